@@ -22,6 +22,14 @@ from processes import HANG
 from training.cli import app
 
 PLACEHOLDER = "..."
+COMMANDS = [
+    (page, words[number + 1 :])
+    for page in PAGES
+    for words in shell_commands(page)
+    for number, word in enumerate(words)
+    if word.rpartition("/")[2] == "thor2"
+]
+"""Page and arguments of every command."""
 
 
 def parse(words: list[str]) -> None:
@@ -35,22 +43,17 @@ def parse(words: list[str]) -> None:
 
 
 def test_commands_parse() -> None:
-    parsed = 0
-    for page in PAGES:
-        for words in shell_commands(page):
-            names = [number for number, word in enumerate(words) if word.rpartition("/")[2] == "thor2"]
-            if names:
-                try:
-                    parse(words[names[0] + 1 :])
-                except (KeyError, typer.TyperException) as error:
-                    pytest.fail(f"{page}: {' '.join(words)}: {error!r}")
-                parsed += 1
-    assert parsed >= 60
+    assert len(COMMANDS) >= 60
+    for page, words in COMMANDS:
+        try:
+            parse(words)
+        except (KeyError, typer.TyperException) as error:
+            pytest.fail(f"{page}: {' '.join(words)}: {error!r}")
 
 
 def test_every_documented_command_is_run_by_a_test() -> None:
     """A test names it as a word of its own, as in `run_thor2("train", ...)`."""
-    names = {words[1] for page in PAGES for words in shell_commands(page) if words[0].rpartition("/")[2] == "thor2"}
+    names = {words[0] for _, words in COMMANDS}
     paths = [path for path in (ROOT / "tests").rglob("*.py") if path.parent.name != "docs"]
     tests = "".join(path.read_text(encoding="utf-8") for path in paths)
     assert len(names) >= 12 and {name for name in names if f'"{name}",' not in tests} == set()
@@ -70,12 +73,9 @@ def test_every_page_is_two_links_from_the_landing_page() -> None:
         return {(page.parent / link).resolve() for link in re.findall(r"\]\(([\w./-]+\.(?:md|ipynb))[)#]", text)}
 
     first = links(docs / "index.md")
-    expected = {path for path in docs.rglob("*") if path.suffix in {".md", ".ipynb"} and path.stem != "index"}
-    expected |= {
-        docs / "reference" / "command-line.md",
-        docs / "reference" / "http.md",
-    }  # written when the site is built
-    assert not expected - first.union(*map(links, first))
+    pages = {path for path in docs.rglob("*") if path.suffix in {".md", ".ipynb"} and path.stem != "index"}
+    written = {docs / "reference" / f"{name}.md" for name in ("command-line", "http")}  # when the site is built
+    assert not (pages | written) - first.union(*map(links, first))
 
 
 NAMES = sorted(path.stem for path in (ROOT / "docs" / "tutorials").glob("*.ipynb"))

@@ -32,9 +32,9 @@ class SoftwareCamera:
     def __init__(self, rs: Any) -> None:
         self.rs, self.device, self.queue = rs, rs.software_device(), rs.syncer(20)
         intrinsics = rs.intrinsics()
-        for name, value in dict(width=WIDTH, height=HEIGHT, fx=60.0, fy=61.0, ppx=32.0, ppy=24.0).items():
+        camera = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "ppx": 32.0, "ppy": 24.0}
+        for name, value in {**camera, "model": rs.distortion.brown_conrady, "coeffs": [0.01, 0, 0, 0, 0]}.items():
             setattr(intrinsics, name, value)
-        intrinsics.model, intrinsics.coeffs = rs.distortion.brown_conrady, [0.01, 0, 0, 0, 0]
         self.sensors = {}
         for uid, (name, stream, kind, size) in enumerate(
             [("Depth", rs.stream.depth, rs.format.z16, 2), ("Color", rs.stream.color, rs.format.rgb8, 3)]
