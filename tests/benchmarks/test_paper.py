@@ -99,10 +99,10 @@ def test_documented_figures_are_those_of_the_results() -> None:
         values = [each["accuracy"]["log-mean"][0]["cells"][0]["accuracy"][title]["mean"] for each in (scenes, frames)]
         return " | ".join(f"{value:.3f}".lstrip("0") for value in values)
 
-    names = {"THOR2 (TOPS + TOPS2)": "THOR2", "CE + TOPS + TOPS2": "CE+TOPS+TOPS2", "TOPS, shape alone": "TOPS"}
-    names |= {"random forest": "forest"} | {title: title for title in TITLES.values() if title in scenes["fusions"]}
-    for name in names.keys() - {"forest"}:
-        assert f"| {name} | {accuracy(names[name])} |" in page
+    names = {"THOR2": "THOR2 (TOPS + TOPS2)", "CE+TOPS+TOPS2": "CE + TOPS + TOPS2", "TOPS": "TOPS, shape alone"}
+    for title in (*names, *(title for title in TITLES.values() if title in scenes["fusions"])):
+        name = (names | {"forest": "random forest"}).get(title, title)
+        assert f"| {name} | {accuracy(title)} |" in page
     for pair in list(zip(*(each["claims"]["log-mean"] for each in (scenes, frames)), strict=True))[:6]:
         cells = [
             f"{100 * c['difference']:+.1f} ({100 * c['low']:+.1f} to {100 * c['high']:+.1f}), {c['verdict']}"
@@ -116,24 +116,18 @@ def test_documented_figures_are_those_of_the_results() -> None:
     assert "RGB-D ViT-small, templates: trained from scratch" in text
 
 
-@pytest.fixture
-def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return options with two frames of two built-in objects, which also join the views."""
+@pytest.mark.slow
+def test_a_small_comparison_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
     monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", NAMES, seed)
-    return [
+    given = [
         *(f"--meshes={meshes}", f"--frames={frames}", f"--real={frames}", "--folds=1", "--workers=1"),
-        "--baselines=thor,forest,rgbd-vit-small,templates",
-        "--render=--azimuth-step 90 --polar-step 90",
+        *("--baselines=thor,forest,rgbd-vit-small,templates", "--render=--azimuth-step 90 --polar-step 90"),
         "--train=--epochs 1 --batch-size 8",
     ]
-
-
-@pytest.mark.slow
-def test_a_small_comparison_resumes(tmp_path: Path, given: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
     out = tmp_path / "out"
     paper.main([*given, f"--out={out}"])
     report: dict[str, Any] = json.loads((out / "paper.json").read_text())

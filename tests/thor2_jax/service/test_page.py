@@ -3,7 +3,6 @@
 import io
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -136,7 +135,7 @@ def test_keyboard_navigation(open_page: Open) -> None:
     expect(page.locator("#classes li")).to_have_count(len(CLASSES))
 
 
-def test_uploaded_frame(open_page: Open, files: Files, tmp_path: Path) -> None:
+def test_uploaded_frame(open_page: Open, files: Files) -> None:
     def rename(answer: Any) -> None:
         for one in answer["instances"]:
             one["name"] = one["name"] and "mug\u202egpj"
@@ -157,12 +156,6 @@ def test_uploaded_frame(open_page: Open, files: Files, tmp_path: Path) -> None:
     expect(page.locator("#masks")).to_be_hidden()  # The frame came with masks.
     expect(page.locator("#naming")).to_be_hidden()  # The service does not teach.
     expect(page.locator("#objects")).not_to_contain_text("Name this object")
-    page.unroute("**/v1/**")
-    (tmp_path / "large").write_bytes(bytes(20 * 2**20))
-    page.get_by_text("Upload your own frame").click()
-    page.locator("#color").set_input_files(tmp_path / "large")
-    page.get_by_role("button", name="Recognize", exact=True).click()
-    expect(page.get_by_role("alert")).to_contain_text("bytes")
 
 
 def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, files: Files) -> None:
