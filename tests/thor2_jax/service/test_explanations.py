@@ -7,13 +7,14 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
 from helpers import encode_image
-from page_actions import assert_fits, upload, wait_until
+from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
@@ -49,25 +50,21 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
     np.testing.assert_array_equal(decoded(LabelMap(**answer["label_map"])), frame.labels)
     plain = http.post("/v1/recognize", files=files).json()["instances"]
     for one, other in zip(answer["instances"], plain, strict=True):
-        assert one.keys() == other.keys() | {"details"}
-        assert [one[name] for name in ("label", "name", "unrecognized")] == [
-            other[name] for name in ("label", "name", "unrecognized")
-        ]
-        assert (one["details"] is None) == (one["name"] is None)
+        assert one.keys() == other.keys() | {"details"} and (one["details"] is None) == (one["name"] is None)
+        assert all(one[name] == other[name] for name in ("label", "name", "unrecognized"))
 
     described = thor2.Recognizer.load(run_dir).describe(frame)
     config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
     aligned = thor2.align(described.packed, config)
     colors = np.asarray(strips(aligned, network, config).color)
-    named = [one for one in answer["instances"] if one["details"] is not None]
-    assert len(named) == len(described.usable) == 3
-    for row, one in enumerate(named):
-        details, instance = one["details"], described.usable[row]
+    shown = [one["details"] for one in answer["instances"] if one["details"] is not None]
+    assert len(shown) == 3
+    for row, (details, instance) in enumerate(zip(shown, described.usable, strict=True)):
         images = np.asarray(described.descriptors.images[row])
         assert details["image_peak"] == pytest.approx(images.max(), rel=1e-4)
-        shown = np.array([piece["image"] for piece in details["slices"]])
-        assert shown.shape == images.shape and shown.max() == 255 and shown.min() >= 0
-        np.testing.assert_allclose(shown / 255 * details["image_peak"], images, atol=0.6 / 255 * details["image_peak"])
+        levels = np.array([piece["image"] for piece in details["slices"]])
+        assert levels.shape == images.shape and levels.max() == 255 and levels.min() >= 0
+        np.testing.assert_allclose(levels / 255 * details["image_peak"], images, atol=0.6 / 255 * details["image_peak"])
 
         shown_colors = np.zeros_like(colors[row])
         for number, piece in enumerate(details["slices"]):
@@ -158,20 +155,16 @@ def test_why_is_503_until_explanations_are_compiled(
         assert is_compiled.wait(300) and not is_stopped()
         compiled.append((n_points, by_classifiers))
 
-    def explain(*_: object) -> None:
-        raise InputError("instance is explained")
-
     monkeypatch.setattr(service, "_compiled", {})
     monkeypatch.setattr(pipeline, "compile_explanations", compile_explanations)
-    monkeypatch.setattr(pipeline, "explain_instance", explain)
+    monkeypatch.setattr(pipeline, "explain_instance", Mock(side_effect=InputError("instance is explained")))
     for _ in range(2):
         response = ask(teaching_url, files, 3)
         check_refused(response, 503, None, "compiled")
         assert int(response.headers["retry-after"]) >= 1
     assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=60).status_code == 200
     is_compiled.set()
-    (future,) = service._compiled.values()
-    future.result(300)
+    next(iter(service._compiled.values())).result(300)
     check_refused(ask(teaching_url, files, 3), 422, "instance", "is explained")
     assert compiled == service.engine.explanation_programs()
 
@@ -179,13 +172,10 @@ def test_why_is_503_until_explanations_are_compiled(
 def test_failed_compilation_leaves_the_error_to_requests(
     teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
-        raise InputError("explanations need a convention")
-
-    service = teaching_app.state.service
+    service, fail = teaching_app.state.service, Mock(side_effect=InputError("explanations need a convention"))
     monkeypatch.setattr(service, "_compiled", {})
-    monkeypatch.setattr(pipeline, "compile_explanations", fail)
-    monkeypatch.setattr(pipeline, "explain_instance", fail)
+    for name in ("compile_explanations", "explain_instance"):
+        monkeypatch.setattr(pipeline, name, fail)
     service._compile_explanations(*service.engine.explanation_programs()).result(300)
     check_refused(ask(teaching_url, files, 3), 422, "instance", "convention")
 
@@ -199,10 +189,8 @@ def test_why_returns_pictures(
     service = teaching_app.state.service
     service._compile_explanations(*service.engine.explanation_programs()).result(600)
     before = service.metrics.compilations._value.get()
-    response = ask(teaching_url, files, 3)
-    assert response.status_code == 200
+    answer = ask(teaching_url, files, 3).json()
     assert service.metrics.compilations._value.get() - before < 30  # of about 290
-    answer = response.json()
     assert answer["label"] == 3 and answer["explained_name"] in ("a", "b") and answer["unit"] == "log-odds"
     assert set(answer["timings"]) >= {"upload", "decode", "clouds", "explain", "total"}
     assert len(answer["pictures"]) >= 2
@@ -218,16 +206,6 @@ def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
         check_refused(ask(teaching_url, sent, instance), 422, field)
 
 
-def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None]) -> Page:
-    """Open the page, whose requests for explanations `answer` answers, and click on "Why?" for object 3."""
-    page = open_page(url=url)
-    page.route("**/v1/why", answer)
-    upload(page, files)
-    page.locator('#objects button[data-label="3"]').click()
-    page.get_by_role("button", name="Why?").click()
-    return page
-
-
 def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_url: str, files: Files) -> None:
     requests: list[Route] = []
 
@@ -237,7 +215,14 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
             problem = {"field": None, "message": "Explanations are still being compiled."}
             route.fulfill(status=503, json=problem, headers={"Retry-After": "1"})
 
-    page = ask_why(open_page, teaching_url, files, compile_first)
+    def ask_why(label: int) -> None:
+        page.locator(f'#objects button[data-label="{label}"]').click()
+        page.get_by_role("button", name="Why?").click()
+
+    page = open_page(url=teaching_url)
+    page.route("**/v1/why", compile_first, times=2)
+    upload(page, files)
+    ask_why(3)
     expect(page.locator("#why-status")).to_contain_text("still being compiled")
     expect(page.get_by_role("button", name="Why?")).to_be_disabled()
     wait_until(page, lambda: len(requests) == 2)  # the message stays until it is answered
@@ -251,15 +236,13 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
     expect(shown.first).to_have_attribute("aria-label", "What decided, on the photo. Orange speaks for a.")
     for width in (1280, 390):
         assert_fits(page, width)
-    page.locator('#objects button[data-label="7"]').click()  # the explanation belonged to the other object
+    problem = {"field": "instance", "message": "instance 7 cannot be explained."}
+    page.route("**/v1/why", answered("/v1/why", status=422, json=problem))
+    page.locator('#objects button[data-label="7"]').click()  # The explanation belonged to the other object.
     expect(shown).to_have_count(0)
     expect(page.locator("#why-status")).to_have_text("")
-
-
-def test_page_shows_why_there_is_no_explanation(open_page: Open, teaching_url: str, files: Files) -> None:
-    problem = {"field": "instance", "message": "instance 3 cannot be explained."}
-    page = ask_why(open_page, teaching_url, files, lambda route: route.fulfill(status=422, json=problem))
-    expect(page.locator("#why-status")).to_have_text("instance 3 cannot be explained.")
+    ask_why(7)
+    expect(page.locator("#why-status")).to_have_text(problem["message"])
     expect(page.get_by_role("button", name="Why?")).to_be_enabled()
-    page.locator('#objects button[data-label="5"]').click()  # too few points to be described
+    page.locator('#objects button[data-label="5"]').click()  # It has too few points to be described.
     expect(page.locator("#why")).to_be_hidden()

@@ -95,16 +95,10 @@ def test_damaged_truncated_or_large_images(http: httpx.Client, files: Files, fie
 
 
 def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame: Any) -> None:
-    gif = encode_image(frame.labels, "GIF")
-    for field, content in (
-        ("color", files["labels"]),
-        ("color", gif),
-        ("depth", files["color"]),
-        ("depth", files["labels"]),
-        ("labels", files["color"]),
-        ("labels", gif),
-    ):
-        check_refused(post(http, files, **{field: content}), 422, field)
+    contents = files | {"gif": encode_image(frame.labels, "GIF")}
+    for field, others in {"color": ("labels", "gif"), "depth": ("color", "labels"), "labels": ("color", "gif")}.items():
+        for other in others:
+            check_refused(post(http, files, **{field: contents[other]}), 422, field)
     check_refused(post(http, files, color=deep_png(240, 320)), 422, "color", "16", "8")
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode_image(np.ones((120, 160), kind))
@@ -119,7 +113,7 @@ def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> 
     assert [problem["field"], *(other["field"] for other in problem["further"])] == ["color", "labels", "intrinsics"]
 
 
-def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
+def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files) -> None:
     good = json.loads(files["intrinsics"])
     values = (float("nan"), float("inf"), 0, -1, "600", None, 10**400, 10**3000)
     texts = [json.dumps(good | {"fx": value}) for value in values]
@@ -127,9 +121,11 @@ def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
     for content in (*map(str.encode, texts), b"\xff\xfe\x00"):
         check_refused(post(http, files, intrinsics=content), 422, "intrinsics")
     check_refused(post(http, files, intrinsics=b" " * 5000), 413, "intrinsics", "5000")
-    for extreme in ({"fx": 1e-300}, {"cx": 1e300}, {"fx": 1e300, "fy": 1e300}, {"depth_scale": 1e-300}):
-        answer = post(http, files, intrinsics=json.dumps(good | extreme).encode())
-        assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
+    extremes = {"fx": 1e-300}, {"fx": 1e-9}, {"cx": 1e300}, {"cx": 1e8}, {"fx": 1e300, "fy": 1e300}
+    for extreme in (*extremes, {"depth_scale": 1e-300}):
+        for frame in (files, unlabelled):
+            answer = post(http, frame, intrinsics=json.dumps(good | extreme).encode())
+            assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
 def test_invalid_forms(http: httpx.Client, files: Files) -> None:
