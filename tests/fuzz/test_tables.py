@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import colornet
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
-from thor2_jax.testing import damaged, networks
+from thor2_jax.testing import damaged
 from training.readers.bop import BOP
 from training.readers.frames import FrameFolder
 from training.readers.ocid import OCID
@@ -178,14 +178,6 @@ def test_an_archive_that_would_fill_memory(times: int, attempt: Any, tmp_path: P
         archive.writestr("mean_rgb.npy", header.getvalue() + bytes(min(times, 1000) * 2**20))
     with pytest.raises(ValueError, match="bomb.npz"):
         attempt(lambda: colornet.load(path), ())
-
-
-@settings(max_examples=10)
-@given(network=networks())
-def test_networks_round_trip(network: colornet.ColorNetwork, tmp_path_factory: Any) -> None:
-    path = tmp_path_factory.getbasetemp() / "network.npz"
-    network.save(path)
-    assert colornet.load(path).fingerprint == network.fingerprint
 
 
 @pytest.fixture(scope="module")
