@@ -31,6 +31,7 @@ class SoftwareCamera:
 
     def __init__(self, rs: Any) -> None:
         self.rs, self.device, self.queue = rs, rs.software_device(), rs.syncer(20)
+        self.wait_for_frames = self.queue.wait_for_frames
         intrinsics = rs.intrinsics()
         camera = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "ppx": 32.0, "ppy": 24.0}
         for name, value in {**camera, "model": rs.distortion.brown_conrady, "coeffs": [0.01, 0, 0, 0, 0]}.items():
@@ -63,9 +64,6 @@ class SoftwareCamera:
             if name == "Depth":
                 frame.depth_units = 0.00025
             sensor.on_video_frame(frame)
-
-    def wait_for_frames(self, milliseconds: int) -> Any:
-        return self.queue.wait_for_frames(milliseconds)
 
 
 @pytest.fixture
