@@ -30,15 +30,8 @@ from thor2_jax.recordings import realsense
 from thor2_jax.tracking.tracker import Tracker
 
 BLOCKS = {
-    "README.md": 1,
-    "docs/cameras.md": 2,
-    "docs/explain.md": 1,
-    "docs/index.md": 1,
-    "docs/library.md": 10,
-    "docs/objects.md": 1,
-    "docs/recordings.md": 1,
-    "docs/segmentation.md": 3,
-    "docs/service.md": 2,
+    **dict.fromkeys(["README.md", "docs/explain.md", "docs/index.md", "docs/objects.md", "docs/recordings.md"], 1),
+    **{"docs/cameras.md": 2, "docs/segmentation.md": 3, "docs/service.md": 2, "docs/library.md": 10},
     "docs/tutorials/first-table.md": 1,
 }
 """Page -> number of its Python blocks; each one is executed by a test."""

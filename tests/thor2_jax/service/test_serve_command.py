@@ -47,21 +47,13 @@ def test_port_in_use(run_dir: Path, serve: Command) -> None:
         assert "in use" in serve("--model", str(run_dir), "--port", str(taken.getsockname()[1]))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--max-batch 7", "max_batch is 7"),
-        ("--unknown-below 2", "unknown_below is 2.0"),
-        ("--token é", "token"),
-        ("--deadline 0", "deadline is 0.0"),
-        ("--deadline nan", "deadline is nan"),
-        ("--deadline inf", "deadline is inf"),
-        ("--allow-host http://robot.local", "allow_host is 'http://robot.local'"),
-        (f"--cache {__file__}", "cache is"),
-    ],
-)
-def test_invalid_settings(run_dir: Path, serve: Command, options: str, message: str) -> None:
-    assert message in serve("--model", run_dir, *options.split())
+SETTINGS = ("max-batch", "7"), ("unknown-below", "2.0"), ("allow-host", "http://robot.local"), ("cache", __file__)
+
+
+@pytest.mark.parametrize(("name", "value"), [*SETTINGS, *(("deadline", value) for value in ("0.0", "nan", "inf"))])
+def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) -> None:
+    error = serve("--model", run_dir, f"--{name}", value)
+    assert f"{name.replace('-', '_')} is " in error and value in error
 
 
 @pytest.mark.parametrize("name", ["queue", "processes"])
@@ -70,10 +62,10 @@ def test_settings_that_only_the_library_can_have(name: str, run_dir: Path) -> No
         Settings(run_dir, **{name: 0})
 
 
-def test_an_empty_token_does_not_switch_authentication_off(
-    run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert "--token" in serve("--model", run_dir, "--token", "")
+def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty one does not switch authentication off."""
+    for token in ("", "é"):
+        assert "--token" in serve("--model", run_dir, "--token", token)
     monkeypatch.setenv("THOR2_TOKEN", "")
     assert "THOR2_TOKEN" in serve("--model", run_dir)
 
