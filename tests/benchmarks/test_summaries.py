@@ -60,14 +60,8 @@ def test_pieces_are_compared_with_instances() -> None:
     item = LabelledFrame("a", frame, {1: "can", 2: "pen_red", 3: "mug"}, {})
 
     rows, on_background = segmentation.compare(pieces, item)
-    columns = {name: [row[name] for row in rows] for name in ("iou", "piece", "over", "under")}
-    assert columns == {
-        "iou": [1.0, 0.5, 0.5],
-        "piece": [1, 2, 4],
-        "over": [False, True, False],
-        "under": [False, False, True],
-    }
-    assert on_background == 1
+    columns = [(row["iou"], row["piece"], row["over"], row["under"]) for row in rows]
+    assert columns == [(1.0, 1, False, False), (0.5, 2, True, False), (0.5, 4, False, True)] and on_background == 1
     rows, on_background = segmentation.compare(np.zeros_like(pieces), item)
     assert [row["iou"] for row in rows] == [0.0, 0.0, 0.0] and on_background == 0
 

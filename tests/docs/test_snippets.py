@@ -16,7 +16,7 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
-from doc_pages import PAGES, ROOT, python_blocks
+from doc_pages import PAGES, ROOT
 from helpers import patches, random_clouds, run_thor2, tilted, untrained_run, write_frame_files
 from recording_files import table_frame
 
@@ -44,7 +44,7 @@ FRAME = tilted(np.where(patches() == 7, 2, patches()))
 
 
 def blocks_of(page: str) -> list[str]:
-    return python_blocks((ROOT / page).read_text(encoding="utf-8"))
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
 def run_blocks(page: str, *numbers: int, **names: Any) -> dict[str, Any]:

@@ -19,16 +19,11 @@ class Disk:
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.folder, self.count, self.fail_at, self.number = str(folder), 0, 0, errno.ENOSPC
-        for module, name in ((builtins, "open"), (io, "open")):
-            patch.setattr(module, name, self._opening(getattr(module, name)))
+        for module in (builtins, io):
+            patch.setattr(module, "open", self._opening(module.open))
         for name in ("mkdir", "rename", "replace"):
             patch.setattr(os, name, self._failing(getattr(os, name)))
-        low = os.open
-        patch.setattr(
-            os,
-            "open",
-            lambda path, flags, *a, **k: (flags & os.O_CREAT and self.step(path), low(path, flags, *a, **k))[1],
-        )
+        patch.setattr(os, "open", self._failing(os.open, lambda flags, *_: flags & os.O_CREAT))
 
     def step(self, path: Any) -> None:
         if isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.folder):
@@ -36,20 +31,21 @@ class Disk:
             if self.fail_at and self.count >= self.fail_at:
                 raise OSError(self.number, os.strerror(self.number), os.fspath(path))
 
-    def _failing(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def _failing(self, function: Callable[..., Any], writes: Any = lambda *_: True) -> Callable[..., Any]:
         def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
-            self.step(path)
+            if writes(*rest):
+                self.step(path)
             return function(path, *rest, **more)
 
         return wrapper
 
     def _opening(self, function: Callable[..., Any]) -> Callable[..., Any]:
         def wrapper(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
-            if set(mode) & set("wxa+"):
-                self.step(path)
+            if not set(mode) & set("wxa+") or not isinstance(path, (str, os.PathLike)):
+                return function(path, mode, *rest, **more)
+            self.step(path)
             stream = function(path, mode, *rest, **more)
-            if set(mode) & set("wxa+") and isinstance(path, (str, os.PathLike)):
-                self._failing_writes(stream, path)
+            self._failing_writes(stream, path)
             return stream
 
         return wrapper

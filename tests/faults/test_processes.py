@@ -60,6 +60,6 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
         if stage == "describe" and not begun:
             begun.append(1)
             with pytest.raises(Interrupted):
-                train(other, progress=stop_when("fit tops", 1))
+                train(other, progress=stop_when("fit tops", 3))
 
     assert train(other, progress=dies).record == done[0].record  # resumes the other training
