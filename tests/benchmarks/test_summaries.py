@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import thor2_jax
 import thor2_jax as thor2
 from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
 from benchmarks.doctor import DAMAGES, run
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 from thor2_jax.explanation.attributions import Faithfulness
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.recognition import Recognition
 from training.readers.frame_files import frame_files
 from training.readers.labelled import LabelledFrame
 
@@ -102,23 +99,20 @@ def test_bad_arguments_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
-
-
-def recognizer_of(name: str) -> Any:
-    """Return a recognizer that is the less sure the more the colours differ from those of a sample."""
-    color = frame_files(SAMPLES / name).read().color.astype(float)
-
-    def recognize(frame: RGBDFrame) -> list[Recognition]:
-        confidence = float(np.exp(-20 * np.abs(frame.color - color).mean() / 255))
-        return [Recognition(label, "known", confidence) for label in frame.instances]
-
-    return SimpleNamespace(recognize=recognize, classes=("known",))
+SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
 
 
 @pytest.mark.slow
 def test_damaged_set_ups_are_diagnosed() -> None:
+    """A toy recognizer is the less sure the more the colours differ from those of the sample."""
+    color = frame_files(SAMPLES / "clutter").read().color.astype(float)
+
+    def recognize(frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
+        confidence = float(np.exp(-20 * np.abs(frame.color - color).mean() / 255))
+        return [thor2.Recognition(label, "known", confidence) for label in frame.instances]
+
     assert len(DAMAGES) == 20
-    report = run(SAMPLES, recognizer_of("clutter"), ["clutter"])
+    recognizer: Any = SimpleNamespace(recognize=recognize, classes=("known",))
+    report = run(SAMPLES, recognizer, ["clutter"])
     wrong = {name: entry["found"] for name, entry in report["damaged"].items() if not entry["right"]}
     assert report["right_by_frame"]["clutter"] == 20 - len(wrong) and len(wrong) <= 2, wrong

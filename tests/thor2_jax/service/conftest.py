@@ -33,8 +33,6 @@ from schemathesis.specs.openapi.checks import (
 from segmentation_scenes import Box, render
 
 import thor2_jax as thor2
-from thor2_jax.adaptation import estimate
-from thor2_jax.explanation import class_scores
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
@@ -65,14 +63,6 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("service") / "run"
     save_run(run, folder)
     return folder
-
-
-@pytest.fixture
-def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
-    monkeypatch.setattr(engine, "MIN_POINTS_BUCKET", 512)
-    monkeypatch.setattr(estimate, "CAPACITY", 512)
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
 @pytest.fixture(scope="session")
