@@ -62,7 +62,8 @@ def test_sigterm_under_load_answers_accepted_requests(
     with ThreadPoolExecutor(8) as clients:
         clients.map(call, range(8))
         wait_until(lambda: answered.count(200) >= 10, server.log.read_text)
-        assert server.terminate() == 0
+        server.process.terminate()
+        assert server.process.wait(HANG) == 0
     log = server.log.read_text()
     counts = re.findall(r"stopped: (\d+) requests accepted, (\d+) finished", log)
     assert len(counts) == workers and set(answered) <= {200, 503}
