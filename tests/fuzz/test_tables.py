@@ -78,23 +78,15 @@ def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFact
 def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("views")
     rng = np.random.default_rng(0)
-    counts = np.array([5, 7])
     xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
-    numbers = np.array([0, 1], np.int32)
-    normalized = NormalizedViews(
-        xyz, rng.integers(0, 256, (12, 3), dtype=np.uint8), counts, 0, numbers, np.zeros(2, np.int32)
+    rgb = rng.integers(0, 256, (12, 3), dtype=np.uint8)
+    content = encode(
+        NormalizedViews(xyz, rgb, np.array([5, 7]), 0, np.arange(2, dtype=np.int32), np.zeros(2, np.int32))
     )
-    content = encode(normalized)
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
     Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
     return path
-
-
-def read_views(path: Path) -> list[Any]:
-    dataset = ViewDataset.open(path)
-    assert dataset.record
-    return [dataset.classes, len(dataset), *(dataset.read(k) for k in range(len(dataset.shards)))]
 
 
 def meaning(name: str, content: bytes) -> Any:
@@ -110,8 +102,13 @@ def meaning(name: str, content: bytes) -> Any:
 
 def read_damaged(name: str, content: bytes, views: Path, attempt: Any) -> Any:
     """Read the dataset while a file has another content."""
+
+    def read() -> list[Any]:
+        dataset = ViewDataset.open(views)
+        return [dataset.record, dataset.classes, len(dataset), *map(dataset.read, range(len(dataset.shards)))]
+
     with other_content(views / name, content):
-        return attempt(lambda: read_views(views))
+        return attempt(read)
 
 
 @pytest.mark.parametrize("name", [MANIFEST, "0000-0000.safetensors"])

@@ -22,19 +22,16 @@ def select(page: Page, label: int) -> None:
     page.locator(f'#objects button[data-label="{label}"]').click()
 
 
-class SentLabels:
-    """Route that keeps the label images that the page sends to be recognized."""
+def keep_labels(images: list[np.ndarray]) -> Callable[[Route], None]:
+    """Return a route that keeps the label images that the page sends to be recognized."""
 
-    def __init__(self) -> None:
-        self.images: list[np.ndarray] = []
-
-    def __call__(self, route: Route) -> None:
-        body = route.request.post_data_buffer or b""
-        _, found, after = body.partition(b'name="labels"')
+    def handle(route: Route) -> None:
+        _, found, after = (route.request.post_data_buffer or b"").partition(b'name="labels"')
         if found:
-            image = Image.open(io.BytesIO(after[after.index(b"\x89PNG") :]))
-            self.images.append(np.asarray(image))
+            images.append(np.asarray(Image.open(io.BytesIO(after[after.index(b"\x89PNG") :]))))
         route.continue_()
+
+    return handle
 
 
 @pytest.fixture
@@ -54,8 +51,8 @@ def count(page: Page, objects: int) -> None:
 
 
 def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
-    sent = SentLabels()
-    page = open_page(sent)
+    sent: list[np.ndarray] = []
+    page = open_page(keep_labels(sent))
     upload(page, unlabelled)
     count(page, 3)
     expect(page.locator("#masks-title")).to_contain_text("table")
@@ -63,10 +60,10 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
     select(page, 2)
     page.get_by_role("button", name="Drop").click()
     count(page, 2)
-    np.testing.assert_array_equal(sent.images[-1], np.where(labels == 2, 0, labels))
+    np.testing.assert_array_equal(sent[-1], np.where(labels == 2, 0, labels))
     page.get_by_role("button", name="Undo correction").click()
     count(page, 3)
-    np.testing.assert_array_equal(sent.images[-1], labels)
+    np.testing.assert_array_equal(sent[-1], labels)
     expect(page.locator("#undo-mask")).to_be_disabled()
     select(page, 3)
     page.get_by_role("button", name="Merge").click()
@@ -74,7 +71,7 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
     y, x = np.argwhere(labels == 1).mean(axis=0)
     click(page, x, y)
     count(page, 2)
-    np.testing.assert_array_equal(sent.images[-1], np.where(labels == 1, 3, labels))
+    np.testing.assert_array_equal(sent[-1], np.where(labels == 1, 3, labels))
     expect(page.locator('#objects button[aria-pressed="true"]')).to_have_attribute("data-label", "3")
     page.get_by_role("button", name="Merge").click()
     select(page, 2)  # The list is reached by keyboard, too.
@@ -84,14 +81,13 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
 
 
 def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
-    sent = SentLabels()
-    page = open_page(sent, size=(1280, 900))
+    sent: list[np.ndarray] = []
+    page = open_page(keep_labels(sent), size=(1280, 900))
     upload(page, unlabelled)
     count(page, 3)
-    label = 1
-    rows, columns = np.nonzero(labels == label)
+    rows, columns = np.nonzero(labels == 1)
     middle = float(np.median(columns))
-    select(page, label)
+    select(page, 1)
     page.get_by_role("button", name="Split").click()
     for y in (rows.min(), rows.max()):
         click(page, columns.max() + 9, float(y))  # beside the piece
@@ -99,11 +95,9 @@ def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels
     for y in (rows.min() - 3, rows.max() + 3):
         click(page, middle, float(y))
     count(page, 4)
-    image = sent.images[-1]
-    columns_of = {part: np.nonzero(image == part)[1] for part in (label, 4)}
-    lower, upper = sorted(columns_of.values(), key=np.mean)
+    lower, upper = sorted((np.nonzero(sent[-1] == part)[1] for part in (1, 4)), key=np.mean)
     assert lower.max() <= middle + 1 and upper.min() >= middle - 1 and min(len(lower), len(upper)) > 0.3 * len(columns)
-    np.testing.assert_array_equal(np.where(image == 4, label, image), labels)
+    np.testing.assert_array_equal(np.where(sent[-1] == 4, 1, sent[-1]), labels)
     page.get_by_role("button", name="Split").click()
     page.keyboard.press("Escape")
     expect(page.locator("#split")).to_have_attribute("aria-pressed", "false")
