@@ -12,13 +12,13 @@ import pytest
 
 
 class Disk:
-    """Count the write operations under a directory, and fail from the n-th on, like a full or read-only disk.
+    """Count the write operations under a directory, and fail from the n-th on, like a full disk.
 
     Opening for writing, writing, creating a directory and renaming each count once. Removing never fails.
     """
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
-        self.folder, self.count, self.fail_at, self.number = str(folder), 0, 0, errno.ENOSPC
+        self.folder, self.count, self.fail_at = str(folder), 0, 0
         for module in (builtins, io):
             patch.setattr(module, "open", self._opening(module.open))
         for name in ("mkdir", "rename", "replace"):
@@ -29,7 +29,7 @@ class Disk:
         if isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.folder):
             self.count += 1
             if self.fail_at and self.count >= self.fail_at:
-                raise OSError(self.number, os.strerror(self.number), os.fspath(path))
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
 
     def _failing(self, function: Callable[..., Any], writes: Any = lambda *_: True) -> Callable[..., Any]:
         def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
@@ -63,9 +63,9 @@ class Disk:
 
         stream.write = failing_write
 
-    def reset(self, fail_at: int, number: int) -> None:
-        """Restart the count; fail from step `fail_at` on with the error `number`, or never if `fail_at` is 0."""
-        self.count, self.fail_at, self.number = 0, fail_at, number
+    def fail_from(self, step: int) -> None:
+        """Restart the count; fail from a step on, or never if it is 0."""
+        self.count, self.fail_at = 0, step
 
 
 @pytest.fixture
