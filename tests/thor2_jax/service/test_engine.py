@@ -105,12 +105,9 @@ def test_a_run_that_answers_by_classifiers_teaches_with_both(tmp_path: Path) -> 
 
 def views(count: int) -> list[PreparedInstance]:
     rng = np.random.default_rng(count)
-    made = []
-    for label in range(count):
-        points = rng.uniform(0, (0.1, 0.06, 0.04), (100, 3)).astype(np.float32)
-        colors = (rng.integers(20, 200, 3) + rng.integers(0, 40, (100, 3))).astype(np.uint8)
-        made.append(PreparedInstance(label, points, colors, np.zeros(100, bool)))
-    return made
+    points = rng.uniform(0, (0.1, 0.06, 0.04), (count, 100, 3)).astype(np.float32)
+    colors = (rng.integers(20, 200, (count, 1, 3)) + rng.integers(0, 40, (count, 100, 3))).astype(np.uint8)
+    return [PreparedInstance(k, points[k], colors[k], np.zeros(100, bool)) for k in range(count)]
 
 
 def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:
@@ -133,15 +130,13 @@ def test_the_service_adapts_after_enough_instances(
         assert all(a is b for a, b in zip(corrected, frame, strict=True))
     assert engine.adaptation is None and adaptation_answer(None) is None
     engine.correct(second, observe=True)
-    assert engine._online is not None
     engine._online.join()
     adaptation = engine.adaptation
-    assert adaptation is not None and adaptation.instances == EVERY + 2
+    assert adaptation.instances == EVERY + 2
     (corrected,) = engine.correct(second[:1], observe=False)
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
-    answer = adaptation_answer(adaptation)
-    assert answer is not None
-    assert answer.model_dump() == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
+    answer = adaptation_answer(adaptation).model_dump()
+    assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
 
 
 def test_a_service_does_not_adapt_by_default(teaching_run: Path) -> None:

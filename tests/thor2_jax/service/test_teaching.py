@@ -65,10 +65,8 @@ def state(http: httpx.Client, files: Files) -> tuple[Any, Any]:
     return listed["objects"], answer["instances"]
 
 
-def compilations(http: httpx.Client) -> float:
-    match = re.search(r"^thor2_compilations_after_warm_up_total (.*)$", http.get("/metrics").text, re.M)
-    assert match is not None
-    return float(match[1])
+def compilations(http: httpx.Client) -> str:
+    return re.findall(r"^thor2_compilations_after_warm_up_total (.*)$", http.get("/metrics").text, re.M)[0]
 
 
 def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
@@ -76,17 +74,14 @@ def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: File
     assert list(before[3]["top"]) == ["tops", "tops2"]
     compiled = compilations(http)  # by other tests in this process
     answer = enroll(http, files, "tall")
-    assert answer.status_code == 200, answer.text
     record = answer.json()
     assert (record["name"], record["trained"], record["views"], record["source"]) == ("tall", False, 1, "frames")
     assert record["generation"] == 1 and {"upload", "decode", "device", "gallery"} <= record["timings"].keys()
     assert recognized(http, files)[3] == "tall"
-    listed = http.get("/v1/objects").json()
-    assert [each["name"] for each in listed["objects"]] == ["a", "b", "tall"] and listed["generation"] == 1
-    assert [each["trained"] for each in listed["objects"]] == [True, True, False]
-    assert listed["objects"][2] == {key: record[key] for key in ("name", "trained", "views", "source", "date")}
-    assert http.get("/v1/model").json()["classes"] == ["a", "b", "tall"]
-    assert http.get("/v1/model").json()["teaches"] is True
+    listed, model = http.get("/v1/objects").json(), http.get("/v1/model").json()
+    assert [(each["name"], each["trained"]) for each in listed["objects"][:2]] == [("a", True), ("b", True)]
+    assert listed["objects"][2:] == [{key: record[key] for key in ("name", "trained", "views", "source", "date")}]
+    assert model["classes"] == ["a", "b", "tall"] and model["teaches"] is True and listed["generation"] == 1
     assert enroll(http, files, "wide", 7).status_code == 200
     explained = http.post("/v1/explain", files=files).json()["instances"]
     assert [one["name"] for one in explained] == recognized(http, files) and explained[2]["name"] == "wide"

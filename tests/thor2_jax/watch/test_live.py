@@ -74,9 +74,7 @@ def test_recordings_play_at_their_speed(
 
 
 def latest(broadcast: Broadcast) -> dict[str, Any]:
-    message = broadcast.wait(0, 0)
-    assert message is not None
-    return dict(json.loads(message[1]))
+    return dict(json.loads(broadcast.wait(0, 0)[1]))
 
 
 def test_messages_of_a_view() -> None:
