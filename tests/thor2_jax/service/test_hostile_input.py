@@ -60,12 +60,9 @@ CHUNKS = with_checksums(
 
 def test_png_with_an_invalid_checksum(tmp_path: Path) -> None:
     """The service and the library refuse it, even if its pixels can be decoded."""
-    contents = {
-        "color": encode_image(np.zeros((12, 16, 3), np.uint8)),
-        "depth": encode_image(np.ones((12, 16), np.uint16)),
-        "intrinsics": b'{"fx": 9, "fy": 9, "cx": 8, "cy": 6}',
-        "labels": png_file(CHUNKS),
-    }
+    images = {"color": np.zeros((12, 16, 3), np.uint8), "depth": np.ones((12, 16), np.uint16)}
+    contents = {name: encode_image(pixels) for name, pixels in images.items()}
+    contents |= {"intrinsics": b'{"fx": 9, "fy": 9, "cx": 8, "cy": 6}', "labels": png_file(CHUNKS)}
     paths = {name: tmp_path / name for name in contents}
     for name, path in paths.items():
         path.write_bytes(contents[name])
@@ -185,16 +182,13 @@ def npz(**arrays: Any) -> bytes:
 POINTS, COLORS = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8)
 
 
+NO_POINTS = [
+    *(POINTS.astype(np.int64), POINTS[:, :2], np.full_like(POINTS, np.nan), np.full_like(POINTS, 1e30)),
+    *(np.array([Pickled()] * 4), np.array(["a", "b"]), np.zeros(4, [("x", "f4")])),
+]
 INVALID_ARRAYS = [
-    ("points", POINTS.astype(np.int64)),
-    ("points", np.zeros((4, 2), np.float32)),
-    ("points", np.full((4, 3), np.nan, np.float32)),
-    ("points", np.full((4, 3), 1e30, np.float32)),
-    ("points", np.array([Pickled()] * 4)),
-    ("points", np.array(["a", "b"])),
-    ("points", np.zeros(4, [("x", "f4")])),
-    ("colors", np.zeros((5, 3), np.uint8)),
-    ("colors", np.zeros((4, 3), np.float32)),
+    *[("points", array) for array in NO_POINTS],
+    *[("colors", array) for array in (np.zeros((5, 3), np.uint8), COLORS.astype(np.float32))],
     *[("sizes", np.array(sizes)) for sizes in ([3], [5, -1], [2**62, 2**62, 2**62, 2**62 + 4], [4.0], 4)],
     *[("sizes", np.zeros(count, int)) for count in (0, 1000)],
 ]

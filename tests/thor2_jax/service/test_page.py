@@ -160,8 +160,7 @@ def test_uploaded_frame(open_page: Open, files: Files) -> None:
 
 def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, files: Files) -> None:
     page = open_page()
-    page.get_by_text("Upload your own frame").click()
-    page.get_by_role("button", name="Recognize", exact=True).click()
+    upload(page, {})
     for field in FIELDS.keys() - {"labels"}:  # A frame without labels is segmented.
         expect(page.locator(f"#{field}-error")).to_have_text("Choose a file.")
     expect(page.locator("#color")).to_be_focused()
@@ -254,13 +253,11 @@ def test_confidence_is_calibrated_or_said_not_to_be(open_page: Open) -> None:
         del calibrated[0]
 
     page = open_page(changed_answers(change))
-    choose_sample(page)
+    for confidence, remark in ((">99.9\xa0%", " (not calibrated)"), ("87\xa0%", "")):
+        choose_sample(page)
+        expect(page.locator("#details-facts")).to_contain_text(confidence + remark)
+        expect(page.locator("#objects .confidence").first).to_have_text(confidence)
     page.get_by_text("How to read this").click()
-    expect(page.locator("#details-facts")).to_contain_text(">99.9\xa0% (not calibrated)")
-    expect(page.locator("#objects .confidence").first).to_have_text(">99.9\xa0%")
-    choose_sample(page)
-    expect(page.locator("#details-facts")).to_contain_text("87\xa0%")
-    expect(page.locator("#objects .confidence").first).to_have_text("87\xa0%")
     for words in ("calibrated", "geometric mean"):
         expect(page.locator("#confidence-help")).to_contain_text(words)
     for text in ("highest probability; divided by", "highest probability. The embedding"):
@@ -270,12 +267,11 @@ def test_confidence_is_calibrated_or_said_not_to_be(open_page: Open) -> None:
 
 
 def test_page_asks_for_the_token(open_page: Open) -> None:
+    problem = {"field": "Authorization", "message": "The bearer token is missing or wrong."}
+
     def guard(route: Route) -> None:
-        if route.request.headers.get("authorization") == "Bearer secret":
-            route.continue_()
-        else:
-            problem = {"field": "Authorization", "message": "The bearer token is missing or wrong."}
-            route.fulfill(status=401, json=problem)
+        has_token = route.request.headers.get("authorization") == "Bearer secret"
+        route.continue_() if has_token else route.fulfill(status=401, json=problem)
 
     page = open_page(guard, samples=0)
     field, error = page.get_by_label("Bearer token"), page.locator("#token-error")
@@ -283,7 +279,7 @@ def test_page_asks_for_the_token(open_page: Open) -> None:
     expect(error).to_be_empty()
     field.fill("wrong")
     field.press("Enter")
-    expect(error).to_have_text("The bearer token is missing or wrong.")
+    expect(error).to_have_text(problem["message"])
     field.fill("secret")
     page.get_by_role("button", name="Use token").click()
     expect(field).to_be_hidden()
@@ -308,8 +304,7 @@ def test_error_responses_are_shown(open_page: Open) -> None:
 
 def test_a_phone_shows_all_and_keeps_the_picture(open_page: Open, files: Files) -> None:
     page = open_page(size=(360, 740), phone=True)
-    page.get_by_text("Upload your own frame").tap()
-    page.get_by_role("button", name="Recognize", exact=True).tap()
+    upload(page, {})  # Errors are shown.
     assert_fits(page, 360)
     upload(page, files)
     expect(page.locator("#objects button")).to_have_count(4)
@@ -374,11 +369,10 @@ def test_tags_neither_overlap_nor_hide_small_objects(open_page: Open, files: Fil
     page.unroute("**/v1/**")
     upload(page, files | {"labels": encode_image(labels)})
     expect(page.locator("#objects button")).to_have_count(5)
-    scale = page.evaluate("overlay.clientWidth") / 320
     tags = tags_of(page)
     assert len(tags) == 5
     for y, x in places.values():
-        region = np.array([x, y, x + 20, y + 16]) * scale
+        region = np.array([x, y, x + 20, y + 16]) * page.evaluate("overlay.clientWidth") / 320
         for text, box in tags:
             sides = np.minimum(box[2:], region[2:]) - np.maximum(box[:2], region[:2])
             covered = np.clip(sides, 0, None).prod() / (region[2:] - region[:2]).prod()
