@@ -15,8 +15,3 @@ def shell_commands(page: str) -> list[list[str]]:
     parts = [part for block in blocks for part in re.split(r"&&|\||\n", block.replace("\\\n", " "))]
     commands = [shlex.split(part.partition(" >")[0], comments=True) for part in parts]
     return [words for words in commands if words]
-
-
-def python_blocks(text: str) -> list[str]:
-    """Return the Python blocks in the text of a page."""
-    return re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)

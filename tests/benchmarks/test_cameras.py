@@ -33,12 +33,8 @@ def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
         write_frame_files(tmp_path / "hots" / f"mix_{k}", small_frame(), {1: "pen_red", 4: "book"})
     given = [tmp_path / "video", tmp_path / "hots" / "mix_1", tmp_path / "hots" / "mix_0"]
     frames = cameras.labelled_frames(given, cameras.LOOK_ALIKES)
-    assert [(item.identifier, dict(item.truth)) for item in frames] == [
-        ("video/0", {1: "mug"}),
-        ("video/1", {1: "mug"}),
-        ("hots/mix_1", {4: "book"}),
-        ("hots/mix_0", {4: "book"}),
-    ]
+    assert [item.identifier for item in frames] == ["video/0", "video/1", "hots/mix_1", "hots/mix_0"]
+    assert [item.truth for item in frames] == [{1: "mug"}] * 2 + [{4: "book"}] * 2
     with pytest.raises(InputError, match="video/1"):
         cameras.labelled_frames([tmp_path / "video", tmp_path / "video" / "1"])
 

@@ -36,22 +36,17 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
     levers.main()
 
 
-@pytest.fixture
-def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
+@pytest.mark.slow
+def test_a_small_table_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", (*NAMES, "mug_white"), seed)
-    return [
+    given = [
         *("--meshes", meshes, "--frames", frames, "--cameras", "none", "--workers", 1),
         "--render=--azimuth-step 90 --polar-step 90 --registration --base --copies 1",
         "--train=--epochs 1 --batch-size 8 --classifiers tops,tops2 --embedding 0",
     ]
-
-
-@pytest.mark.slow
-def test_a_small_table_resumes(tmp_path: Path, given: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     rows = "default", 'fusion rule "max"'
     small = Lever(rows[0]), Lever(rows[1], rule="max"), Lever("gallery", fusion="gallery")

@@ -1,6 +1,7 @@
-"""The paper's comparison: bad arguments, and a tiny one with every part that resumes."""
+"""The paper's comparison: paired differences by hand, and a tiny comparison with every part that resumes."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,59 @@ from processes import UNOPTIMIZED
 from safetensors.numpy import save_file
 
 from benchmarks import paper
+from benchmarks.paired import paired_difference
 from benchmarks.paper_measurement import CLAIMS
 from benchmarks.paper_report import report_text
 from training.baselines.files import TITLES
 from training.evaluation.answers import fusions
+
+
+def marks(n_both: int, n_first: int, n_second: int, n_none: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return [1, N] marks of two methods by the numbers of instances on which both, one or none is correct."""
+    first = np.repeat([1, 1, 0, 0], [n_both, n_first, n_second, n_none]).astype(bool)[None]
+    second = np.repeat([1, 0, 1, 0], [n_both, n_first, n_second, n_none]).astype(bool)[None]
+    return first, second
+
+
+def test_independent_instances_match_the_formulas() -> None:
+    """The interval is about the normal one, and the test counts the instances on which one method is correct."""
+    first, second = marks(120, 45, 20, 15)
+    result = paired_difference(first, second, np.arange(200))
+    difference = np.repeat([0, 1, -1], [135, 45, 20])
+    error = difference.std() / math.sqrt(200)
+    assert result.difference == pytest.approx(0.125)
+    assert result.low == pytest.approx(0.125 - 1.96 * error, abs=0.1 * error)
+    assert result.high == pytest.approx(0.125 + 1.96 * error, abs=0.1 * error)
+    tail = sum(math.comb(65, k) for k in range(21)) / 2**65
+    assert (result.better, result.worse) == (45, 20) and result.p_value == pytest.approx(2 * tail)
+    assert result.verdict == "holds"
+    reverse = paired_difference(second, first, np.arange(200))
+    assert reverse.verdict == "does not hold" and reverse.difference == -result.difference
+
+
+def test_neighbouring_frames_do_not_narrow_the_interval() -> None:
+    first, second = marks(12, 9, 6, 3)
+    once = paired_difference(first, second, np.arange(30))
+    often = paired_difference(np.repeat(first, 10, axis=1), np.repeat(second, 10, axis=1), np.repeat(np.arange(30), 10))
+    assert (often.low, often.high, often.p_value) == (once.low, once.high, once.p_value)
+    assert (often.instances, often.placements) == (300, 30) and once.verdict == "undecided"
+
+
+def test_folds_are_averaged_before_they_are_compared() -> None:
+    """Over three folds, a difference of one third counts for the better method, and thirds that cancel for none."""
+    first = np.array([[1, 1, 0, 1], [1, 0, 1, 1], [1, 1, 1, 1]], bool)
+    second = np.array([[1, 0, 1, 1], [1, 1, 0, 1], [1, 1, 0, 1]], bool)
+    result = paired_difference(first, second, np.arange(4))
+    assert result.difference == pytest.approx(1 / 12) and (result.better, result.worse) == (1, 0)
+
+
+def test_equal_methods_and_single_placements_are_undecided() -> None:
+    first, second = marks(3, 0, 0, 2)
+    result = paired_difference(first, second, np.arange(5))
+    assert (result.low, result.high, result.p_value, result.verdict) == (0, 0, 1, "undecided")
+    one = paired_difference(*marks(0, 4, 0, 0), np.zeros(4, int))
+    assert one.placements == 1 and one.verdict == "undecided"
+
 
 NAMES = ("soup_can_red", "cereal_box_blue")
 
@@ -49,10 +99,10 @@ def test_documented_figures_are_those_of_the_results() -> None:
         values = [each["accuracy"]["log-mean"][0]["cells"][0]["accuracy"][title]["mean"] for each in (scenes, frames)]
         return " | ".join(f"{value:.3f}".lstrip("0") for value in values)
 
-    names = {"THOR2 (TOPS + TOPS2)": "THOR2", "CE + TOPS + TOPS2": "CE+TOPS+TOPS2", "TOPS, shape alone": "TOPS"}
-    names |= {"random forest": "forest"} | {title: title for title in TITLES.values() if title in scenes["fusions"]}
-    for name in names.keys() - {"forest"}:
-        assert f"| {name} | {accuracy(names[name])} |" in page
+    names = {"THOR2": "THOR2 (TOPS + TOPS2)", "CE+TOPS+TOPS2": "CE + TOPS + TOPS2", "TOPS": "TOPS, shape alone"}
+    for title in (*names, *(title for title in TITLES.values() if title in scenes["fusions"])):
+        name = (names | {"forest": "random forest"}).get(title, title)
+        assert f"| {name} | {accuracy(title)} |" in page
     for pair in list(zip(*(each["claims"]["log-mean"] for each in (scenes, frames)), strict=True))[:6]:
         cells = [
             f"{100 * c['difference']:+.1f} ({100 * c['low']:+.1f} to {100 * c['high']:+.1f}), {c['verdict']}"
@@ -66,24 +116,18 @@ def test_documented_figures_are_those_of_the_results() -> None:
     assert "RGB-D ViT-small, templates: trained from scratch" in text
 
 
-@pytest.fixture
-def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return options with two frames of two built-in objects, which also join the views."""
+@pytest.mark.slow
+def test_a_small_comparison_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
     monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", NAMES, seed)
-    return [
+    given = [
         *(f"--meshes={meshes}", f"--frames={frames}", f"--real={frames}", "--folds=1", "--workers=1"),
-        "--baselines=thor,forest,rgbd-vit-small,templates",
-        "--render=--azimuth-step 90 --polar-step 90",
+        *("--baselines=thor,forest,rgbd-vit-small,templates", "--render=--azimuth-step 90 --polar-step 90"),
         "--train=--epochs 1 --batch-size 8",
     ]
-
-
-@pytest.mark.slow
-def test_a_small_comparison_resumes(tmp_path: Path, given: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
     out = tmp_path / "out"
     paper.main([*given, f"--out={out}"])
     report: dict[str, Any] = json.loads((out / "paper.json").read_text())

@@ -1,12 +1,19 @@
-"""Summaries of the benchmarks of explanations, adaptation, tracks and segmentation: values written by hand."""
+"""Summaries of the benchmarks against values by hand, their bad arguments, and the benchmark of `thor2 doctor`."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from benchmarks import adaptation, explanation, segmentation
+from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
+from benchmarks.doctor import DAMAGES, run
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 from thor2_jax.explanation.attributions import Faithfulness
+from training.readers.frame_files import frame_files
 from training.readers.labelled import LabelledFrame
 
 
@@ -50,17 +57,62 @@ def test_pieces_are_compared_with_instances() -> None:
     item = LabelledFrame("a", frame, {1: "can", 2: "pen_red", 3: "mug"}, {})
 
     rows, on_background = segmentation.compare(pieces, item)
-    columns = {name: [row[name] for row in rows] for name in ("iou", "piece", "over", "under")}
-    assert columns == {
-        "iou": [1.0, 0.5, 0.5],
-        "piece": [1, 2, 4],
-        "over": [False, True, False],
-        "under": [False, False, True],
-    }
-    assert on_background == 1
+    columns = [(row["iou"], row["piece"], row["over"], row["under"]) for row in rows]
+    assert columns == [(1.0, 1, False, False), (0.5, 2, True, False), (0.5, 4, False, True)] and on_background == 1
     rows, on_background = segmentation.compare(np.zeros_like(pieces), item)
     assert [row["iou"] for row in rows] == [0.0, 0.0, 0.0] and on_background == 0
 
     report = segmentation.measure([item], lambda frame: pieces, None)
     assert (report["instances"], report["thick"], report["thick found"]) == (3, 2, 0.5)
     assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "arguments", "message"),
+    [
+        (cameras, "", "give --model, --frames and --out"),
+        (cameras, "--model x", "give --model, --frames and --out"),
+        (cameras, "--model x --frames y --out z", "y"),
+        (levers, "--meshes . --frames . --out out --levers none", "none"),
+        (levers, "--meshes . --frames . --out out --seeds 0", "seeds"),
+        (levers, "--meshes absent --frames . --out out", "absent"),
+        (paper, "--meshes . --out out", "scenes and frames are missing"),
+        (paper, "--meshes . --out out --frames absent --folds 0", "folds is 0"),
+        (paper, "--meshes . --out out --frames absent", "absent"),
+        (paper, "--meshes . --out out --frames . --baselines tree", "baselines is tree"),
+    ],
+)
+def test_bad_arguments_write_nothing(
+    benchmark: Any,
+    arguments: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        benchmark.main()
+    error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
+    assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
+
+
+@pytest.mark.slow
+def test_damaged_set_ups_are_diagnosed() -> None:
+    """A toy recognizer is the less sure the more the colours differ from those of the sample."""
+    color = frame_files(SAMPLES / "clutter").read().color.astype(float)
+
+    def recognize(frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
+        confidence = float(np.exp(-20 * np.abs(frame.color - color).mean() / 255))
+        return [thor2.Recognition(label, "known", confidence) for label in frame.instances]
+
+    assert len(DAMAGES) == 20
+    recognizer: Any = SimpleNamespace(recognize=recognize, classes=("known",))
+    report = run(SAMPLES, recognizer, ["clutter"])
+    wrong = {name: entry["found"] for name, entry in report["damaged"].items() if not entry["right"]}
+    assert report["right_by_frame"]["clutter"] == 20 - len(wrong) and len(wrong) <= 2, wrong

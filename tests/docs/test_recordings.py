@@ -1,14 +1,13 @@
 """The commands of docs/recordings.md run on the sample recording; the run's weights are random."""
 
 import json
-import shlex
 import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 from doc_pages import ROOT, shell_commands
-from helpers import run_thor2, untrained_run
+from helpers import Command, json_lines, run_thor2, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
@@ -44,13 +43,12 @@ def test_the_recording_shows_four_objects_apart() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 1])
-def test_recordings_are_recognized(number: int, capfd: pytest.CaptureFixture[str]) -> None:
-    words = COMMANDS[number]
-    assert run_thor2(*words[1:]) == 0, shlex.join(words)
-    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert len(lines) == (FRAMES if number == 0 else 2) and all(len(line["instances"]) >= 4 for line in lines)
-    assert Path("answers.mcap").is_file() == (number == 1)
+def test_recordings_are_recognized(printed: Command) -> None:
+    for words, count in zip(COMMANDS[:2], (FRAMES, 2), strict=True):
+        assert not Path("answers.mcap").exists()
+        lines = json_lines(printed(*words[1:]))
+        assert len(lines) == count and all(len(line["instances"]) >= 4 for line in lines)
+    assert Path("answers.mcap").is_file()
 
 
 @pytest.mark.slow

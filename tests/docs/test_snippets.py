@@ -16,7 +16,7 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
-from doc_pages import PAGES, ROOT, python_blocks
+from doc_pages import PAGES, ROOT
 from helpers import patches, random_clouds, run_thor2, tilted, untrained_run, write_frame_files
 from recording_files import table_frame
 
@@ -30,15 +30,8 @@ from thor2_jax.recordings import realsense
 from thor2_jax.tracking.tracker import Tracker
 
 BLOCKS = {
-    "README.md": 1,
-    "docs/cameras.md": 2,
-    "docs/explain.md": 1,
-    "docs/index.md": 1,
-    "docs/library.md": 10,
-    "docs/objects.md": 1,
-    "docs/recordings.md": 1,
-    "docs/segmentation.md": 3,
-    "docs/service.md": 2,
+    **dict.fromkeys(["README.md", "docs/explain.md", "docs/index.md", "docs/objects.md", "docs/recordings.md"], 1),
+    **{"docs/cameras.md": 2, "docs/segmentation.md": 3, "docs/service.md": 2, "docs/library.md": 10},
     "docs/tutorials/first-table.md": 1,
 }
 """Page -> number of its Python blocks; each one is executed by a test."""
@@ -51,7 +44,7 @@ FRAME = tilted(np.where(patches() == 7, 2, patches()))
 
 
 def blocks_of(page: str) -> list[str]:
-    return python_blocks((ROOT / page).read_text(encoding="utf-8"))
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
 def run_blocks(page: str, *numbers: int, **names: Any) -> dict[str, Any]:

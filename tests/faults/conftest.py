@@ -12,44 +12,40 @@ import pytest
 
 
 class Disk:
-    """Count the write operations under a directory, and fail from the n-th on, like a full or read-only disk.
+    """Count the write operations under a directory, and fail from the n-th on, like a full disk.
 
     Opening for writing, writing, creating a directory and renaming each count once. Removing never fails.
     """
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
-        self.folder, self.count, self.fail_at, self.number = str(folder), 0, 0, errno.ENOSPC
-        for module, name in ((builtins, "open"), (io, "open")):
-            patch.setattr(module, name, self._opening(getattr(module, name)))
+        self.folder, self.count, self.fail_at = str(folder), 0, 0
+        for module in (builtins, io):
+            patch.setattr(module, "open", self._opening(module.open))
         for name in ("mkdir", "rename", "replace"):
             patch.setattr(os, name, self._failing(getattr(os, name)))
-        low = os.open
-        patch.setattr(
-            os,
-            "open",
-            lambda path, flags, *a, **k: (flags & os.O_CREAT and self.step(path), low(path, flags, *a, **k))[1],
-        )
+        patch.setattr(os, "open", self._failing(os.open, lambda flags, *_: flags & os.O_CREAT))
 
     def step(self, path: Any) -> None:
         if isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.folder):
             self.count += 1
             if self.fail_at and self.count >= self.fail_at:
-                raise OSError(self.number, os.strerror(self.number), os.fspath(path))
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
 
-    def _failing(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def _failing(self, function: Callable[..., Any], writes: Any = lambda *_: True) -> Callable[..., Any]:
         def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
-            self.step(path)
+            if writes(*rest):
+                self.step(path)
             return function(path, *rest, **more)
 
         return wrapper
 
     def _opening(self, function: Callable[..., Any]) -> Callable[..., Any]:
         def wrapper(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
-            if set(mode) & set("wxa+"):
-                self.step(path)
+            if not set(mode) & set("wxa+") or not isinstance(path, (str, os.PathLike)):
+                return function(path, mode, *rest, **more)
+            self.step(path)
             stream = function(path, mode, *rest, **more)
-            if set(mode) & set("wxa+") and isinstance(path, (str, os.PathLike)):
-                self._failing_writes(stream, path)
+            self._failing_writes(stream, path)
             return stream
 
         return wrapper
@@ -67,9 +63,9 @@ class Disk:
 
         stream.write = failing_write
 
-    def reset(self, fail_at: int, number: int) -> None:
-        """Restart the count; fail from step `fail_at` on with the error `number`, or never if `fail_at` is 0."""
-        self.count, self.fail_at, self.number = 0, fail_at, number
+    def fail_from(self, step: int) -> None:
+        """Restart the count; fail from a step on, or never if it is 0."""
+        self.count, self.fail_at = 0, step
 
 
 @pytest.fixture

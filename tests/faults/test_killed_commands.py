@@ -1,13 +1,13 @@
 """Commands that are killed while they write: files under their final names are complete, and commands resume."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from flax import nnx
@@ -42,21 +42,10 @@ main()
 """
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Environment in which the processes share compiled programs."""
-    cache = {
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache")),
-        "JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "TF_CPP_MIN_LOG_LEVEL": "3",
-    }
-    return os.environ | cache
-
-
-def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -> None:
+def kill(place: str, *command: object) -> None:
     """Run a command and kill it before or after it renames a file or directory to its place in --out."""
     arguments = [sys.executable, "-c", KILLED, place, *map(str, command)]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG, env=environment)
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG)
     assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
 
 
@@ -95,12 +84,12 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
 
 
-def test_render(meshes: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
+def test_render(meshes: Path, refused: Command, tmp_path: Path) -> None:
     command, whole, out = ("render", "--meshes", meshes, *STEPS, "--out"), tmp_path / "whole", tmp_path / "views"
     assert run_thor2(*command, whole) == 0
     expected = files(whole)
     for place in (f"before {MANIFEST}", "before 0001-0000.safetensors"):
-        kill(place, (*command, out), environment)
+        kill(place, *command, out)
         written = files(out)
         if MANIFEST in written:
             manifest = Manifest.parse(written.pop(MANIFEST), out)
@@ -115,23 +104,19 @@ def test_render(meshes: Path, environment: Any, refused: Command, tmp_path: Path
 
 def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
     """Return whether two runs are equal; their files differ, because orbax names files at random."""
-    first, second = ([nnx.to_flat_state(nnx.state(m)) for m in run.classifiers.values()] for run in (one, other))
-    same = all(
-        path == other_path and np.array_equal(a[...], b[...])
-        for model, other_model in zip(first, second, strict=True)
-        for (path, a), (other_path, b) in zip(model, other_model, strict=True)
-    )
+    weights = ([nnx.state(classifier) for classifier in run.classifiers.values()] for run in (one, other))
+    same = jax.tree.all(jax.tree.map(np.array_equal, *weights))
     return same and (one.classes, one.config, one.record) == (other.classes, other.config, other.record)
 
 
-def test_train(meshes: Path, frames: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
+def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> None:
     options = (*STEPS, "--paper", "--batch-size", 16, "--classifiers", "ce", "--baselines", "forest", "--epochs", 2)
     command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
     assert run_thor2(*command, whole) == 0
     expected, run = files(whole), load_run(whole)
     places = "checkpoints/fold-0/ce/1", "curves.png", "run.json", "baselines/forest.safetensors", ".thor2-*/views"
     for place in (f"{'after' if place == places[0] else 'before'} {place}" for place in places):
-        kill(place, (*command, out), environment)
+        kill(place, *command, out)
         written = files(out)
         assert all(written[name] == expected[name] for name in {"curves.png", "network.npz"} & written.keys())
         assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
@@ -163,15 +148,12 @@ def without_times(contents: dict[str, bytes]) -> dict[str, Any]:
     return kept
 
 
-def test_evaluate(frames: Path, model: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
-    command, whole, out = (
-        ("evaluate", "frames", frames, "--model", model, "--out"),
-        tmp_path / "whole",
-        tmp_path / "out",
-    )
+def test_evaluate(frames: Path, model: Path, refused: Command, tmp_path: Path) -> None:
+    command = "evaluate", "frames", frames, "--model", model, "--out"
+    whole, out = tmp_path / "whole", tmp_path / "out"
     assert run_thor2(*command, whole) == 0
     expected = without_times(files(whole))
-    kill("before frames/1.jpg", (*command, out), environment)
+    kill("before frames/1.jpg", *command, out)
     written = without_times(files(out))
     kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
     assert {name for name in written if "confusions" not in name} == kept
@@ -182,11 +164,11 @@ def test_evaluate(frames: Path, model: Path, environment: Any, refused: Command,
     assert without_times(files(out)) == expected and files(out).keys() == files(whole).keys()
 
 
-def test_recognize(frames: Path, model: Path, environment: Any, tmp_path: Path) -> None:
+def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
     images = frame_options(frames / "one")
     command, whole, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "whole", tmp_path / "out"
     assert run_thor2(*command, whole) == 0
-    kill("before recognition.json", (*command, out), environment)
+    kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
     assert run_thor2(*command, out) == 0
     assert files(out) == files(whole)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import Interrupted, brick_and_stick, files_of
+from helpers import Interrupted, brick_and_stick, files_of, stop_when
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -56,14 +56,10 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
 
     other, begun = tmp_path / "other", []
 
-    def stop(stage: str, count: int, total: int, note: str) -> None:
-        if stage == "fit tops":
-            raise Interrupted
-
     def dies(stage: str, count: int, total: int, note: str) -> None:
         if stage == "describe" and not begun:
             begun.append(1)
             with pytest.raises(Interrupted):
-                train(other, progress=stop)
+                train(other, progress=stop_when("fit tops", 3))
 
     assert train(other, progress=dies).record == done[0].record  # resumes the other training

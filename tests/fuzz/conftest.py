@@ -31,9 +31,7 @@ def measured(read: Callable[[], Any], refusals: Any) -> tuple[Any, str | None, i
     """Return the result of a reader, or None and the message of its refusal, and the bytes that it took at most."""
 
     def memory(kind: str) -> int:
-        match = re.search(rf"{kind}:\s*(\d+) kB", Path("/proc/self/status").read_text())
-        assert match is not None
-        return 1024 * int(match[1])
+        return 1024 * int(re.findall(rf"{kind}:\s*(\d+) kB", Path("/proc/self/status").read_text())[0])
 
     Path("/proc/self/clear_refs").write_text("5")  # The peak is counted from here.
     before, result, message = memory("VmRSS"), None, None
@@ -91,9 +89,7 @@ def attempt(reader_process: ReaderProcess, request: pytest.FixtureRequest) -> Ca
     def call(read: Callable[[], Any], refusals: Any = (InputError, OSError)) -> Any:
         result, message, memory = reader_process(measured, read, refusals)
         assert memory < reader_process.memory, f"the reader takes {memory} bytes"
-        if message is not None:
-            assert message and "\n" not in message and len(message) < 20_000, message[:3000]
-            return None
+        assert message is None or (message and "\n" not in message and len(message) < 20_000), message[:3000]
         return result
 
     return call

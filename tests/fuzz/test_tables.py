@@ -1,20 +1,25 @@
-"""Damaged datasets: tables in JSON and YAML, point clouds, views; and the colour network."""
+"""Damaged datasets, run directories and colour networks."""
 
+import dataclasses
 import hashlib
 import io
 import json
 import zipfile
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 from dataset_files import band, write_bop, write_folder, write_ocid, write_uwis
+from helpers import untrained_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import colornet
-from thor2_jax.testing import damaged, networks
+import thor2_jax as thor2
+from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.testing import damaged
 from training.readers.bop import BOP
 from training.readers.frames import FrameFolder
 from training.readers.ocid import OCID
@@ -73,23 +78,15 @@ def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFact
 def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("views")
     rng = np.random.default_rng(0)
-    counts = np.array([5, 7])
     xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
-    numbers = np.array([0, 1], np.int32)
-    normalized = NormalizedViews(
-        xyz, rng.integers(0, 256, (12, 3), dtype=np.uint8), counts, 0, numbers, np.zeros(2, np.int32)
+    rgb = rng.integers(0, 256, (12, 3), dtype=np.uint8)
+    content = encode(
+        NormalizedViews(xyz, rgb, np.array([5, 7]), 0, np.arange(2, dtype=np.int32), np.zeros(2, np.int32))
     )
-    content = encode(normalized)
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
     Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
     return path
-
-
-def read_views(path: Path) -> list[Any]:
-    dataset = ViewDataset.open(path)
-    assert dataset.record
-    return [dataset.classes, len(dataset), *(dataset.read(k) for k in range(len(dataset.shards)))]
 
 
 def meaning(name: str, content: bytes) -> Any:
@@ -105,8 +102,13 @@ def meaning(name: str, content: bytes) -> Any:
 
 def read_damaged(name: str, content: bytes, views: Path, attempt: Any) -> Any:
     """Read the dataset while a file has another content."""
+
+    def read() -> list[Any]:
+        dataset = ViewDataset.open(views)
+        return [dataset.record, dataset.classes, len(dataset), *map(dataset.read, range(len(dataset.shards)))]
+
     with other_content(views / name, content):
-        return attempt(lambda: read_views(views))
+        return attempt(read)
 
 
 @pytest.mark.parametrize("name", [MANIFEST, "0000-0000.safetensors"])
@@ -175,9 +177,54 @@ def test_an_archive_that_would_fill_memory(times: int, attempt: Any, tmp_path: P
         attempt(lambda: colornet.load(path), ())
 
 
-@settings(max_examples=10)
-@given(network=networks())
-def test_networks_round_trip(network: colornet.ColorNetwork, tmp_path_factory: Any) -> None:
-    path = tmp_path_factory.getbasetemp() / "network.npz"
-    network.save(path)
-    assert colornet.load(path).fingerprint == network.fingerprint
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "run"
+    save_run(untrained_run(("mug", "bowl"), ("ce",), record={"epochs": 3}), path)
+    assert load_run(path).classes == ("mug", "bowl")
+    return path
+
+
+@given(data=st.data())
+def test_descriptions(data: st.DataObject, run: Path, attempt: Any) -> None:
+    """A damaged run.json is refused or read as a run with valid types; weights are not restored here."""
+    content = (run / "run.json").read_bytes()
+    if data.draw(st.booleans()):
+        other = data.draw(damaged(content))
+    else:
+        table = json.loads(content)
+        key = data.draw(st.sampled_from(sorted(table)))
+        part = data.draw(damaged(json.dumps(table[key]).encode()))
+        other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
+
+    def read() -> Any:
+        with mock.patch("thor2_jax.model.run_directory.model_from_arrays"):
+            return dataclasses.replace(load_run(run), classifiers={})
+
+    with other_content(run / "run.json", other):
+        loaded = attempt(read)
+    if loaded is not None:
+        assert isinstance(loaded.config, thor2.DescriptorConfig) and isinstance(loaded.record, dict)
+        assert loaded.classes and all(isinstance(name, str) for name in loaded.classes)
+
+
+@settings(max_examples=30)
+@given(data=st.data())
+def test_files_of_weights_and_network(data: st.DataObject, run: Path, attempt: Any) -> None:
+    files = sorted(p for p in run.rglob("*") if p.is_file() and p.name != "run.json" and p.stat().st_size)
+    path = data.draw(st.sampled_from(files))
+    content = data.draw(damaged(path.read_bytes()))
+    same = content == path.read_bytes()
+    with other_content(path, content):
+        loaded = attempt(lambda: same or load_run(run))
+    assert (loaded is None) == (not same)
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 10**5, "1e400", "-1", "null", "10000000"])
+def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
+    """Sizes that would fill memory are compared with the shapes of the weights before any array is allocated."""
+    table = json.loads((run / "run.json").read_bytes())
+    for key in ("n_slices", "n_strips"):
+        changed = table | {"descriptor_config": table["descriptor_config"] | {key: "PART"}}
+        with other_content(run / "run.json", json.dumps(changed).replace('"PART"', value).encode()):
+            assert attempt(lambda: load_run(run)) is None

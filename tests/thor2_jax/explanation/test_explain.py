@@ -16,17 +16,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.looks import LookDescriptors, describe_aligned_looks, describe_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
-from thor2_jax.explanation import attributions as attributions_module
-from thor2_jax.explanation import class_scores
-from thor2_jax.explanation.attributions import (
-    RELAXATION,
-    attribute_points,
-    leave_out,
-    path_gradients,
-    select_points,
-    smooth,
-    tenth_of,
-)
+from thor2_jax.explanation import attributions, class_scores
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
@@ -81,14 +71,8 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
-@pytest.mark.parametrize(
-    ("rule", "make_run"),
-    [
-        ("log-mean", untrained_run),
-        *(pytest.param(rule, untrained_run, marks=pytest.mark.slow) for rule in ("max", "mean")),
-        pytest.param("log-mean", untrained_embedding_run, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])
+@pytest.mark.parametrize("make_run", [untrained_run, *slow(untrained_embedding_run)])
 def test_margin_is_the_log_odds_of_the_answer(
     rule: str, make_run: Callable[..., TrainedRun], frame: thor2.RGBDFrame, instance: PreparedInstance
 ) -> None:
@@ -158,12 +142,12 @@ def test_parts_keep_the_mask_of_each_look(instance: PreparedInstance) -> None:
 
 def test_selected_points_keep_their_flags(recognizer: Recognizer, instance: PreparedInstance) -> None:
     kept = np.arange(len(instance.points)) % 3 > 0
-    selected = select_points(instance, kept)
+    selected = attributions.select_points(instance, kept)
     packed = pack_instances([selected], 1)
     assert instance.rim is not None and packed.rim is not None
     np.testing.assert_array_equal(packed.rim[0, : kept.sum()], instance.rim[kept])
     assert np.isfinite(classifier_scores(recognizer.model).of_instances([selected])).all()
-    assert select_points(dataclasses.replace(instance, rim=None), kept).rim is None
+    assert attributions.select_points(dataclasses.replace(instance, rim=None), kept).rim is None
 
 
 RED = np.asarray(NETWORK.membership(np.array([200, 30, 30], np.uint8))) > 0
@@ -184,16 +168,13 @@ def red() -> ClassScores:
 def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: ClassScores) -> None:
     scores, index = red, 1
     cloud = scores.orient(instance)
-    left = leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
+    left = attributions.leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
     oriented = describe_looks(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
     margin = jax.jit(lambda o: scores.margin(scores.of_descriptors(o), index)[0])
     for number in range(2):
         blank = lambda a, number=number: a * (np.arange(2) != number).reshape(2, *[1] * (a.ndim - 3))  # noqa: E731
-        each = dataclasses.replace(
-            oriented.each,
-            images=blank(np.asarray(oriented.each.images)),
-            embeddings=blank(np.asarray(oriented.each.embeddings)),
-        )
+        blanked = {name: blank(np.asarray(getattr(oriented.each, name))) for name in ("images", "embeddings")}
+        each = dataclasses.replace(oriented.each, **blanked)
         expected = float(margin(oriented) - margin(dataclasses.replace(oriented, each=each)))
         assert left.slices[number] == pytest.approx(expected, abs=1e-3)
     aligned = np.asarray(thor2.align(pack_instances([instance], 1), SMALL_CONFIG).points[0])[: len(instance.points)]
@@ -204,22 +185,15 @@ def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: Cla
 
 def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> float:
     """Return the relaxed margin of name 1 with a weight for all points."""
-    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
+    config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
     cloud = scores.orient(instance)
+    aligned, weights = cloud.aligned, jnp.full(cloud.aligned.mask.shape[1], weight, jnp.float32)
+    constant = region_sets(NETWORK), config, jnp.zeros((), jnp.int32), weights
     cut = [
-        relaxed_strips(
-            cloud.aligned.points[k].T,
-            cloud.aligned.colors[k],
-            cloud.aligned.mask[k],
-            region_sets(NETWORK),
-            config,
-            jnp.zeros((), jnp.int32),
-            jnp.full(cloud.aligned.mask.shape[1], weight, jnp.float32),
-        )
-        for k in range(scores.count)
+        relaxed_strips(aligned.points[k].T, aligned.colors[k], aligned.mask[k], *constant) for k in range(scores.count)
     ]
     together = jax.tree.map(lambda *a: jnp.stack(a), *cut)
-    oriented = describe_aligned_looks(cloud.aligned, cloud.weights[None], together, NETWORK, config)
+    oriented = describe_aligned_looks(aligned, cloud.weights[None], together, NETWORK, config)
     return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
 
 
@@ -228,16 +202,16 @@ def test_attributions_are_complete(
     recognizer: Recognizer, instance: PreparedInstance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
-    monkeypatch.setattr(attributions_module, "STEPS", 32)
+    monkeypatch.setattr(attributions, "STEPS", 32)
     scores = classifier_scores(recognizer.model)
-    gradients = path_gradients(scores, scores.orient(instance), 1)
+    gradients = attributions.path_gradients(scores, scores.orient(instance), 1)
     assert gradients.shape[0] == 32 and not gradients[:, len(instance.points) :].any()
     slope = (relaxed(scores, instance, 1.0) - relaxed(scores, instance, 0.5)) / 0.5
     assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
 
 
 def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
-    config = dataclasses.replace(SMALL_CONFIG, relaxation=RELAXATION)
+    config = dataclasses.replace(SMALL_CONFIG, relaxation=attributions.RELAXATION)
     aligned = thor2.align(pack_instances([instance], 1), config)
     cloud = jax.tree.map(lambda a: a[0], aligned)
     some = jnp.arange(len(cloud.mask)) % 3 > 0
@@ -255,12 +229,12 @@ def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
 
 def test_points_of_the_decisive_color_are_found(instance: PreparedInstance, red: ClassScores) -> None:
     cloud = red.orient(instance)
-    attributions = attribute_points(red, cloud, instance, 1)
+    found = attributions.attribute_points(red, cloud, instance, 1)
     is_red = instance.colors[:, 0] > instance.colors[:, 2]
     aligned = np.asarray(cloud.aligned.points[0])[: len(instance.points)]
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
-    assert attributions.values[is_red & inside].min() > 5 * np.abs(attributions.values[~is_red]).max()
-    assert attributions.faithfulness.holds and attributions.faithfulness.most_attributed > 0
+    assert found.values[is_red & inside].min() > 5 * np.abs(found.values[~is_red]).max()
+    assert found.faithfulness.holds and found.faithfulness.most_attributed > 0
 
 
 def test_smoothing_averages_over_neighbours() -> None:
@@ -268,8 +242,9 @@ def test_smoothing_averages_over_neighbours() -> None:
     points, values = (rng.random(shape).astype(np.float32) for shape in ((200, 3), (2, 200)))
     distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
     weights = np.exp(-((distances / 0.1) ** 2) / 2) * (distances <= 0.2)
-    np.testing.assert_allclose(smooth(points, values, 0.1), values @ weights / weights.sum(axis=0), rtol=1e-5)
-    np.testing.assert_array_equal(smooth(points, values, 0.0), values)
+    expected = values @ weights / weights.sum(axis=0)
+    np.testing.assert_allclose(attributions.smooth(points, values, 0.1), expected, rtol=1e-5)
+    np.testing.assert_array_equal(attributions.smooth(points, values, 0.0), values)
 
 
 @pytest.mark.slow
@@ -321,9 +296,9 @@ def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recogni
 def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -> None:
     values, check = explanation.attributions.values, explanation.attributions.faithfulness
     kept = np.ones(len(values), bool)
-    kept[np.argsort(-values, kind="stable")[: tenth_of(len(values))]] = False
+    kept[np.argsort(-values, kind="stable")[: attributions.tenth_of(len(values))]] = False
     scores = explanation.scores
-    rest = scores.of_instances([select_points(explanation.instance, kept)])
+    rest = scores.of_instances([attributions.select_points(explanation.instance, kept)])
     margin = float(scores.margin(jnp.asarray(rest), scores.names.index(explanation.name))[0])
     assert check.margin - margin == pytest.approx(check.most_attributed, abs=1e-3)
 

@@ -22,9 +22,7 @@ def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def rs() -> Any:
     return pytest.importorskip(
-        "pyrealsense2",
-        reason="pyrealsense2, or the system library libusb-1.0, is not installed",
-        exc_type=ImportError,
+        "pyrealsense2", reason="pyrealsense2, or the system library libusb-1.0, is not installed", exc_type=ImportError
     )
 
 
@@ -33,10 +31,11 @@ class SoftwareCamera:
 
     def __init__(self, rs: Any) -> None:
         self.rs, self.device, self.queue = rs, rs.software_device(), rs.syncer(20)
+        self.wait_for_frames = self.queue.wait_for_frames
         intrinsics = rs.intrinsics()
-        for name, value in dict(width=WIDTH, height=HEIGHT, fx=60.0, fy=61.0, ppx=32.0, ppy=24.0).items():
+        camera = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "ppx": 32.0, "ppy": 24.0}
+        for name, value in {**camera, "model": rs.distortion.brown_conrady, "coeffs": [0.01, 0, 0, 0, 0]}.items():
             setattr(intrinsics, name, value)
-        intrinsics.model, intrinsics.coeffs = rs.distortion.brown_conrady, [0.01, 0, 0, 0, 0]
         self.sensors = {}
         for uid, (name, stream, kind, size) in enumerate(
             [("Depth", rs.stream.depth, rs.format.z16, 2), ("Color", rs.stream.color, rs.format.rgb8, 3)]
@@ -65,9 +64,6 @@ class SoftwareCamera:
             if name == "Depth":
                 frame.depth_units = 0.00025
             sensor.on_video_frame(frame)
-
-    def wait_for_frames(self, milliseconds: int) -> Any:
-        return self.queue.wait_for_frames(milliseconds)
 
 
 @pytest.fixture

@@ -50,38 +50,28 @@ def test_frames_and_detections_are_read_back(reader: Any, tmp_path: Path) -> Non
     assert [one.name for one in tmp_path.iterdir()] == ["a.rrd"]
 
 
-def test_a_frame_without_instances(reader: Any, tmp_path: Path) -> None:
-    with RerunFile(tmp_path / "a.rrd") as file:
-        file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="x")
-    assert "/camera/color" in read(reader, tmp_path / "a.rrd")
-
-
-def test_no_frames_leave_no_file(reader: Any, tmp_path: Path) -> None:
-    with RerunFile(tmp_path / "a.rrd"):
+def test_files_of_frames_without_instances_and_of_no_frames(reader: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    with RerunFile(path):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_only_a_recording_of_this_software_is_replaced(reader: Any, tmp_path: Path) -> None:
-    for count in (1, 2):
-        with RerunFile(tmp_path / "a.rrd") as file:
+    for count in (1, 2):  # A recording of this software is replaced.
+        with RerunFile(path) as file:
             for _ in range(count):
-                file.write(segmented(table_frame()), [], name="x")
-    assert read(reader, tmp_path / "a.rrd")["/camera/boxes"]["frame"] == [0, 1]
-
-
-def test_a_recording_of_the_user_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / "a.rrd").write_bytes(b"RRF2 another program")
-    with pytest.raises(InputError, match=r"rerun is .*a\.rrd"):
-        RerunFile(tmp_path / "a.rrd")
-    assert (tmp_path / "a.rrd").read_bytes() == b"RRF2 another program"
+                file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="x")
+    assert read(reader, path)["/camera/name"]["frame"] == [0, 1]
 
 
 def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    users = tmp_path / "a.rrd"
+    users.write_bytes(b"RRF2 another program")
+    with pytest.raises(InputError, match=r"rerun is .*a\.rrd"):
+        RerunFile(users)
+    assert users.read_bytes() == b"RRF2 another program"
     with pytest.raises(InputError, match=r"\.rrd"):
         RerunFile(tmp_path / "a.mcap")
     with pytest.raises(OSError, match="No such file"):
         RerunFile(tmp_path / "none" / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(InputError, match=r"\.\[rerun\]"):
-        RerunFile(tmp_path / "a.rrd")
+        RerunFile(tmp_path / "b.rrd")

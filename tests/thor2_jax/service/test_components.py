@@ -5,8 +5,6 @@ import dataclasses
 import math
 import os
 import queue
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -20,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 from fastapi import FastAPI
+from helpers import finish_programs, start_program
 from processes import HANG
 from prometheus_client import CollectorRegistry, Counter
 from service_requests import calls, check_refused
 
-from thor2_jax.client import multipart
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import Batcher
@@ -39,10 +37,9 @@ from thor2_jax.service.settings import MAX_BODY, Settings
 class Device:
     """Double numbers; wait for permission before each batch."""
 
-    def __init__(self) -> None:
+    def __init__(self, permits: int = 0) -> None:
         self.batches: list[list[int]] = []
-        self.permits = threading.Semaphore(0)
-        self.called = threading.Event()
+        self.permits, self.called = threading.Semaphore(permits), threading.Event()
 
     def __call__(self, numbers: list[int]) -> list[int]:
         self.called.set()
@@ -70,12 +67,10 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
 
 
 def test_batch_waits_briefly_for_expected_jobs() -> None:
-    device = Device()
-    device.permits.release(10)
+    device = Device(10)
     batcher = Batcher(device, lambda: 2, max_batch=4, window=HANG)
-    first = batcher.submit([1], deadline_in())
-    second = batcher.submit([2], deadline_in())
-    assert (first.result(HANG), second.result(HANG)) == ([2], [4]) and device.batches == [[1, 2]]
+    jobs = [batcher.submit([number], deadline_in()) for number in (1, 2)]
+    assert [job.result(HANG) for job in jobs] == [[2], [4]] and device.batches == [[1, 2]]
     batcher.close()
     batcher = Batcher(device, lambda: 2, max_batch=4, window=0.3)
     start = time.monotonic()
@@ -122,8 +117,7 @@ def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
 def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     before = pool.submit(deadline_in(), os.getpid).result(HANG)
-    calls_that_fail = [(0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)]
-    for seconds, function, argument, status in calls_that_fail:
+    for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
         with pytest.raises(RequestError) as error:
             pool.submit(deadline_in(seconds), function, argument).result(HANG)
         assert error.value.status == status
@@ -200,16 +194,17 @@ def test_requests_are_refused_unless_ready(
 ) -> None:
     for state in ("starting", "stopping", "failed"):
         monkeypatch.setattr(app.state.service, "state", state)
-        ready, answer = calls(app, lambda c: c.get("/readyz"), frame_request(files))
-        assert ready.status_code == answer.status_code == 503 and answer.headers["retry-after"] == "1"
-        assert state in answer.json()["message"]
+        for answer in calls(app, lambda c: c.get("/readyz"), frame_request(files)):
+            assert answer.status_code == 503
+        assert answer.headers["retry-after"] == "1" and state in answer.json()["message"]
 
 
 def test_progress_of_the_warm_up_is_reported(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     service = Service(Settings(run_dir, max_batch=16, processes=1))
-    messages = []
+    messages: list[str] = []
+    explained: queue.Queue[tuple[int, bool]] = queue.Queue()
 
     def compile_shape(*_: int) -> None:
         with pytest.raises(RequestError) as error:
@@ -217,17 +212,15 @@ def test_progress_of_the_warm_up_is_reported(
         messages.append(error.value.message)
 
     monkeypatch.setattr(service.engine, "compile", compile_shape)
-    explained: queue.Queue[tuple[int, bool]] = queue.Queue()
     monkeypatch.setattr(pipeline, "compile_explanations", lambda _, *programs: explained.put(programs[:2]))
     with caplog.at_level("INFO"):
         service.start()
         service.wait_until_ready()
         assert [explained.get(timeout=300) for _ in range(3)] == [(2048, True), (4096, True), (8192, True)]
         service.close()
-    steps = [f"compiling {k} of 6" for k in range(1, 7)]
-    assert [step in message for step, message in zip(steps, messages, strict=True)] == [True] * 6
-    assert [step in caplog.text for step in steps] == [True] * 6
-    assert service.metrics.count_ready_workers() == 0
+    for k, message in enumerate(messages, 1):
+        assert f"compiling {k} of 6" in message and f"compiling {k} of 6" in caplog.text
+    assert len(messages) == 6 and service.metrics.count_ready_workers() == 0
 
 
 def test_full_queue_is_429_and_deadline_504(
@@ -280,13 +273,12 @@ def test_large_files_stay_in_memory(
     app: FastAPI, files: dict[str, bytes], recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(tempfile.SpooledTemporaryFile, "rollover")  # It would write to a file.
-    large = files | {"color": os.urandom(MAX_BODY - 200_000)}
-    assert len(multipart(large)[1]) > MAX_BODY - 200_000
+    large = files | {"color": bytes(MAX_BODY - 200_000)}
     assert calls(app, frame_request(large))[0].status_code == 200
     assert recognize.await_args is not None and recognize.await_args.args[0] == large
 
 
-def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
+def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its other counts are kept."""
     code = """if True:
         import os
@@ -301,9 +293,6 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
         metrics.in_progress.inc(1)
         print(metrics.text().decode())
     """
-    environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
-    text = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
+    (text,) = finish_programs(start_program(code))
     assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text

@@ -1,28 +1,41 @@
-"""The evidence of /v1/explain, compared with the library on the same run."""
+"""Explanations of frames and of one object, over HTTP, compared with the library, and on the web page."""
 
-import dataclasses
+import base64
+import io
 import json
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from helpers import encode_image
+from page_actions import answered, assert_fits, upload, wait_until
+from PIL import Image
+from playwright.sync_api import Page, Route, expect
+from processes import HANG
+from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
+from thor2_jax.errors import InputError
+from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.classifier import RunClassifiers
-from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
+from thor2_jax.model.model import Model
+from thor2_jax.service import pipeline
 from thor2_jax.service.answers import explained_frame
-from thor2_jax.service.engine import CloudResult, InferenceEngine
+from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_EXPLAINED, Settings
+from thor2_jax.service.settings import MAX_EXPLAINED
 
+Open = Callable[..., Page]
 Files = dict[str, bytes]
 
 
@@ -37,25 +50,21 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
     np.testing.assert_array_equal(decoded(LabelMap(**answer["label_map"])), frame.labels)
     plain = http.post("/v1/recognize", files=files).json()["instances"]
     for one, other in zip(answer["instances"], plain, strict=True):
-        assert one.keys() == other.keys() | {"details"}
-        assert [one[name] for name in ("label", "name", "unrecognized")] == [
-            other[name] for name in ("label", "name", "unrecognized")
-        ]
-        assert (one["details"] is None) == (one["name"] is None)
+        assert one.keys() == other.keys() | {"details"} and (one["details"] is None) == (one["name"] is None)
+        assert all(one[name] == other[name] for name in ("label", "name", "unrecognized"))
 
     described = thor2.Recognizer.load(run_dir).describe(frame)
     config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
     aligned = thor2.align(described.packed, config)
     colors = np.asarray(strips(aligned, network, config).color)
-    named = [one for one in answer["instances"] if one["details"] is not None]
-    assert len(named) == len(described.usable) == 3
-    for row, one in enumerate(named):
-        details, instance = one["details"], described.usable[row]
+    shown = [one["details"] for one in answer["instances"] if one["details"] is not None]
+    assert len(shown) == 3
+    for row, (details, instance) in enumerate(zip(shown, described.usable, strict=True)):
         images = np.asarray(described.descriptors.images[row])
         assert details["image_peak"] == pytest.approx(images.max(), rel=1e-4)
-        shown = np.array([piece["image"] for piece in details["slices"]])
-        assert shown.shape == images.shape and shown.max() == 255 and shown.min() >= 0
-        np.testing.assert_allclose(shown / 255 * details["image_peak"], images, atol=0.6 / 255 * details["image_peak"])
+        levels = np.array([piece["image"] for piece in details["slices"]])
+        assert levels.shape == images.shape and levels.max() == 255 and levels.min() >= 0
+        np.testing.assert_allclose(levels / 255 * details["image_peak"], images, atol=0.6 / 255 * details["image_peak"])
 
         shown_colors = np.zeros_like(colors[row])
         for number, piece in enumerate(details["slices"]):
@@ -71,33 +80,6 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
         assert (rgb == instance.colors[distance.argmin(axis=1)]).all(axis=1).mean() > 0.99
         borders = np.array(details["slice_borders"])
         np.testing.assert_allclose(borders, 0.1 * np.column_stack([np.arange(7), np.arange(1, 8)]), atol=1e-9)
-
-
-EMPTY = np.zeros(0, np.float32)
-
-
-def test_calibrated_confidences(run_dir: Path) -> None:
-    """Confidences use the temperatures of both classifiers, or the calibration of the run."""
-    rng = np.random.default_rng(0)
-    engine = InferenceEngine(Settings(run_dir))
-    alpha = np.full(len(engine.run.classes), 0.1)
-    probabilities = {name: rng.dirichlet(alpha).astype(np.float32) for name in ("tops", "tops2", "embedding")}
-    result = CloudResult(EMPTY, EMPTY, EMPTY, EMPTY, Inference(0, probabilities))
-    assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
-    engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
-    (confidence,) = engine.calibrated_confidences([result])
-    logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
-    expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
-    best = (probabilities["tops"] * probabilities["tops2"]).argmax()
-    assert confidence == pytest.approx(expected[best], rel=1e-4)
-
-    record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.2))}
-    run = dataclasses.replace(engine.run, record=record)
-    classifiers = RunClassifiers({**engine.model.classifiers, "embedding": lambda oriented: oriented})
-    engine._recognizer.model = dataclasses.replace(engine.model, run=run, classifiers=classifiers)
-    (confidence,) = engine.calibrated_confidences([result])
-    fused = engine.model.fused({name: values[None] for name, values in probabilities.items()})
-    assert confidence == pytest.approx(float(fused.max()))
 
 
 def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
@@ -137,3 +119,118 @@ def test_details_are_limited_to_the_first_instances() -> None:
 def test_released_slices_are_the_occurring_levels() -> None:
     (one,) = explained(1, thor2.DescriptorConfig.released(), np.array([0.02, 0.11, 0.32])).instances  # levels 0, 1, 3
     np.testing.assert_allclose(one.details.slice_borders, [(-0.05, 0.05), (0.05, 0.15), (0.25, 0.35)], atol=1e-9)
+
+
+BLANK = [base64.b64encode(encode_image(np.zeros((200, width), np.uint8))).decode() for width in (600, 300)]
+ANSWER = {
+    **{"label": 3, "name": "a", "explained_name": "a", "unit": "log-odds", "margin": 2.5, "timings": {}},
+    **{"loss_without_most_attributed_tenth": 1.25, "mean_loss_without_random_tenth": 0.125},
+    "changes": ["red +20, green +0, blue -3 (of 255): b"],
+    "pictures": [{"title": "What decided", "caption": "Orange speaks for a.", "png": png} for png in BLANK],
+}
+
+
+def ask(url: str, files: Files, instance: object) -> httpx.Response:
+    return httpx.post(f"{url}/v1/why", files=files, data={"instance": str(instance)}, timeout=HANG)
+
+
+def test_why_is_503_until_explanations_are_compiled(
+    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, is_compiled, compiled = teaching_app.state.service, threading.Event(), []
+
+    def compile_explanations(_: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
+        assert is_compiled.wait(300) and not is_stopped()
+        compiled.append((n_points, by_classifiers))
+
+    monkeypatch.setattr(service, "_compiled", {})
+    monkeypatch.setattr(pipeline, "compile_explanations", compile_explanations)
+    monkeypatch.setattr(pipeline, "explain_instance", Mock(side_effect=InputError("instance is explained")))
+    for _ in range(2):
+        response = ask(teaching_url, files, 3)
+        check_refused(response, 503, None, "compiled")
+        assert int(response.headers["retry-after"]) >= 1
+    assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=60).status_code == 200
+    is_compiled.set()
+    next(iter(service._compiled.values())).result(300)
+    check_refused(ask(teaching_url, files, 3), 422, "instance", "is explained")
+    assert compiled == service.engine.explanation_programs()
+
+
+def test_failed_compilation_leaves_the_error_to_requests(
+    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, fail = teaching_app.state.service, Mock(side_effect=InputError("explanations need a convention"))
+    monkeypatch.setattr(service, "_compiled", {})
+    for name in ("compile_explanations", "explain_instance"):
+        monkeypatch.setattr(pipeline, name, fail)
+    service._compile_explanations(*service.engine.explanation_programs()).result(300)
+    check_refused(ask(teaching_url, files, 3), 422, "instance", "convention")
+
+
+@pytest.mark.slow
+def test_why_returns_pictures(
+    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Almost all programs of an explanation are compiled before the first one."""
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    service = teaching_app.state.service
+    service._compile_explanations(*service.engine.explanation_programs()).result(600)
+    before = service.metrics.compilations._value.get()
+    answer = ask(teaching_url, files, 3).json()
+    assert service.metrics.compilations._value.get() - before < 30  # of about 290
+    assert answer["label"] == 3 and answer["explained_name"] in ("a", "b") and answer["unit"] == "log-odds"
+    assert set(answer["timings"]) >= {"upload", "decode", "clouds", "explain", "total"}
+    assert len(answer["pictures"]) >= 2
+    for one in answer["pictures"]:
+        with Image.open(io.BytesIO(base64.b64decode(one["png"]))) as image:
+            assert image.format == "PNG" and min(image.size) > 200
+        assert one["title"] and one["caption"].endswith(".")
+
+
+def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
+    damaged = files | {"depth": b"damaged"}
+    for sent, instance, field in ((files, 4, "instance"), (files, "x", "instance"), (damaged, 3, "depth")):
+        check_refused(ask(teaching_url, sent, instance), 422, field)
+
+
+def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_url: str, files: Files) -> None:
+    requests: list[Route] = []
+
+    def compile_first(route: Route) -> None:
+        requests.append(route)
+        if len(requests) == 1:
+            problem = {"field": None, "message": "Explanations are still being compiled."}
+            route.fulfill(status=503, json=problem, headers={"Retry-After": "1"})
+
+    def ask_why(label: int) -> None:
+        page.locator(f'#objects button[data-label="{label}"]').click()
+        page.get_by_role("button", name="Why?").click()
+
+    page = open_page(url=teaching_url)
+    page.route("**/v1/why", compile_first, times=2)
+    upload(page, files)
+    ask_why(3)
+    expect(page.locator("#why-status")).to_contain_text("still being compiled")
+    expect(page.get_by_role("button", name="Why?")).to_be_disabled()
+    wait_until(page, lambda: len(requests) == 2)  # the message stays until it is answered
+    assert b'name="instance"\r\n\r\n3\r\n' in (requests[1].request.post_data_buffer or b"")
+    requests[1].fulfill(json=ANSWER)
+    for text in ("2.5", "red +20"):
+        expect(page.locator("#why-status")).to_contain_text(text)
+    shown = page.locator("#why-pictures canvas")
+    expect(shown).to_have_count(2)
+    assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
+    expect(shown.first).to_have_attribute("aria-label", "What decided. Orange speaks for a.")
+    for width in (1280, 390):
+        assert_fits(page, width)
+    problem = {"field": "instance", "message": "instance 7 cannot be explained."}
+    page.route("**/v1/why", answered("/v1/why", status=422, json=problem))
+    page.locator('#objects button[data-label="7"]').click()  # The explanation belonged to the other object.
+    expect(shown).to_have_count(0)
+    expect(page.locator("#why-status")).to_have_text("")
+    ask_why(7)
+    expect(page.locator("#why-status")).to_have_text(problem["message"])
+    expect(page.get_by_role("button", name="Why?")).to_be_enabled()
+    page.locator('#objects button[data-label="5"]').click()  # It has too few points to be described.
+    expect(page.locator("#why")).to_be_hidden()

@@ -1,9 +1,6 @@
 """Frames without labels: the service segments them, and says what is wrong with a segmenter."""
 
 import contextlib
-import functools
-import json
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +10,6 @@ import httpx
 import numpy as np
 import pytest
 from processes import HANG
-from service_requests import check_refused
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
@@ -56,22 +52,11 @@ def wrapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-@pytest.fixture
-def segment_by(wrapper: None) -> Iterator[Callable[[str, Files], Any]]:
-    """Return a function that prepares a frame in the process of a pool with a segmenter."""
-    with contextlib.ExitStack() as stack:
-
-        @functools.cache
-        def pool(name: str) -> PreparationPool:
-            made = PreparationPool(1, name)
-            stack.callback(made.close)
-            return made
-
-        yield (
-            lambda name, files: (
-                pool(name).submit(time.monotonic() + HANG, prepare_frame, files, 2.5, False, name).result(HANG)
-            )
-        )
+@contextlib.contextmanager
+def preparation_by(name: str | None) -> Iterator[Callable[[Files], Any]]:
+    """Yield a function that prepares a frame in the process of a pool with a segmenter."""
+    with contextlib.closing(PreparationPool(1, name)) as pool:
+        yield lambda files: pool.submit(time.monotonic() + HANG, prepare_frame, files, 2.5, False, name).result(HANG)
 
 
 def test_a_frame_without_labels_is_segmented(
@@ -90,50 +75,40 @@ def test_a_frame_without_labels_is_segmented(
     explained = http.post("/v1/explain", files=unlabelled).json()
     assert len(explained["instances"]) == 3 and set(explained["label_map"]["labels"]) == {0, 1, 2, 3}
     assert http.get("/v1/model").json()["segmenter"] == "table"
-    for field in unlabelled:
-        check_refused(http.post("/v1/recognize", files=unlabelled | {field: b"damaged"}), 422, field)
-    for change in ({"fx": 1e-9}, {"cx": 1e8}, {"fx": 1e300, "fy": 1e300}):
-        camera = json.loads(unlabelled["intrinsics"]) | change
-        answer = http.post("/v1/recognize", files=unlabelled | {"intrinsics": json.dumps(camera).encode()})
-        assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
-def test_frames_without_labels_can_be_refused(unlabelled: Files) -> None:
-    with pytest.raises(RequestError, match="labels is missing") as caught:
-        prepare_frame(unlabelled, 2.5, False, None)
-    assert (caught.value.status, caught.value.field) == (422, "labels")
-
-
-def test_a_segmenter_of_another_package(segment_by: Callable[[str, Files], Any], unlabelled: Files) -> None:
-    prepared = segment_by("halves", unlabelled)
+@pytest.mark.usefixtures("wrapper")
+def test_a_segmenter_of_another_package(unlabelled: Files) -> None:
+    with preparation_by("halves") as prepare:
+        prepared = prepare(unlabelled)
     assert [instance.label for instance in prepared.instances] == [7]
     assert prepared.label_map.labels == [0, 7] * 240 and prepared.label_map.lengths == [160] * 480
 
 
+@pytest.mark.usefixtures("wrapper")
 @pytest.mark.parametrize(
     ("name", "status", "words"),
     [
         ("failing", 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
         ("leaving", 500, "segmenter leaving ended the process"),
         ("many", 422, "labels has 76799 instances"),
+        (None, 422, "labels is missing"),
     ],
 )
-def test_a_segmenter_that_fails_ends_one_request(
-    segment_by: Callable[[str, Files], Any], unlabelled: Files, files: Files, name: str, status: int, words: str
+def test_without_labels_of_a_segmenter_one_request_fails(
+    unlabelled: Files, files: Files, name: str | None, status: int, words: str
 ) -> None:
-    for _ in range(2):
-        with pytest.raises(RequestError, match=words) as caught:
-            segment_by(name, unlabelled)
-        assert (caught.value.status, caught.value.field) == (status, "labels")
-    assert [instance.label for instance in segment_by(name, files).instances] == [3, 5, 7, 200]
+    with preparation_by(name) as prepare:
+        for _ in range(2):
+            with pytest.raises(RequestError, match=words) as caught:
+                prepare(unlabelled)
+            assert (caught.value.status, caught.value.field) == (status, "labels")
+        assert [instance.label for instance in prepare(files).instances] == [3, 5, 7, 200]
 
 
 def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Settings(tmp_path).segmenter == "table"
     with pytest.raises(InputError, match="segmenter is 'sam'; expected one of table"):
         Settings(tmp_path, segmenter="sam")
-    monkeypatch.setitem(sys.modules, "thor2_jax.segmentation.table", None)
-    with pytest.raises(InputError, match=r"OpenCV.*\[segment\]"):
-        Settings(tmp_path, segmenter="table")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert Settings(tmp_path).segmenter is None

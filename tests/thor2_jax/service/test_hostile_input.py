@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -19,6 +20,10 @@ from helpers import Pickled, deep_png, encode_image, png_file, with_checksums
 from processes import HANG
 from service_requests import check_refused
 
+from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import read_frame
+from thor2_jax.service.decoding import decode_frame
+from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import MAX_BODY
 
 Files = dict[str, bytes]
@@ -40,6 +45,40 @@ def png_bomb(width: int, height: int) -> bytes:
     return png_file(with_checksums((b"IHDR", header), (b"IDAT", zlib.compress(bytes(10**7), 9)), (b"IEND", b"")))
 
 
+PIXELS = np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2
+DATA = zlib.compress(np.pad(PIXELS, ((0, 0), (1, 0))).tobytes(), 0)
+CHUNKS = with_checksums(
+    (b"IHDR", struct.pack(">IIBBBBB", 16, 12, 8, 3, 0, 0, 0)),
+    (b"PLTE", bytes(6)),
+    (b"tEXt", b"Title\0scene"),
+    *((b"IDAT", part) for part in (DATA[:50], DATA[50:90], DATA[90:])),
+    (b"tIME", bytes(7)),
+    (b"IEND", b""),
+)
+"""An indexed image of zeros and ones, with its pixels in three chunks."""
+
+
+def test_png_with_an_invalid_checksum(tmp_path: Path) -> None:
+    """The service and the library refuse it, even if its pixels can be decoded."""
+    images = {"color": np.zeros((12, 16, 3), np.uint8), "depth": np.ones((12, 16), np.uint16)}
+    contents = {name: encode_image(pixels) for name, pixels in images.items()}
+    contents |= {"intrinsics": b'{"fx": 9, "fy": 9, "cx": 8, "cy": 6}', "labels": png_file(CHUNKS)}
+    paths = {name: tmp_path / name for name in contents}
+    for name, path in paths.items():
+        path.write_bytes(contents[name])
+    for frame in (decode_frame(**contents), read_frame(**paths)):
+        np.testing.assert_array_equal(frame.labels, PIXELS)
+    for k, (kind, content, crc) in enumerate(CHUNKS[:-1]):
+        for changed in ((kind, content, crc ^ 1), (kind, bytes([*content[:-1], content[-1] ^ 1]), crc)):
+            labels = png_file([*CHUNKS[:k], changed, *CHUNKS[k + 1 :]])
+            with pytest.raises(RequestError) as error:
+                decode_frame(**contents | {"labels": labels})
+            assert (error.value.status, error.value.field) == (422, "labels")
+            paths["labels"].write_bytes(labels)
+            with pytest.raises(InputError, match="^labels: .* is damaged"):
+                read_frame(**paths)
+
+
 @pytest.mark.parametrize("field", ["color", "depth", "labels"])
 def test_damaged_truncated_or_large_images(http: httpx.Client, files: Files, field: str) -> None:
     good = files[field]
@@ -53,16 +92,10 @@ def test_damaged_truncated_or_large_images(http: httpx.Client, files: Files, fie
 
 
 def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame: Any) -> None:
-    gif = encode_image(frame.labels, "GIF")
-    for field, content in (
-        ("color", files["labels"]),
-        ("color", gif),
-        ("depth", files["color"]),
-        ("depth", files["labels"]),
-        ("labels", files["color"]),
-        ("labels", gif),
-    ):
-        check_refused(post(http, files, **{field: content}), 422, field)
+    contents = files | {"gif": encode_image(frame.labels, "GIF")}
+    for field, others in {"color": ("labels", "gif"), "depth": ("color", "labels"), "labels": ("color", "gif")}.items():
+        for other in others:
+            check_refused(post(http, files, **{field: contents[other]}), 422, field)
     check_refused(post(http, files, color=deep_png(240, 320)), 422, "color", "16", "8")
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode_image(np.ones((120, 160), kind))
@@ -77,7 +110,7 @@ def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> 
     assert [problem["field"], *(other["field"] for other in problem["further"])] == ["color", "labels", "intrinsics"]
 
 
-def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
+def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files) -> None:
     good = json.loads(files["intrinsics"])
     values = (float("nan"), float("inf"), 0, -1, "600", None, 10**400, 10**3000)
     texts = [json.dumps(good | {"fx": value}) for value in values]
@@ -85,9 +118,11 @@ def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
     for content in (*map(str.encode, texts), b"\xff\xfe\x00"):
         check_refused(post(http, files, intrinsics=content), 422, "intrinsics")
     check_refused(post(http, files, intrinsics=b" " * 5000), 413, "intrinsics", "5000")
-    for extreme in ({"fx": 1e-300}, {"cx": 1e300}, {"fx": 1e300, "fy": 1e300}, {"depth_scale": 1e-300}):
-        answer = post(http, files, intrinsics=json.dumps(good | extreme).encode())
-        assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
+    extremes = {"fx": 1e-300}, {"fx": 1e-9}, {"cx": 1e300}, {"cx": 1e8}, {"fx": 1e300, "fy": 1e300}
+    for extreme in (*extremes, {"depth_scale": 1e-300}):
+        for frame in (files, unlabelled):
+            answer = post(http, frame, intrinsics=json.dumps(good | extreme).encode())
+            assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
 def test_invalid_forms(http: httpx.Client, files: Files) -> None:
@@ -147,16 +182,13 @@ def npz(**arrays: Any) -> bytes:
 POINTS, COLORS = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8)
 
 
+NO_POINTS = [
+    *(POINTS.astype(np.int64), POINTS[:, :2], np.full_like(POINTS, np.nan), np.full_like(POINTS, 1e30)),
+    *(np.array([Pickled()] * 4), np.array(["a", "b"]), np.zeros(4, [("x", "f4")])),
+]
 INVALID_ARRAYS = [
-    ("points", POINTS.astype(np.int64)),
-    ("points", np.zeros((4, 2), np.float32)),
-    ("points", np.full((4, 3), np.nan, np.float32)),
-    ("points", np.full((4, 3), 1e30, np.float32)),
-    ("points", np.array([Pickled()] * 4)),
-    ("points", np.array(["a", "b"])),
-    ("points", np.zeros(4, [("x", "f4")])),
-    ("colors", np.zeros((5, 3), np.uint8)),
-    ("colors", np.zeros((4, 3), np.float32)),
+    *[("points", array) for array in NO_POINTS],
+    *[("colors", array) for array in (np.zeros((5, 3), np.uint8), COLORS.astype(np.float32))],
     *[("sizes", np.array(sizes)) for sizes in ([3], [5, -1], [2**62, 2**62, 2**62, 2**62 + 4], [4.0], 4)],
     *[("sizes", np.zeros(count, int)) for count in (0, 1000)],
 ]

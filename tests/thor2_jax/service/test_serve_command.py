@@ -2,10 +2,8 @@
 
 import asyncio
 import functools
-import os
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +11,13 @@ from typing import Any
 
 import pytest
 import uvicorn
-from helpers import Command
+from helpers import Command, finish_programs, start_program
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.errors import InputError
 from thor2_jax.service import server
 from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
-from training.cli import main
 
 
 @pytest.fixture
@@ -39,12 +36,10 @@ def test_missing_run_directory(workers: int, tmp_path: Path, serve: Command, cap
     assert workers == 1 or "listening at" not in caplog.text  # that is logged after the model is loaded
 
 
-def test_xla_log_is_silenced_before_jax_is_imported() -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
-    command = [sys.executable, "-c", code, "TF_CPP_MIN_LOG_LEVEL"]
-    ended = subprocess.run(command, cwd=Path(__file__).parents[3], env=environment, capture_output=True, text=True)
-    assert ended.stdout.split() == ["False", "3"], ended.stderr
+    assert finish_programs(start_program(code, "TF_CPP_MIN_LOG_LEVEL")) == ["False\n3\n"]
 
 
 def test_port_in_use(run_dir: Path, serve: Command) -> None:
@@ -52,21 +47,13 @@ def test_port_in_use(run_dir: Path, serve: Command) -> None:
         assert "in use" in serve("--model", str(run_dir), "--port", str(taken.getsockname()[1]))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--max-batch 7", "max_batch is 7"),
-        ("--unknown-below 2", "unknown_below is 2.0"),
-        ("--token é", "token"),
-        ("--deadline 0", "deadline is 0.0"),
-        ("--deadline nan", "deadline is nan"),
-        ("--deadline inf", "deadline is inf"),
-        ("--allow-host http://robot.local", "allow_host is 'http://robot.local'"),
-        (f"--cache {__file__}", "cache is"),
-    ],
-)
-def test_invalid_settings(run_dir: Path, serve: Command, options: str, message: str) -> None:
-    assert message in serve("--model", run_dir, *options.split())
+SETTINGS = ("max-batch", "7"), ("unknown-below", "2.0"), ("allow-host", "http://robot.local"), ("cache", __file__)
+
+
+@pytest.mark.parametrize(("name", "value"), [*SETTINGS, *(("deadline", value) for value in ("0.0", "nan", "inf"))])
+def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) -> None:
+    error = serve("--model", run_dir, f"--{name}", value)
+    assert f"{name.replace('-', '_')} is " in error and value in error
 
 
 @pytest.mark.parametrize("name", ["queue", "processes"])
@@ -75,10 +62,10 @@ def test_settings_that_only_the_library_can_have(name: str, run_dir: Path) -> No
         Settings(run_dir, **{name: 0})
 
 
-def test_an_empty_token_does_not_switch_authentication_off(
-    run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert "--token" in serve("--model", run_dir, "--token", "")
+def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty one does not switch authentication off."""
+    for token in ("", "é"):
+        assert "--token" in serve("--model", run_dir, "--token", token)
     monkeypatch.setenv("THOR2_TOKEN", "")
     assert "THOR2_TOKEN" in serve("--model", run_dir)
 
@@ -119,39 +106,28 @@ def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.Monk
         "call = pool.submit(time.monotonic() + 60, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
         "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert ended.stdout.split("\n") == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}", "set()", ""], ended.stderr
+    assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     app = create_app(Settings(run_dir), workers=2)
-    states: list[str] = []
 
-    def start() -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    async def run() -> None:
+    async def state() -> str:
         async with app.router.lifespan_context(app):
-            states.append(app.state.service.state)
+            return str(app.state.service.state)
 
-    monkeypatch.setattr(app.state.service, "start", start)
     for name in ("wait_until_ready", "close"):
         monkeypatch.setattr(app.state.service, name, lambda: None)
+    monkeypatch.setattr(app.state.service, "start", lambda: signal.raise_signal(signal.SIGTERM))
     handler = signal.signal(signal.SIGTERM, lambda *_: None)
     try:
-        asyncio.run(run())
+        assert asyncio.run(state()) == "stopping"
     finally:
         signal.signal(signal.SIGTERM, handler)
-    assert states == ["stopping"]
 
 
-def test_missing_package_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run_dir: Path
-) -> None:
+def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, refused: Command, run_dir: Path) -> None:
     for name in [name for name in sys.modules if name.startswith("thor2_jax.service")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    monkeypatch.setattr(sys, "argv", ["thor2", "serve", "--model", str(run_dir)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2 and "'.[serve]'" in capsys.readouterr().err
+    assert "'.[serve]'" in refused("serve", "--model", run_dir)

@@ -6,7 +6,6 @@ import functools
 import io
 import json
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import httpx
@@ -45,24 +44,6 @@ def fail() -> thor2.RGBDFrame:
     raise InputError("depth is missing")
 
 
-class Clock:
-    """A clock that stands still, but for sleeping and for `work` seconds after each frame."""
-
-    def __init__(self, work: Sequence[float]) -> None:
-        self.now, self.work = 0.0, iter(work)
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-    def times(self, stamps: Sequence[float]) -> list[tuple[float, float]]:
-        """Return time stamp and time at which it was shown, of each frame that was."""
-        shown = []
-        for frame in paced(map(recorded, stamps), lambda: self.now, self.sleep):
-            shown.append((frame.stamp / SECOND, self.now))
-            self.now += next(self.work, 0.0)
-        return shown
-
-
 STAMPS = [100 + k / 10 for k in range(10)]
 
 
@@ -80,13 +61,20 @@ STAMPS = [100 + k / 10 for k in range(10)]
 def test_recordings_play_at_their_speed(
     stamps: list[float], work: list[float], expected: list[tuple[float, float]]
 ) -> None:
-    assert Clock(work).times(stamps) == [pytest.approx(each) for each in expected]
+    """The clock stands still, but for sleeping and for the work after each frame."""
+    clock, shown, works = [0.0], [], iter(work)
+
+    def sleep(seconds: float) -> None:
+        clock[0] += seconds
+
+    for frame in paced(map(recorded, stamps), lambda: clock[0], sleep):
+        shown.append(pytest.approx((frame.stamp / SECOND, clock[0])))
+        sleep(next(works, 0.0))
+    assert shown == expected
 
 
 def latest(broadcast: Broadcast) -> dict[str, Any]:
-    message = broadcast.wait(0, 0)
-    assert message is not None
-    return dict(json.loads(message[1]))
+    return dict(json.loads(broadcast.wait(0, 0)[1]))
 
 
 def test_messages_of_a_view() -> None:
@@ -101,10 +89,9 @@ def test_messages_of_a_view() -> None:
     assert one["objects"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(one["image"]))))
     assert picture.shape == (240, 320, 3)
-    for k, (row, column) in enumerate([(115, 60), (115, 180)]):  # left edges of the boxes
-        paint = [int(one["objects"][k]["color"][i : i + 2], 16) for i in (1, 3, 5)]
-        near = picture[row, column - 3 : column + 4].astype(int)
-        assert np.abs(near - paint).sum(axis=1).min() < 180  # without a line, at least 260
+    for shown, column in zip(one["objects"], (60, 180), strict=True):  # left edges of the boxes
+        near = picture[115, column - 3 : column + 4].astype(int) - list(bytes.fromhex(shown["color"][1:]))
+        assert np.abs(near).sum(axis=1).min() < 180  # without a line, at least 260
     view.show(recorded(2, fail))
     failed = message()
     assert failed["error"] == "depth is missing" and failed["objects"] == [] and failed["number"] == 1
@@ -114,13 +101,11 @@ def test_messages_of_a_view() -> None:
 
 
 def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
-    labels = np.zeros((240, 320), np.uint8)
-    labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
-
     class Tracked(Recognition):
         track, frames = 2, 5
 
-    broadcast = Broadcast()
+    broadcast, labels = Broadcast(), np.zeros((240, 320), np.uint8)
+    labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
     view = LiveView(lambda f: [Tracked(label, f"name {label}") for label in f.instances], segment_table, broadcast)
     view.show(recorded(1, lambda: dataclasses.replace(table_frame(), labels=labels)))
     objects = latest(broadcast)["objects"]
@@ -158,9 +143,8 @@ def test_server_serves_its_files_and_events_only() -> None:
 
 def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
-    broadcast, errors = Broadcast(), []
+    broadcast, page, errors = Broadcast(), browser.new_page(), []
     view = LiveView(recognize, segment_table, broadcast)
-    page = browser.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:
@@ -169,9 +153,8 @@ def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.Monk
         expect(page.locator("#message")).to_contain_text("compiled")
         for k in range(3):
             view.show(recorded(1_700_000_000.5 + k))
-        expect(page.locator("#ready")).to_have_text("Live")
-        expect(page.locator("#number")).to_have_text("3")
-        expect(page.locator("#frame")).to_have_text("1700000002.500")
+        for selector, text in (("ready", "Live"), ("number", "3"), ("frame", "1700000002.500")):
+            expect(page.locator(f"#{selector}")).to_have_text(text)
         expect(page.locator("#objects .name")).to_have_text(["<b>mug</b>", "unknown"])
         expect(page.locator("#objects .confidence")).to_have_text(["90 %", "90 %"])
         assert page.locator("#picture").evaluate("image => image.decode().then(() => image.naturalWidth)") == 320

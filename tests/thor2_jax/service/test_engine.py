@@ -1,0 +1,146 @@
+"""The engine of the service, without HTTP: enrolled objects, an embedding alone, confidences, adaptation."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from unittest.mock import create_autospec
+
+import jax
+import numpy as np
+import pytest
+from helpers import SMALL_CONFIG, assert_same_answers, slow, small_embedding, untrained_embedding_run, untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.adaptation import estimate
+from thor2_jax.adaptation.color_transform import ColorTransform
+from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
+from thor2_jax.explanation import class_scores
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.inference import Inference
+from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.service import engine as service_engine
+from thor2_jax.service.answers import adaptation_answer
+from thor2_jax.service.engine import CloudResult, InferenceEngine
+from thor2_jax.service.settings import Settings
+
+BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
+
+
+@pytest.fixture(autouse=True)
+def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
+    monkeypatch.setattr(service_engine, "MIN_POINTS_BUCKET", 512)
+    monkeypatch.setattr(estimate, "CAPACITY", 512)
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+
+
+def write_run(folder: Path, trained: tuple[str, ...], record: dict[str, object]) -> Path:
+    """Write a run with trained classes and an embedding."""
+    save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), folder)
+    small_embedding().save(folder / EMBEDDING_FILE)
+    return folder
+
+
+def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], list[CloudResult]]:
+    """Return the instances of a frame, and the results of those that can be used."""
+    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
+    return instances, engine.infer([instance for instance in instances if instance.reason is None])
+
+
+@pytest.mark.parametrize("trained", [("a", "b"), *slow(())])
+@pytest.mark.parametrize("record", [{}, *slow(BY_CLASSIFIERS)])
+def test_the_engine_answers_as_the_recognizer(
+    trained: tuple[str, ...], record: dict[str, object], frame: thor2.RGBDFrame, tmp_path: Path
+) -> None:
+    recognizer = thor2.Recognizer.load(write_run(tmp_path / "run", trained, record))
+    recognizer.enroll("tall", [(frame, 200)])
+    recognizer.enroll("wide", [(frame, 7)])
+    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
+    assert engine.model.names == (*trained, "tall", "wide")
+    instances, results = inferred(engine, frame)
+    assert_same_answers(engine.recognize(instances, results), recognizer.recognize(frame), 1e-4)
+    assert engine.calibrated_confidences(results) == [None] * 3
+    unusable = [instance for instance in instances if instance.reason is not None]
+    assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
+
+
+@pytest.mark.parametrize("calibration", [None, Calibration(0.0, 1.0, 1.0, 0.5, 0.1)])
+def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor2.RGBDFrame, tmp_path: Path) -> None:
+    record: dict[str, object] = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
+    run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
+    save_run(run, tmp_path / "run")
+    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
+    assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
+    instances, results = inferred(engine, frame)
+    recognizer = thor2.Recognizer.load(tmp_path / "run")
+    answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
+    assert_same_answers(answers, expected, 1e-4)
+    calibrated = engine.calibrated_confidences(results)
+    of_usable = [one.confidence for one in expected if one.confidence is not None]
+    assert len(of_usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}
+    assert calibrated == ([None] * len(results) if calibration is None else pytest.approx(of_usable, abs=1e-4))
+    assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
+
+
+def test_confidences_use_the_temperatures_of_both_classifiers(run_dir: Path) -> None:
+    rng = np.random.default_rng(0)
+    engine = InferenceEngine(Settings(run_dir))
+    alpha = np.full(len(engine.run.classes), 0.1)
+    probabilities = {name: rng.dirichlet(alpha).astype(np.float32) for name in ("tops", "tops2", "embedding")}
+    result = CloudResult(*[np.zeros(0, np.float32)] * 4, Inference(0, probabilities))
+    assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
+    engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
+    (confidence,) = engine.calibrated_confidences([result])
+    logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
+    expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
+    best = (probabilities["tops"] * probabilities["tops2"]).argmax()
+    assert confidence == pytest.approx(expected[best], rel=1e-4)
+
+
+def test_a_run_that_answers_by_classifiers_teaches_with_both(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", ("a", "b"), BY_CLASSIFIERS)
+    assert InferenceEngine(Settings(run, teach=True)).model.answer_by == "both"
+
+
+def views(count: int) -> list[PreparedInstance]:
+    rng = np.random.default_rng(count)
+    points = rng.uniform(0, (0.1, 0.06, 0.04), (count, 100, 3)).astype(np.float32)
+    colors = (rng.integers(20, 200, (count, 1, 3)) + rng.integers(0, 40, (count, 100, 3))).astype(np.uint8)
+    return [PreparedInstance(k, points[k], colors[k], np.zeros(100, bool)) for k in range(count)]
+
+
+def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:
+    return Adaptation(ColorTransform(0.1, -0.1, 0.2, 0.05), len(instances), 1.0, 0.5)
+
+
+@pytest.mark.parametrize("is_estimated", [False, *slow(True)])
+def test_the_service_adapts_after_enough_instances(
+    teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
+        monkeypatch.setattr(estimate, "Objective", create_autospec(estimate.Objective))
+        monkeypatch.setattr(estimate, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
+    engine = InferenceEngine(Settings(teaching_run, adapt=True))
+    engine.compile_adaptation()
+    first, second = views(EVERY - 1), views(3)
+    unusable = dataclasses.replace(first[0], reason="too few points")
+    for frame, observe in ((first, True), ([unusable], True), (second, False)):
+        corrected = engine.correct(frame, observe=observe)
+        assert all(a is b for a, b in zip(corrected, frame, strict=True))
+    assert engine.adaptation is None and adaptation_answer(None) is None
+    engine.correct(second, observe=True)
+    engine._online.join()
+    adaptation = engine.adaptation
+    assert adaptation.instances == EVERY + 2
+    (corrected,) = engine.correct(second[:1], observe=False)
+    np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
+    answer = adaptation_answer(adaptation).model_dump()
+    assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
+
+
+def test_a_service_does_not_adapt_by_default(teaching_run: Path) -> None:
+    engine = InferenceEngine(Settings(teaching_run))
+    engine.compile_adaptation()
+    engine.correct(views(2 * EVERY), observe=True)
+    assert engine.adaptation is None
