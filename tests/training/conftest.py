@@ -4,11 +4,12 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers import random_classifier
+from helpers import random_classifier, write_box
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -86,6 +87,15 @@ def weights(request: pytest.FixtureRequest) -> str:
     if request.param == "random":
         request.getfixturevalue("unfitted")
     return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory of two meshes, a red brick and a green box."""
+    folder = tmp_path_factory.mktemp("meshes")
+    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
+    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
+    return folder
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import random_clouds, untrained_run
+from helpers import assert_refused, random_clouds, untrained_run
 from safetensors.numpy import load, save
 from typer.testing import CliRunner
 
@@ -110,8 +110,7 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="^dataset: "):
-        train_baselines(trained, Views(clouds(1), CONFIG))
+    assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG))
     assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
     arguments = ["train", "--dataset", str(tmp_path), "--out", str(tmp_path / "run"), "--baselines", "forest, tree"]
     result = CliRunner().invoke(app, arguments)
@@ -119,8 +118,7 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
     without_angles = MemoryViews(clouds(), CONFIG)
     assert without_angles.digest == SOURCE.digest
-    with pytest.raises(InputError, match="^baselines: thor"):
-        train_baselines(write_run(tmp_path / "run"), without_angles, ["thor"])
+    assert_refused("^baselines: thor", train_baselines, write_run(tmp_path / "run"), without_angles, ["thor"])
 
 
 def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
@@ -132,5 +130,4 @@ def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
     lacking, others = (save(tensors, {"about": json.dumps(about)}) for tensors in ({}, load(content)))
     for damaged in (content[:-9], content[:-1] + bytes([content[-1] ^ 1]), lacking, others):
         file.write_bytes(damaged)
-        with pytest.raises(InputError, match="forest.safetensors"):
-            load_baselines(folder, load_run(folder))
+        assert_refused("forest.safetensors", load_baselines, folder, load_run(folder))

@@ -30,17 +30,14 @@ def test_camera_types_match_the_published_lists() -> None:
         assert camera_types(azimuth, polar) == tuple(np.array(VIEW_TYPES)[list(expected)])
 
 
-@pytest.mark.parametrize(
-    ("types", "areas"),
-    [
+def test_view_types_by_face_areas() -> None:
+    for types, areas in (
         (("front",), [(1, 1, 1), (0.8, 1, 1), (1, 0.5, 0.5)]),
         (("front", "side"), [(1, 1, 0.5), (1, 0.5, 1), (1, 0.7, 0.3), (0.7, 0.3, 1)]),
         (("side", "top"), [(0.5, 0.5, 1), (0.5, 1, 0.5), (0.3, 0.7, 1)]),
         (("top",), [(0.79, 1, 1)]),
-    ],
-)
-def test_view_types_by_face_areas(types: tuple[str, ...], areas: list[tuple[float, float, float]]) -> None:
-    assert {view_types(*each) for each in areas} == {types}
+    ):
+        assert {view_types(*each) for each in areas} == {types}
 
 
 @functools.cache

@@ -30,9 +30,8 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
+def test_a_usage_error_is_one_line(refused: Command) -> None:
+    for command, expected in (
         ("recognize", "--help"),
         ("trian", "--help"),
         ("train --out o --no-such-option", "--help"),
@@ -49,10 +48,8 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
         ("render --meshes m --out o --sensor --copies 0", "copies is 0; expected"),
         ("render --meshes m --out o --sensor --crops 99999999", "crops is 99999999; expected"),
-    ],
-)
-def test_a_usage_error_is_one_line(command: str, expected: str, refused: Command) -> None:
-    assert expected in refused(*shlex.split(command))
+    ):
+        assert expected in refused(*shlex.split(command))
 
 
 @pytest.mark.parametrize("command", ["recognize", "explain", "evaluate frames", "enroll mug", "doctor", "adapt"])

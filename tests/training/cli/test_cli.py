@@ -143,16 +143,6 @@ def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path:
             assert f"out: {out}" in refused(*command, "--out", out), command
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("small_descriptors")
-def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, views: Path, tmp_path: Path) -> None:
-    """Views written by `render` and read back train the same model as views rendered by `train`."""
-    for name, options in {"first": ("--meshes", meshes, *STEPS), "second": ("--dataset", views)}.items():
-        assert run_thor2("train", *options, "--out", tmp_path / name, *FEW_STEPS) == 0
-    first, second = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("first", "second"))
-    assert first["record"]["curves"] == second["record"]["curves"]
-
-
 @pytest.mark.usefixtures("small_descriptors")
 def test_a_default_training_recognizes_and_is_evaluated(
     weights: str,
@@ -161,7 +151,6 @@ def test_a_default_training_recognizes_and_is_evaluated(
     images: Path,
     tmp_path: Path,
     printed: Command,
-    refused: Command,
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -191,7 +180,6 @@ def test_a_default_training_recognizes_and_is_evaluated(
     assert list(report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]) == ["embedding"]
     text = printed(*command)
     assert "nothing was trained" in text and line.split(" with: ")[1] in text
-    assert "classifiers" in refused(*command, "--classifiers", "ce")
 
 
 def test_options_replace_values_of_the_protocols(

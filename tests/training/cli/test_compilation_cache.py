@@ -6,9 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import untrained_run, write_frame
+from helpers import assert_refused, untrained_run, write_frame
 
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
 from training.cli.app import enable_compilation_cache
 
@@ -47,8 +46,7 @@ def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypa
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == ""
     (tmp_path / "file").touch()
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
-    with pytest.raises(InputError, match="THOR2_CACHE"):
-        enable_compilation_cache()
+    assert_refused("THOR2_CACHE", enable_compilation_cache)
 
 
 @pytest.mark.slow

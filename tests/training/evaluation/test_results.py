@@ -59,9 +59,8 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
     assert list(fusions(["thor", "tops", "pointnet", "tops2", "forest", "gallery", "both"])) == titles
 
 
-@pytest.mark.parametrize(
-    ("predictors", "answer_by", "expected"),
-    [
+def test_main_fusion_is_that_of_what_answers() -> None:
+    for predictors, answer_by, expected in (
         (["thor", "ce"], "classifiers", "CE"),
         (["ce", "tops"], "classifiers", "CE+TOPS"),
         (["ce", "tops", "tops2", "gallery", "both"], "classifiers", "THOR2"),
@@ -69,10 +68,8 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
         (["forest", "embedding", "gallery", "both"], "both", "both"),
         (["forest", "embedding"], "classifiers", "embedding"),
         (["tops", "tops2", "embedding", "THOR2+embedding"], "classifiers", "THOR2+embedding"),
-    ],
-)
-def test_main_fusion_is_that_of_what_answers(predictors: list[str], answer_by: str, expected: str) -> None:
-    assert main_fusion(fusions(predictors), answer_by) == expected
+    ):
+        assert main_fusion(fusions(predictors), answer_by) == expected
 
 
 def test_fusion_rules_match_hand_calculation() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from helpers import assert_refused
 from helpers import random_clouds as views
 
 import colornet
@@ -117,5 +118,4 @@ def test_samples_of_a_view_stay_together_and_folds_are_even() -> None:
     assert (fold_numbers != fold_of(label, view, 5, 1)).any()
     assert not fold_of(label, view, 1, 0).any()
     for folds in (14, 0):
-        with pytest.raises(thor2.InputError, match=f"folds is {folds}"):
-            fold_of(label, view, folds, 0)
+        assert_refused(f"folds is {folds}", fold_of, label, view, folds, 0)

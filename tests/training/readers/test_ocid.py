@@ -1,6 +1,7 @@
-"""OCID on small datasets with the layout of the real one; the fitted camera against the one that made the clouds."""
+"""OCID on small datasets with the layout of the real one, PCD files, and the fitted camera."""
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,13 @@ import numpy as np
 import pytest
 import yaml
 from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, points_of, write_ocid
-from helpers import Command, NamesInOrder, input_error
+from helpers import Command, NamesInOrder, assert_refused, input_error
 from PIL import Image
 
 from thor2_jax.frames.frames import backproject
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import OCID
-from training.readers.ocid import fit_intrinsics
+from training.readers.ocid import fit_intrinsics, read_organized_points
 
 ALL = {"seq36": ["mug", "bowl", "banana"]}
 
@@ -129,22 +130,18 @@ def test_the_camera_against_least_squares_of_numpy() -> None:
         np.testing.assert_allclose((focal, centre), (1 / slope, -offset / slope), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda p: -p, "the cloud has 0 points"),
-        (lambda p: np.where(np.arange(9)[:, None] == 3, p, np.nan), "the cloud has 6 points"),
-        (lambda p: p * [1, -1, 1], "fy -565.21"),
-        (lambda p: np.random.default_rng(0).permutation(p.reshape(-1, 3)).reshape(p.shape), "is not that"),
-        (lambda p: p * [0, 1, 1], "is not that"),
-        (lambda p: p * [1e300, 1e300, 1e-300], "is not that"),
-    ],
-)
-@pytest.mark.filterwarnings("error")
-def test_clouds_without_a_pinhole_camera(change: Any, expected: str) -> None:
-    depth = np.random.default_rng(0).uniform(0.5, 1.5, SHAPE)
-    with input_error(expected):
-        fit_intrinsics(change(backproject(depth, CAMERA)))
+def test_clouds_without_a_pinhole_camera() -> None:
+    rng = np.random.default_rng(0)
+    points = backproject(rng.uniform(0.5, 1.5, SHAPE), CAMERA)
+    for changed, expected in (
+        (-points, "the cloud has 0 points"),
+        (np.where(np.arange(9)[:, None] == 3, points, np.nan), "the cloud has 6 points"),
+        (points * [1, -1, 1], "fy -565.21"),
+        (rng.permutation(points.reshape(-1, 3)).reshape(points.shape), "is not that"),
+        (points * [0, 1, 1], "is not that"),
+        (points * [1e300, 1e300, 1e-300], "is not that"),
+    ):
+        assert_refused(expected, fit_intrinsics, changed)
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
@@ -197,3 +194,88 @@ def test_each_sequence_has_its_own_run(
     (by_sequence,) = [each["cells"] for each in report["accuracy"]["max"] if each["by"] == ["sequence"]]
     assert [round(cell["accuracy"]["TOPS"]["mean"], 3) for cell in by_sequence] == [1.0, 1.0, 0.667]
     assert "2 models are given" in refused(*command, "--per-sequence", tmp_path)
+
+
+# Clouds in PCD files.
+
+
+HEADER = (
+    "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgba label\nSIZE 4 4 4 4 4\n"
+    "TYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH 3\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 6\nDATA {}\n"
+)
+ROWS = [(0.5 * k, -0.25 * k, float("nan") if k == 4 else 1.0 + k, 0xFF102030, k) for k in range(6)]
+POINTS = np.array([row[:3] for row in ROWS]).reshape(2, 3, 3)
+DATA = {
+    "binary": b"".join(struct.pack("<fffII", *row) for row in ROWS).replace(
+        struct.pack("<f", float("nan")),
+        struct.pack("<I", 0x7F800001),  # a signalling NaN
+    ),
+    "ascii": "".join("{} {} {} {} {}\n".format(*row) for row in ROWS).encode(),
+}
+
+
+def write_cloud(path: Path, data: str, old: str = "", new: str = "") -> Path:
+    header = HEADER.format(data)
+    assert old in header
+    path.write_bytes(header.replace(old, new).encode() + DATA[data])
+    return path
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_points(tmp_path: Path, data: str) -> None:
+    for count in ("COUNT 1 1 1 1 1\n", ""):
+        points = read_organized_points(write_cloud(tmp_path / "cloud.pcd", data, "COUNT 1 1 1 1 1\n", count))
+        np.testing.assert_array_equal(points, POINTS, strict=True)
+
+
+def test_points_among_other_fields(tmp_path: Path) -> None:
+    """The file has a field of three numbers, padding, other number types, another order of axes and CR LF line ends."""
+    path = tmp_path / "cloud.pcd"
+    header = (
+        "VERSION .7\r\nFIELDS _ z normal x _ y\r\nSIZE 1 8 4 4 2 4\r\nTYPE U F F F I F\r\nCOUNT 3 1 3 1 1 1\r\n"
+        "WIDTH 2\r\nHEIGHT 1\r\nPOINTS 2\r\nDATA {}\r\n"
+    )
+    rows = [(0, 1, 2, 3.5, 9.0, 9.0, 9.0, 1.5, -7, 2.5), (0, 1, 2, float("nan"), 9.0, 9.0, 9.0, 4.0, -7, 5.0)]
+    path.write_bytes(header.format("binary").encode() + b"".join(struct.pack("<3Bd3ffhf", *row) for row in rows))
+    expected = [[[1.5, 2.5, 3.5], [4.0, 5.0, np.nan]]]
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+    text = "\r\n".join(" ".join(map(str, row)) for row in rows)
+    path.write_bytes((header.format("ascii") + text).encode())
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_damaged_headers(tmp_path: Path, data: str) -> None:
+    for old, new in (
+        ("DATA", "DATE"),
+        ("FIELDS x y z", "FIELDS x y w"),
+        ("SIZE 4", "SIZE 3"),
+        ("SIZE 4", "SIZE four"),
+        ("TYPE F", "TYPE X"),
+        ("TYPE F F F U U\n", ""),
+        ("COUNT 1", "COUNT 2"),
+        ("COUNT 1", "COUNT 0"),
+        ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 9999999999999999999999"),
+        ("WIDTH 3", "WIDTH 0"),
+        ("WIDTH 3", "WIDTH"),
+        ("HEIGHT 2", "HEIGHT 3"),
+        ("HEIGHT 2\n", ""),
+    ):
+        path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
+        with input_error(path):
+            read_organized_points(path)
+
+
+def test_damaged_data(tmp_path: Path) -> None:
+    for data, old, new, expected in (
+        ("binary", b"DATA binary", b"DATA binary_compressed", "DATA binary_compressed"),
+        ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
+        ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
+    ):
+        path = write_cloud(tmp_path / "cloud.pcd", data)
+        assert path.read_bytes().count(old) == 1
+        path.write_bytes(path.read_bytes().replace(old, new))
+        with input_error(path, expected):
+            read_organized_points(path)

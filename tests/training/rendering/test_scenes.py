@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers import input_error
+from helpers import assert_refused, input_error
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
@@ -161,8 +161,7 @@ def test_numbers_out_of_range_are_refused() -> None:
     ):
         with input_error(message):
             compose_scene(OBJECTS, np.random.default_rng(0), **options)
-    with input_error("n_objects"):
-        compose_scene({}, np.random.default_rng(0))
+    assert_refused("n_objects", compose_scene, {}, np.random.default_rng(0))
 
 
 def test_views_of_a_scene_agree_in_space() -> None:
@@ -178,5 +177,4 @@ def test_views_of_a_scene_agree_in_space() -> None:
                 middles.setdefault(name, []).append((seen.min(axis=0) + seen.max(axis=0)) / 2)
     distances = [np.linalg.norm(a - b) for of_object in middles.values() for a in of_object for b in of_object]
     assert len(distances) > len(middles) and max(distances) < 0.06
-    with input_error("n_objects"):
-        compose_views(OBJECTS, np.random.default_rng(2), 99)
+    assert_refused("n_objects", compose_views, OBJECTS, np.random.default_rng(2), 99)

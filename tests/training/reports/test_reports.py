@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, Interrupted, ParsedPage, run_thor2
+from helpers import SMALL_CONFIG, Interrupted, ParsedPage, assert_refused, run_thor2
 from PIL import Image
 
 import colornet
-import thor2_jax as thor2
 from thor2_jax.figures import plain_text
 from training import demo
 from training.fitting.loop import FitOptions
@@ -80,8 +79,7 @@ def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
 def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
-    with pytest.raises(thor2.InputError, match="already contains pictures"):
-        demo.run_demo(tmp_path)
+    assert_refused("already contains pictures", demo.run_demo, tmp_path)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["scene-0.png"]
 
 
@@ -114,8 +112,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     assert interrupt_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
     assert "fit ce" not in interrupt_at("recognize scenes")
     assert not (tmp_path / "report.html").exists()
-    with pytest.raises(thor2.InputError, match="^out: .*seed 1, not 2"):
-        demo.run_demo(tmp_path, 2)
+    assert_refused("^out: .*seed 1, not 2", demo.run_demo, tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
     summaries, run_demo = [], demo.run_demo
 
@@ -130,8 +127,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     printed = capsys.readouterr().out
     assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
     assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
-    with pytest.raises(thor2.InputError, match="^out: "):
-        run_demo(tmp_path, 1)
+    assert_refused("^out: ", run_demo, tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
     subsets = {name: count for name, count in summary.instances.items() if name != "all"}
     assert summary.instances["all"] == sum(subsets.values()) > 6
