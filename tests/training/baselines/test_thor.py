@@ -73,17 +73,12 @@ def test_most_confident_selected_classifier_decides() -> None:
         box((0.1, 0.1, 0.1), (0.0, -2.0, 0.0)),  # all equal: front
     )
     models = library()
-    types: list[tuple[str, ...]] = [
-        ("front", "side"),
-        ("side", "top"),
-        ("front", "side"),
-        ("front", "side"),
-        ("front",),
-    ]
+    selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
     probabilities = THOR(models, CONFIG).probabilities(clouds)
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
-    for row, (names, k) in enumerate(zip(types, (3, 3, 2, 3, 3), strict=True)):
-        rows = [np.asarray(apply(models[name, k], clouds.tops[row : row + 1, : 16 * k]))[0] for name in names]
+    for row, (names, k) in enumerate(selected):
+        tops = clouds.tops[row : row + 1, : 16 * k]
+        rows = [np.asarray(apply(models[name, k], tops))[0] for name in names.split()]
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
 
 

@@ -11,7 +11,6 @@ from helpers import Command, files_of, frame_options, full_disk, run_thor2, writ
 from PIL import Image
 from recording_files import table_frame, write_recording
 
-from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
@@ -161,19 +160,12 @@ def test_arguments_are_checked_before_anything_is_loaded(
         assert text in refused("enroll", "--model", model, *arguments)
 
 
-def test_few_views_give_a_warning(model: Path, frames: Path, printed: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    again = ("enroll", "--frames", frames, "--extend", "--model", model)
-    for few, warned in ((10, True), (1, False)):
-        monkeypatch.setattr(gallery_objects, "FEW", few)
-        text = printed(*again)
-        assert ("unknown objects are hardly rejected" in text) is warned
-        assert f"thor2 recognize FRAME --model {model}" in text and "2 objects: " in text
-
-
-def test_labels_that_are_no_names_are_skipped(tmp_path: Path, printed: Command) -> None:
+def test_names_that_are_invalid_are_skipped_and_few_views_noted(tmp_path: Path, printed: Command) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick", 5: "book"})
     (frame / "labels.json").write_text('{"labels": {"1": "mug ", "5": "unknown"}}')
-    assert "skipped: frame: name is 'unknown'" in printed("enroll", "--frames", frame, "--model", tmp_path / "run")
+    text = printed("enroll", "--frames", frame, "--model", tmp_path / "run")
+    assert "skipped: frame: name is 'unknown'" in text and "unknown objects are hardly rejected" in text
+    assert "1 object: mug" in text and f"thor2 recognize FRAME --model {tmp_path / 'run'}" in text
     assert Recognizer.load(tmp_path / "run").gallery.names == ("mug",)
     assert run_thor2("evaluate", "frames", frame, "--model", tmp_path / "run", "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())

@@ -9,7 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full_disk, random_clouds, stop_when
+from helpers import Interrupted, assert_refused, brick_and_stick, files_of, random_clouds, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
@@ -197,21 +197,6 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     train(out)
     assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
-
-
-@pytest.mark.slow
-def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A training that could not write any of its files resumes."""
-    out = tmp_path / "run"
-    writers = ((Checkpoints, "save"), *((module, name) for name in ("append_metrics", "draw_curves", "save_run")))
-    for where, name in ((module, "begin_job"), *writers):
-        with monkeypatch.context() as patch:
-            patch.setattr(where, name, full_disk)
-            with pytest.raises(OSError, match="No space left"):
-                train(out, ("tops", "ce"))
-        assert not (out / "run.json").exists()
-    same_weights(train(out, ("tops", "ce")), whole[1])
-    assert names(out) == FINISHED
 
 
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
