@@ -91,6 +91,7 @@ def test_evaluate_frames(
     alone = ("evaluate", "frames", images.parent, "--model", model, "--out")
     assert "runs" in refused(*alone, tmp_path / "report")
     assert "already contains" in refused(*alone, tmp_path / "answer")
+    assert "address is head:6379" in refused(*command, "--address", "head:6379")
 
 
 def test_evaluate_refuses_changed_labels(
@@ -295,14 +296,6 @@ def test_paper_protocol(meshes: Path, views: Path, tmp_path: Path) -> None:
     # Augmented copies with too few points are left out.
     assert 5 * 3 * 2 * 3 < of["default"]["samples"] / 2 <= 6 * 3 * 2 * 3
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
-
-
-def test_invalid_arguments_of_evaluate(model: Path, images: Path, tmp_path: Path, refused: Command) -> None:
-    command = ("evaluate", "frames", images, "--model", model, "--address", "head:6379")
-    assert "address is head:6379" in refused(*command)
-    for kind in ("uwis", "frames"):
-        for path in (tmp_path / "absent", tmp_path):
-            assert str(path) in refused("evaluate", kind, path, "--model", model)
 
 
 def test_colornet(tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:

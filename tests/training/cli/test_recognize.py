@@ -150,14 +150,15 @@ def test_frames_without_labels_are_segmented(
     assert "--segment" in refused("recognize", "--model", model, *files)
 
 
-@pytest.mark.parametrize("option", ["--coco", "--bop"])
-def test_tables_that_cannot_be_written(model: Path, tmp_path: Path, refused: Command, option: str) -> None:
+def test_tables_that_cannot_be_written(model: Path, tmp_path: Path, refused: Command) -> None:
     """They are refused before the frames are recognized."""
-    folder, other = write_frame_files(tmp_path / "one", small_frame()), "--bop" if option == "--coco" else "--coco"
+    folder = write_frame_files(tmp_path / "one", small_frame())
+    command = ("recognize", "--model", model, folder)
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, folder / "color.png" / "results", tmp_path / "pipe"):
-        assert f"{option[2:]}: {path} is not a file" in refused("recognize", "--model", model, folder, option, path)
-    assert "coco and bop are x" in refused("recognize", "--model", model, folder, option, "x", other, "x")
+    for option in ("coco", "bop"):
+        for path in (tmp_path, folder / "color.png" / "results", tmp_path / "pipe"):
+            assert f"{option}: {path} is not a file" in refused(*command, f"--{option}", path)
+    assert "coco and bop are x" in refused(*command, "--coco", "x", "--bop", "x")
     assert (tmp_path / "pipe").is_fifo()
 
 

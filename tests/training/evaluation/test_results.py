@@ -1,6 +1,5 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
-import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -228,7 +227,7 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
 def test_results_of_no_or_one_instance(instances: list[InstancePrediction]) -> None:
     report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
     assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
-    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
+    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else []) and report["published_tables"] == []
     if instances:
         assert report["known_unknown"] is None
         accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
@@ -248,20 +247,3 @@ def test_grouping_by_attributes() -> None:
     assert attribute_tables("bop", attributes) == [(), ("a",), ("b",)]
     assert attribute_tables("uwis", [{"environment": "lounge"}]) == [(), ("environment",)]
     assert summarize_runs([0.5, float("nan"), 0.7])["runs"] == 2
-
-
-@pytest.mark.parametrize("own", [True, False])
-def test_ocid_has_a_table_by_sequence_and_published_ones(own: bool) -> None:
-    """The protocol decides which: the models know the objects of one sequence, or those of all sequences."""
-    answer = InstancePrediction(1, "mug", probabilities=EYE[:2])
-    names = ["table/bottom/mixed/seq21", "table/bottom/mixed/seq22"]
-    attributes = {"camera": "lower", "place": "table", "type": "mixed"}
-    frames = [FrameAnswers(f"{name}/{k}", attributes, 1.0, [answer]) for name in names for k in range(2)]
-    report = compute_results("ocid", RUNS[:1], frames, own_objects=own)
-    tables = report["accuracy"]["max"]
-    assert tables[-1]["by"] == ["sequence"] and [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
-    (lower,) = next(table for table in tables if table["by"] == ["camera"])["cells"]
-    assert lower["published"]["THOR2"] == pytest.approx(0.7507 if own else 0.5996)
-    published = json.loads(json.dumps(report))["published_tables"]
-    assert [table["number"] for table in published] == ([1, 8, None] if own else [3])
-    assert compute_results("ocid", RUNS[:1], [])["published_tables"] == []

@@ -158,12 +158,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert "Models: run." in page and "banana (unknown object)" in page
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"banana": 1}
-    accuracy = {
-        (*table["by"], *cell["where"].values()): (cell["instances"], cell["accuracy"]["TOPS"]["mean"])
-        for table in report["accuracy"]["max"]
-        for cell in table["cells"]
-    }
-    assert accuracy[()] == (4, 0.75)
+    tables = report["accuracy"]["max"]
+    cells = {(*table["by"], *cell["where"].values()): cell for table in tables for cell in table["cells"]}
+    accuracy = {where: (cell["instances"], cell["accuracy"]["TOPS"]["mean"]) for where, cell in cells.items()}
+    assert accuracy[()] == (4, 0.75) and cells["camera", "lower"]["published"]["THOR2"] == pytest.approx(0.5996)
     assert accuracy["camera", "lower"] == (2, 1.0) and accuracy["camera", "upper"] == (2, 0.5)
     assert accuracy["camera", "place", "lower", "table"] == (2, 1.0)
     assert accuracy["camera", "type", "upper", "mixed"] == (2, 0.5)
@@ -175,8 +173,9 @@ def test_each_sequence_has_its_own_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command
 ) -> None:
     """Each run has its own classes; one run serves both cameras."""
-    for place in ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08"):
-        write_ocid(tmp_path / "YCB10", place)
+    sequences = ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08")
+    for sequence in sequences:
+        write_ocid(tmp_path / "YCB10", sequence)
     table = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
     classes = {"seq36": ("mug", "bowl"), "seq08": ("banana", "apple")}
     runs = {name: [EvaluatedRun(name, name, NamesInOrder(each))] for name, each in classes.items()}
@@ -191,8 +190,10 @@ def test_each_sequence_has_its_own_run(
     assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
-    (by_sequence,) = [each["cells"] for each in report["accuracy"]["max"] if each["by"] == ["sequence"]]
-    assert [round(cell["accuracy"]["TOPS"]["mean"], 3) for cell in by_sequence] == [1.0, 1.0, 0.667]
+    cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
+    accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
+    assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
+    assert cells["camera",][0]["published"]["THOR2"] == pytest.approx(0.7507)
     assert "2 models are given" in refused(*command, "--per-sequence", tmp_path)
 
 

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import os
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -207,10 +206,8 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     for meshes, steps, options, message in [
         ({}, STEPS, {}, "meshes is empty"),
         (OBJECTS, (0, 45), {}, "azimuth_step"),
-        (OBJECTS, (60, -45), {}, "polar_step"),
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
-        ({"z": tmp_path / "absent.ply"}, STEPS, {}, "absent.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
         ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
     ]:
@@ -219,18 +216,11 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
 
 
 def test_other_files_are_kept(tmp_path: Path) -> None:
-    out = tmp_path / "views"
-    out.mkdir()
-    (out / "notes.txt").write_text("text")
-    for path, message in (
-        (out, f"{out} already contains notes.txt"),
-        (out / "notes.txt", ".*notes.txt "),
-        (out / "notes.txt" / "views", ""),
-    ):
-        assert_refused(f"^out: {message}", render_dataset, OBJECTS, path, *STEPS)
-    (out / MANIFEST).write_text('{"format": 1}')
-    assert_refused("manifest.json has format 1; expected 2", render_dataset, OBJECTS, out, *STEPS)
-    assert (out / MANIFEST).read_text() == '{"format": 1}' and (out / "notes.txt").read_text() == "text"
+    (tmp_path / "notes.txt").write_text("text")
+    assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, OBJECTS, tmp_path, *STEPS)
+    (tmp_path / MANIFEST).write_text('{"format": 1}')
+    assert_refused("manifest.json has format 1; expected 2", render_dataset, OBJECTS, tmp_path, *STEPS)
+    assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
 
 
 def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,15 +240,9 @@ def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypa
     assert files_of(copied) == files_of(whole)
 
 
-def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
-    """Repeats a job, changes its steps, and selects a cluster that is not available."""
+def test_command(tmp_path: Path, printed: Command, refused: Command) -> None:
     write_box(tmp_path / "meshes" / "box.ply", (0.06, 0.06, 0.06))
-    out = tmp_path / "views"
-    command = ("render", "--meshes", tmp_path / "meshes", "--out", out, "--workers", 1, "--polar-step", 90)
-    for _ in range(2):
-        assert "6 views of 1 objects (0 left out)" in printed(*command, "--azimuth-step", 180)
-    assert "azimuth_step 180.0, not 90.0" in refused(*command, "--azimuth-step", 90)
-    monkeypatch.setitem(sys.modules, "ray", None)
-    assert "'.[cluster]'" in refused(*command, "--azimuth-step", 180, "--engine", "ray")
-    refused(*command, "--engine", "cloud")
-    refused(*command, "--address", "head:6379")
+    command = ("render", "--meshes", tmp_path / "meshes", "--out", tmp_path / "views", "--azimuth-step", 180)
+    for _ in range(2):  # it may be repeated
+        assert "6 views of 1 objects (0 left out)" in printed(*command, "--polar-step", 90, "--workers", 1)
+    assert "address is head:6379" in refused(*command, "--address", "head:6379")
