@@ -16,8 +16,7 @@ def test_the_table_has_views_of_the_trained_classes_only() -> None:
     assert len(table.label) == len(table.rotations) == len(table.probabilities) == 16
     assert set(table.label.tolist()) == {0}
     np.testing.assert_allclose(table.probabilities.sum(axis=1), 1, rtol=1e-5)
-    np.testing.assert_allclose(
-        table.rotations @ table.rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (16, 3, 3)), atol=1e-9
-    )
+    products = table.rotations @ table.rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (16, 1, 1)), atol=1e-9)
     assert (table.rotations[:, 2, 2] < 0).all()  # all cameras look down
     assert_refused("none of the classes", view_table, recognizer, {other: objects[other]})

@@ -24,10 +24,8 @@ ROOT = Path(__file__).parents[3]
 
 
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, "-c", *arguments], capture_output=True, text=True, env=environment, timeout=HANG
-    )
+    command, environment = [sys.executable, "-c", *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
 
 
 def test_a_usage_error_is_one_line(refused: Command) -> None:

@@ -185,10 +185,8 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     """A mug in four frames, correct in two; a can in one; three dragons. The thresholds reject the less sure."""
     answers = [("mug", 0.9), ("mug", 0.7), ("can", 0.8), ("bowl", 0.6)]
     dragons: list[tuple[str, float]] = [("mug", 0.8), ("can", 0.65), ("can", 0.5)]
-    frames = [
-        FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0))])
-        for answer in answers
-    ]
+    mugs = [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0)) for answer in answers]
+    frames = [FrameAnswers("f", {}, 1.0, [mug]) for mug in mugs]
     frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
     frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
     frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))

@@ -42,14 +42,11 @@ def test_a_frame(tmp_path: Path, place: str, first: int, data: str) -> None:
     assert item.frame.instances == (first, first + 1, first + 2)
     np.testing.assert_array_equal(item.frame.labels, np.where(labels < first, 0, labels))
     fitted = item.frame.intrinsics
-    np.testing.assert_allclose(
-        (fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale), (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4
-    )
+    numbers = fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale
+    np.testing.assert_allclose(numbers, (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4)
     # The points of the frame equal those of the cloud.
-    there = depth > 0
-    np.testing.assert_allclose(
-        backproject(item.frame.depth_m, fitted)[there], points_of(depth)[there], rtol=1e-4, atol=1e-6
-    )
+    points, there = backproject(item.frame.depth_m, fitted), depth > 0
+    np.testing.assert_allclose(points[there], points_of(depth)[there], rtol=1e-4, atol=1e-6)
 
 
 def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
@@ -72,11 +69,8 @@ def test_the_order_of_the_dataset(tmp_path: Path) -> None:
     (root / "table" / "top" / "mixed" / "seq99").mkdir()
     names = write_names(tmp_path, {"seq21": ["a", "b", "c"], "seq02": ["d", "e", "f"]})
     whole = OCID(tmp_path, names)
-    assert whole.identifiers == [
-        f"{sequence}/result_{stem}"
-        for sequence in ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
-        for stem in "ab"
-    ]
+    sequences = ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
+    assert whole.identifiers == [f"{sequence}/result_{stem}" for sequence in sequences for stem in "ab"]
     assert [item.identifier for item in whole] == whole.identifiers == OCID(root, names).identifiers
     assert [item.attributes["camera"] for item in whole] == ["lower"] * 2 + ["upper"] * 4
 

@@ -49,9 +49,8 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [item.truth for item in items] == [{1: "mug"}, {1: "mug"}, {1: "mug", 77: "spoon"}]
     for item, seed in zip(items, (2, 1, 0), strict=True):
         assert_images_of(item, seed)
-        assert item.frame.intrinsics == Intrinsics(
-            920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406, 1000
-        )
+        camera = 920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406
+        assert item.frame.intrinsics == Intrinsics(*camera, 1000)
     listed = {"environment": "lounge", "category": "food", "occlusion": "high", "light": "2"}
     assert [item.attributes for item in items] == [listed, listed, {"environment": "lounge"}]
     assert [item.identifier for item in dataset] == dataset.identifiers  # iterates again from the start

@@ -85,9 +85,8 @@ def test_degrees_of_occlusion() -> None:
 @pytest.mark.slow
 def test_clutter_increases_occlusion() -> None:
     def occluded_share(clutter: float) -> float:
-        return float(
-            np.mean([share <= 0.95 for scene in scenes(20, clutter=clutter) for share in scene.visible.values()])
-        )
+        visible = [share for scene in scenes(20, clutter=clutter) for share in scene.visible.values()]
+        return float(np.mean(np.array(visible) <= 0.95))
 
     open_table, default, crowded = occluded_share(0.0), occluded_share(0.85), occluded_share(1.0)
     assert open_table < 0.35 < crowded and open_table < default
@@ -105,9 +104,8 @@ def test_objects_stand_apart_on_the_table() -> None:
             for other in hulls[k + 1 :]:
                 # No vertex of one lies within the vertical prism over the footprint of the other.
                 for a, b in ((one, other), (other, one)):
-                    prism = trimesh.convex.convex_hull(
-                        np.concatenate([np.c_[b.vertices[:, :2], np.full(len(b.vertices), z)] for z in (-1, 1)])
-                    )
+                    ends = [np.c_[b.vertices[:, :2], np.full(len(b.vertices), z)] for z in (-1, 1)]
+                    prism = trimesh.convex.convex_hull(np.concatenate(ends))
                     inside = (a.vertices @ prism.face_normals.T) - (prism.triangles[:, 0] * prism.face_normals).sum(1)
                     assert (inside.max(axis=1) > 0.004).all()
 
@@ -142,9 +140,8 @@ def test_noise_of_depth() -> None:
 
 
 def test_light_changes_colours_by_a_gain() -> None:
-    plain, lit = (
-        compose_scene(OBJECTS, np.random.default_rng(5), camera=SMALL, noise=0, light=light) for light in (0.0, 0.3)
-    )
+    options = {"camera": SMALL, "noise": 0}
+    plain, lit = (compose_scene(OBJECTS, np.random.default_rng(5), light=light, **options) for light in (0.0, 0.3))
     assert np.array_equal(plain.frame.labels, lit.frame.labels)
     bright = (plain.frame.color > 60).all(axis=-1) & (lit.frame.color < 255).all(axis=-1)
     gain = lit.frame.color[bright] / plain.frame.color[bright]
