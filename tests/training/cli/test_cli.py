@@ -227,7 +227,8 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     assert "nothing was trained" in printed(*arguments)
     own_views = ("--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run", "--embedding", 0)
     assert "manifest.json" in refused("train", *own_views)
-    assert "was written with" in refused(*arguments, "--leave-out", NAMES[0])
+    for change in (("--leave-out", NAMES[0]), ("--epochs", 2)):
+        assert "was written with" in refused(*arguments, *change)
     assert files_of(tmp_path / "run") == before
     # A training that is killed at the very end leaves its own views.
     shutil.rmtree(tmp_path / "run" / "views")

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import assert_refused, input_error
+from helpers import assert_refused, input_error, random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -18,8 +18,9 @@ from thor2_jax.model.classifier import MLP, model_arrays
 from training.fitting import loop
 from training.fitting.fit import fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
-from training.fitting.samples import Batch, Samples, expand
+from training.fitting.samples import Batch, Samples, build_samples, expand
 from training.fitting.steps import FitContext
+from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -29,6 +30,16 @@ TOPS2 = FitContext("tops2", NETWORK, CONFIG)
 QUICK = FitOptions(epochs=8, batch_size=16, seed=3)
 
 Fit = Callable[..., tuple[MLP, int]]
+
+BOXES = {"long": ((0.2, 0.05, 0.05), 0), "short": ((0.06, 0.05, 0.05), 0), "white": ((0.06, 0.05, 0.05), 255)}
+"""Class -> size and colour."""
+
+
+@pytest.fixture(scope="module")
+def separable() -> Samples:
+    """Return 48 samples of three classes, which differ in shape or colour."""
+    views = {name: random_clouds(k, [200] * 8, *box) for k, (name, box) in enumerate(BOXES.items())}
+    return build_samples(MemoryViews(views, CONFIG), NETWORK, CONFIG)
 
 
 @pytest.fixture
@@ -60,7 +71,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     )
     assert (answers(model, separable) == separable.label).all()
     assert [metrics.epoch for metrics in curve] == list(range(1, 9))
-    assert curve[-1].loss < curve[0].loss / 3 and curve[-1].accuracy > 0.8
+    assert curve[-1].loss < curve[0].loss / 2 and curve[-1].accuracy > 0.8
     assert best == min(curve, key=lambda metrics: metrics.loss).epoch
     assert all(math.isfinite(metrics.loss) and metrics.held_out_accuracy is None for metrics in curve)
     assert steps == [(3 * epoch, 24, epoch) for epoch in range(1, 9)]
@@ -68,7 +79,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
 
 def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fitted: Fit) -> None:
     """The held-out set is mislabelled, which limits its accuracy; the best epoch has the highest accuracy."""
-    held_out = np.arange(48) >= 38
+    held_out = np.arange(48) % 5 == 0
     mislabelled = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
     curve: list[EpochMetrics] = []
     model, best = fitted(samples=mislabelled, held_out=held_out, epoch_done=curve.append)

@@ -9,7 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import Interrupted, assert_refused, brick_and_stick, files_of, random_clouds, stop_when
+from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full_disk, random_clouds, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
@@ -196,6 +196,18 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     train(out)
     assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
+
+
+@pytest.mark.usefixtures("unfitted")
+def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "run"
+    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+            patch.setattr(module, name, full_disk)
+            train(out)
+        assert not (out / "run.json").exists()
+    train(out)
+    assert names(out) == FINISHED
 
 
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
