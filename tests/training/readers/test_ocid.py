@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, points_of, write_ocid
+from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, points_of, write_ocid
 from helpers import Command, NamesInOrder, assert_refused, input_error
 from PIL import Image
 
@@ -194,32 +194,23 @@ def test_each_sequence_has_its_own_run(
 # Clouds in PCD files.
 
 
-HEADER = (
-    "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgba label\nSIZE 4 4 4 4 4\n"
-    "TYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH 3\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 6\nDATA {}\n"
-)
-ROWS = [(0.5 * k, -0.25 * k, float("nan") if k == 4 else 1.0 + k, 0xFF102030, k) for k in range(6)]
-POINTS = np.array([row[:3] for row in ROWS]).reshape(2, 3, 3)
-DATA = {
-    "binary": b"".join(struct.pack("<fffII", *row) for row in ROWS).replace(
-        struct.pack("<f", float("nan")),
-        struct.pack("<I", 0x7F800001),  # a signalling NaN
-    ),
-    "ascii": "".join("{} {} {} {} {}\n".format(*row) for row in ROWS).encode(),
-}
+POINTS = np.array([(0.5 * k, -0.25 * k, np.nan if k == 4 else 1.0 + k) for k in range(6)]).reshape(2, 3, 3)
+SIGNALLING_NAN = b"\x01\0\x80\x7f"
 
 
-def write_cloud(path: Path, data: str, old: str = "", new: str = "") -> Path:
-    header = HEADER.format(data)
-    assert old in header
-    path.write_bytes(header.replace(old, new).encode() + DATA[data])
+def write_cloud(path: Path, data: str, old: bytes = b"", new: bytes = b"") -> Path:
+    """Write six points, whose labels are 0 to 5, with bytes replaced that occur once."""
+    content = pack_pcd(POINTS, np.zeros((2, 3, 3), int), np.arange(1, 7).reshape(2, 3), data)
+    content = content.replace(struct.pack("<f", np.nan), SIGNALLING_NAN)
+    assert not old or content.count(old) == 1
+    path.write_bytes(content.replace(old, new) if old else content)
     return path
 
 
-@pytest.mark.parametrize("data", DATA)
+@pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_points(tmp_path: Path, data: str) -> None:
-    for count in ("COUNT 1 1 1 1 1\n", ""):
-        points = read_organized_points(write_cloud(tmp_path / "cloud.pcd", data, "COUNT 1 1 1 1 1\n", count))
+    for count in (b"COUNT 1 1 1 1 1\n", b""):
+        points = read_organized_points(write_cloud(tmp_path / "cloud.pcd", data, b"COUNT 1 1 1 1 1\n", count))
         np.testing.assert_array_equal(points, POINTS, strict=True)
 
 
@@ -239,22 +230,22 @@ def test_points_among_other_fields(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_organized_points(path), expected)
 
 
-@pytest.mark.parametrize("data", DATA)
+@pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_damaged_headers(tmp_path: Path, data: str) -> None:
     for old, new in (
-        ("DATA", "DATE"),
-        ("FIELDS x y z", "FIELDS x y w"),
-        ("SIZE 4", "SIZE 3"),
-        ("SIZE 4", "SIZE four"),
-        ("TYPE F", "TYPE X"),
-        ("TYPE F F F U U\n", ""),
-        ("COUNT 1", "COUNT 2"),
-        ("COUNT 1", "COUNT 0"),
-        ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 9999999999999999999999"),
-        ("WIDTH 3", "WIDTH 0"),
-        ("WIDTH 3", "WIDTH"),
-        ("HEIGHT 2", "HEIGHT 3"),
-        ("HEIGHT 2\n", ""),
+        (b"DATA", b"DATE"),
+        (b"FIELDS x y z", b"FIELDS x y w"),
+        (b"SIZE 4", b"SIZE 3"),
+        (b"SIZE 4", b"SIZE four"),
+        (b"TYPE F", b"TYPE X"),
+        (b"TYPE F F F U U\n", b""),
+        (b"COUNT 1", b"COUNT 2"),
+        (b"COUNT 1", b"COUNT 0"),
+        (b"COUNT 1 1 1 1 1", b"COUNT 1 1 1 1 9999999999999999999999"),
+        (b"WIDTH 3", b"WIDTH 0"),
+        (b"WIDTH 3", b"WIDTH"),
+        (b"HEIGHT 2", b"HEIGHT 3"),
+        (b"HEIGHT 2\n", b""),
     ):
         path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
         with input_error(path):
@@ -269,8 +260,6 @@ def test_damaged_data(tmp_path: Path) -> None:
         ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
         ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
     ):
-        path = write_cloud(tmp_path / "cloud.pcd", data)
-        assert path.read_bytes().count(old) == 1
-        path.write_bytes(path.read_bytes().replace(old, new))
+        path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
         with input_error(path, expected):
             read_organized_points(path)
