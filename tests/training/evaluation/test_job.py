@@ -14,7 +14,6 @@ from helpers import (
     ToyDescriptors,
     UntaughtRecognizer,
     assert_refused,
-    input_error,
     json_lines,
     small_frame,
     untrained_embedding_run,
@@ -277,8 +276,7 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
         "digest1": (runs[:1], ToyDataset(3), DESCRIPTION),
     }
     for value, (evaluated, dataset, description) in cases.items():
-        with input_error(value, match="^out: "):
-            evaluate_dataset(evaluated, dataset, description, report)
+        assert_refused(f"^out: .*{value}", evaluate_dataset, evaluated, dataset, description, report)
     assert (report / "answers.jsonl").read_bytes() == before
     (report / "answers.jsonl").write_bytes(b"".join(before.splitlines(keepends=True)[:3]))
     assert_refused("'frame0'.*'photo0'", evaluate_toys, tmp_path, ToyDataset(3, "photo"))

@@ -27,8 +27,6 @@ class ToyRun(NamedTuple):
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
-N_PREDICTORS = 5
-EYE = np.eye(3, dtype=np.float32)
 
 
 def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
@@ -40,7 +38,7 @@ def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
         for label in (1, 2):
             number = 2 * k + label
             truth = "dragon" if number % 11 == 0 else CLASSES[rng.integers(3)]
-            table = rng.dirichlet(np.ones(3), N_PREDICTORS).astype(np.float32)
+            table = rng.dirichlet(np.ones(3), 5).astype(np.float32)
             described = (None, table) if number % 7 else ("too few points", None)
             instances.append(InstancePrediction(label, truth, False, *described))
         attributes = {"environment": "lounge" if k % 2 else "warehouse", "occlusion": ("none", "low", "high")[k % 3]}
@@ -217,23 +215,22 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
 
 
-@pytest.mark.parametrize(
-    "instances",
-    [[], [InstancePrediction(1, "mug", False, None, EYE[:2])], [InstancePrediction(1, "mug", False, "too few points")]],
-    ids=["none", "incorrect", "not described"],
-)
-def test_results_of_no_or_one_instance(instances: list[InstancePrediction]) -> None:
-    report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
-    assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
-    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else []) and report["published_tables"] == []
-    if instances:
-        assert report["known_unknown"] is None
-        accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
-        assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
-        assert report["confusion"][2][3] == (instances[0].reason is not None)
-        assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
-        assert report["rejection"]["threshold"]["runs"] == 0
-        assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
+def test_results_of_no_or_one_instance() -> None:
+    incorrect = InstancePrediction(1, "mug", probabilities=np.eye(2, 3, dtype=np.float32))
+    for instances in ([], [incorrect], [InstancePrediction(1, "mug", reason="too few points")]):
+        report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
+        assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
+        assert (
+            report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else []) and report["published_tables"] == []
+        )
+        if instances:
+            assert report["known_unknown"] is None
+            accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
+            assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
+            assert report["confusion"][2][3] == (instances[0].reason is not None)
+            assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
+            assert report["rejection"]["threshold"]["runs"] == 0
+            assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 def test_grouping_by_attributes() -> None:

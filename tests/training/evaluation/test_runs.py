@@ -99,5 +99,5 @@ def test_incompatible_sequence_runs_are_refused(make: Maker, tmp_path: Path) -> 
         (): "has no run for any sequence",
     }
     for sequences, message in cases.items():
-        with input_error(message, match="^model: "):
-            load_sequence_runs(tmp_path / "runs", [f"{sequence}/frame" for sequence in sequences])
+        frames = [f"{sequence}/frame" for sequence in sequences]
+        assert_refused(f"^model: .*{message}", load_sequence_runs, tmp_path / "runs", frames)

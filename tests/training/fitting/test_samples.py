@@ -16,7 +16,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
-from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand, fold_of_views
+from training.fitting.samples import PAPER_MIRRORS, build_samples, expand, fold_of_views
 from training.views.normalized_views import MemoryViews, SourceShard
 
 NETWORK = colornet.load_default()
@@ -24,10 +24,6 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 expand_batch = jax.jit(lambda batch, config: expand(batch, region_sets(NETWORK).weights, config), static_argnums=1)
-
-
-def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFIG) -> thor2.Strips:
-    return expand_batch(samples.take(np.asarray(rows)), config)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +52,7 @@ def test_every_view_is_used_mirrored_in_four_ways(
         points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
         assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
-    descriptors = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
+    descriptors = thor2.describe_strips(expand_batch(samples.take(np.arange(16)), config), NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))

@@ -213,8 +213,7 @@ def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     assert_refused("no .glb, .obj, .ply file", find_meshes, tmp_path)
     put(tmp_path, "mug.glb")
     for names, message in (({"a": "dish", "b": "bowl", "c": "mug"}, "no mesh for bowl, dish"), ({}, "names is empty")):
-        with input_error(message):
-            find_meshes(tmp_path, names)
+        assert_refused(message, find_meshes, tmp_path, names)
     put(tmp_path, "mug.obj")
     assert_refused("'mug'", find_meshes, tmp_path)
 

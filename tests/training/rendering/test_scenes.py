@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers import assert_refused, input_error
+from helpers import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
-from training.objects.mesh import TexturedMesh
 from training.rendering.scenes import (
     MIN_PIXELS,
     SCENE_CAMERA,
@@ -26,10 +25,6 @@ SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
 
 def scenes(n: int, **options: float) -> list[Scene]:
     return [compose_scene(OBJECTS, np.random.default_rng(seed), camera=SMALL, **options) for seed in range(n)]
-
-
-def hull(mesh: TexturedMesh) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull
 
 
 def test_frame_and_truth_agree() -> None:
@@ -98,7 +93,7 @@ def test_objects_stand_apart_on_the_table() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
         meshes = _arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
-        hulls = [hull(mesh) for mesh in meshes]
+        hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull for mesh in meshes]
         for k, one in enumerate(hulls):
             assert one.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
             for other in hulls[k + 1 :]:
@@ -156,8 +151,7 @@ def test_numbers_out_of_range_are_refused() -> None:
         ({"noise": -1.0}, "noise is -1.0"),
         ({"light": float("nan")}, "light is nan"),
     ):
-        with input_error(message):
-            compose_scene(OBJECTS, np.random.default_rng(0), **options)
+        assert_refused(message, compose_scene, OBJECTS, np.random.default_rng(0), **options)
     assert_refused("n_objects", compose_scene, {}, np.random.default_rng(0))
 
 

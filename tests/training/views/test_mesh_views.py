@@ -8,7 +8,6 @@ import trimesh
 from helpers import assert_refused
 from scipy.spatial import cKDTree
 
-from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.illumination import Illumination
 from training.objects.builtin_objects import builtin_objects
@@ -42,26 +41,17 @@ def test_points_lie_on_the_sphere_with_its_colours() -> None:
     assert_refused("^pose", views.view_cloud, ball(), camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
 
 
-def check_same(one: dict[str, list[Cloud]], other: dict[str, list[Cloud]]) -> None:
-    assert list(one) == list(other)
-    for name in one:
-        assert len(one[name]) == len(other[name])
-        for (xyz, rgb), (other_xyz, other_rgb) in zip(one[name], other[name], strict=True):
-            assert xyz.dtype == other_xyz.dtype == np.float32 and rgb.dtype == other_rgb.dtype == np.uint8
-            assert np.array_equal(xyz, other_xyz) and np.array_equal(rgb, other_rgb)
-
-
 def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(views, "VIEWS_PER_TASK", 4)
     seen: list[tuple[int, int]] = []
     meshes = {"ball": ball(), "marble": ball(0.02)}
     clouds = views.render_views(meshes, 120, 90, 1, lambda done, total: seen.append((done, total)))
     assert seen == [(done, 18) for done in (4, 8, 9, 13, 17, 18)]
-    expected = {
-        name: [views.view_cloud(mesh, camera_pose(*angles, np.zeros(3))) for angles in view_angles(120, 90)]
-        for name, mesh in meshes.items()
-    }
-    check_same(clouds, expected)
+    assert list(clouds) == list(meshes)
+    for name, mesh in meshes.items():
+        for cloud, angles in zip(clouds[name], view_angles(120, 90), strict=True):
+            for part, expected in zip(cloud, views.view_cloud(mesh, camera_pose(*angles, np.zeros(3))), strict=True):
+                np.testing.assert_array_equal(part, expected, strict=True)
 
 
 def test_copies_depend_only_on_name_view_and_seed() -> None:

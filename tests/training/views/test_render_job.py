@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import Command, Interrupted, assert_refused, files_of, full_disk, input_error, write_box
+from helpers import Command, Interrupted, assert_refused, files_of, full_disk, write_box
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations
@@ -167,25 +167,24 @@ def test_another_job_is_refused(copied: Path) -> None:
         (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
         (dict(reversed(OBJECTS.items())), STEPS, r"objects\[0\].name "),
     ]:
-        with input_error(copied, match=message):
-            render_dataset(meshes, copied, *steps)
+        assert_refused(f"{copied} .*{message}", render_dataset, meshes, copied, *steps)
         assert files_of(copied) == before
 
 
 def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
+    ball = {"ball": sphere(0.03)}
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
-    dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, augmentations=light, seed=1)
+    dataset = render_dataset(ball, out, 90, 90, augmentations=light, seed=1)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
     assert [shard.views for shard in dataset.shards] == [6] * 6
     views = dataset.read(1)
     assert views.view.tolist() == [2, 2, 2, 3, 3, 3] and views.copy.tolist() == [0, 1, 2] * 2
     for options in ({}, {"augmentations": light, "seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
-        assert_refused("variations", render_dataset, {"ball": sphere(0.03)}, out, 90, 90, **options)
-    off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
+        assert_refused("variations", render_dataset, ball, out, 90, 90, **options)
+    off = render_dataset(ball, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
     assert len(off) == 12 and off.record["job"]["variations"] is None
-    with pytest.raises(InputError, match="variations null, not {"):
-        render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=light)
+    assert_refused("variations null, not {", render_dataset, ball, tmp_path / "off", 90, 90, augmentations=light)
 
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
