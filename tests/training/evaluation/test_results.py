@@ -219,10 +219,9 @@ def test_results_of_no_or_one_instance() -> None:
     incorrect = InstancePrediction(1, "mug", probabilities=np.eye(2, 3, dtype=np.float32))
     for instances in ([], [incorrect], [InstancePrediction(1, "mug", reason="too few points")]):
         report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
-        assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
-        assert (
-            report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else []) and report["published_tables"] == []
-        )
+        assert report["instances"]["scored"] == len(instances) and report["published_tables"] == []
+        assert report["speed"]["frames_per_second"] is None
+        assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
         if instances:
             assert report["known_unknown"] is None
             accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
