@@ -92,6 +92,7 @@ def test_evaluate_frames(
     assert "runs" in refused(*alone, tmp_path / "report")
     assert "already contains" in refused(*alone, tmp_path / "answer")
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
+    assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
 
 def test_evaluate_refuses_changed_labels(

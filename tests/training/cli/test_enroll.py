@@ -199,6 +199,7 @@ def test_a_gallery_outside_the_run_directory(
     for name, label in (("new", 1), ("old", 5)):
         assert run_thor2("enroll", name, "--model", model, *one_frame(frames / "000", label), *other) == 0
     assert run_thor2("forget", "old", "--model", model, *other) == 0
+    assert "'old'" in refused("forget", "old", "--model", model, *other)
     lines = printed("objects", "--model", model, *other)
     assert "new" in lines and "old" not in lines and "brick" not in lines
     assert files_of(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)

@@ -29,11 +29,12 @@ def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, pr
 def test_one_failing_frame_does_not_lose_the_others(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    for number in range(1, 6):
+    for number in range(1, 7):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
     (tmp_path / "frames" / "000003" / "intrinsics.json").unlink()
     (tmp_path / "frames" / "000005" / "color.png").unlink()
+    (tmp_path / "frames" / "000006" / "mask.png").unlink()
     coco_file = tmp_path / "new" / "a" / "coco.json"
     outputs = ("--out", tmp_path / "out", "--coco", coco_file)
     command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
@@ -41,11 +42,11 @@ def test_one_failing_frame_does_not_lose_the_others(
         assert run_thor2(*command) == 2
         out, err = capfd.readouterr()
         answers = {line["frame"]: line for line in json_lines(out)}
-        assert list(answers) == [f"00000{number}" for number in range(1, 6)]
-        for number, file in ((2, "depth"), (3, "intrinsics.json"), (5, "color.png")):
-            assert file in answers[f"00000{number}"]["error"]
+        assert list(answers) == [f"00000{number}" for number in range(1, 7)]
+        for number, word in ((2, "depth"), (3, "intrinsics.json"), (5, "color.png"), (6, "--segment")):
+            assert word in answers[f"00000{number}"]["error"]
         assert all([one["label"] for one in answers[n]["instances"]] == [1, 4] for n in ("000001", "000004"))
-        assert "3 of 5 frames" in err and "000002, 000003, 000005" in err
+        assert "4 of 6 frames" in err and "000002, 000003, 000005, 000006" in err
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000001", "000004"]
     coco = json.loads(coco_file.read_text())
     boxes = [10, 10, 40, 40], [60, 30, 50, 50]

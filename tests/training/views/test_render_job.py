@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -239,9 +240,11 @@ def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypa
     assert files_of(copied) == files_of(whole)
 
 
-def test_command(tmp_path: Path, printed: Command, refused: Command) -> None:
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     write_box(tmp_path / "meshes" / "box.ply", (0.06, 0.06, 0.06))
     command = ("render", "--meshes", tmp_path / "meshes", "--out", tmp_path / "views", "--azimuth-step", 180)
     for _ in range(2):  # it may be repeated
         assert "6 views of 1 objects (0 left out)" in printed(*command, "--polar-step", 90, "--workers", 1)
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "'.[cluster]'" in refused(*command, "--engine", "ray")
