@@ -248,6 +248,12 @@ def input_error(*words: object, match: str | None = None) -> Iterator[None]:
     assert [word for word in words if str(word) not in str(caught.value)] == [], caught.value
 
 
+def assert_refused(match: str, call: Callable[..., object], /, *arguments: Any, **options: Any) -> None:
+    """Assert that a call raises an InputError whose message matches a pattern."""
+    with pytest.raises(InputError, match=match):
+        call(*arguments, **options)
+
+
 class Pickled:
     """Ends the process that unpickles it, with an exception that readers do not catch."""
 

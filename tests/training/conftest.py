@@ -4,17 +4,16 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers import random_classifier
+from helpers import random_classifier, write_box
 from matplotlib.figure import Figure
 from PIL import Image
 
-import colornet
 from thor2_jax import figures
-from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.model.classifier import MLP
@@ -88,26 +87,10 @@ def weights(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture
-def separable() -> Samples:
-    """Return 48 samples of 2 x 5 strips; the classes differ in the length or the colour of the strips."""
-    n, strips = 48, 10
-    rng = np.random.default_rng(0)
-    label = np.arange(n, dtype=np.int32) % 3
-    length = np.where(label == 0, 0.05, 0.2)[:, None] + rng.random((n, strips)) * 0.01
-    weights = np.asarray(region_sets(colornet.load_default()).weights)
-    only_8, only_3 = (int(np.flatnonzero(weights[:, region] == 1)[0]) for region in (8, 3))
-    color_set = np.repeat(np.where(label == 2, only_3, only_8), strips)
-    every = np.tile(np.arange(strips, dtype=np.uint16), n)
-    return Samples(
-        strip_start=np.arange(n + 1) * strips,
-        color_start=np.arange(n + 1) * strips,
-        strip=every,
-        length=length.reshape(-1).astype(np.float32),
-        color_strip=every,
-        color_set=color_set.astype(np.uint16),
-        color_count=rng.integers(8, 12, n * strips).astype(np.float32),
-        label=label,
-        view=np.arange(n, dtype=np.int32),
-        classes=("a", "b", "c"),
-    )
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory of two meshes, a red brick and a green box."""
+    folder = tmp_path_factory.mktemp("meshes")
+    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
+    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
+    return folder

@@ -6,8 +6,6 @@ from helpers import random_clouds
 import thor2_jax as thor2
 from training.augmentation.orientation import _random_axes, reorient
 
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
-
 
 def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
     sides = np.array([[1, 0.9, 0.2]] * 400 + [[1, 0.5, 0.2]] * 400, np.float32)
@@ -20,7 +18,7 @@ def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
 def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
     rng = np.random.default_rng(3)
     clouds = thor2.PointClouds.pack(random_clouds(3, [200], (0.2, 0.19, 0.1)) * 8)
-    normal = thor2.view_normalize(clouds, CONFIG)
+    normal = thor2.view_normalize(clouds, thor2.DescriptorConfig())
     turned = reorient(normal, rng)
     assert len({np.asarray(cloud).tobytes() for cloud in turned.points}) == 8
     for cloud, before in zip(np.asarray(turned.points), np.asarray(normal.points), strict=True):

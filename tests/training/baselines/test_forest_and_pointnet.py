@@ -100,10 +100,8 @@ def test_any_number_of_points(sizes: tuple[int, ...]) -> None:
 
 def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
     net, both = model(), inputs((800, 500))
-    one = BaselineInputs(
-        thor2.PointClouds.pack([(np.asarray(both.normal.points)[0, :800], np.asarray(both.normal.colors)[0, :800])]),
-        both.tops[:1],
-    )
+    first = np.asarray(both.normal.points)[0, :800], np.asarray(both.normal.colors)[0, :800]
+    one = BaselineInputs(thor2.PointClouds.pack([first]), both.tops[:1])
     np.testing.assert_allclose(net.probabilities(one)[0], net.probabilities(both)[0], atol=1e-6)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import random_clouds, untrained_run
+from helpers import assert_refused, random_clouds, untrained_run
 from safetensors.numpy import load_file, save_file
 
 import thor2_jax as thor2
@@ -191,13 +191,10 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
 
 def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:
     folder, source = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
-    with pytest.raises(InputError, match="^baselines: templates needs a backbone"):
-        train_baselines(folder, SOURCE, ["templates"])
-    with pytest.raises(InputError, match="no crops"):
-        train_baselines(folder, source, [SMALL], options=OPTIONS)
+    assert_refused("^baselines: templates needs a backbone", train_baselines, folder, SOURCE, ["templates"])
+    assert_refused("no crops", train_baselines, folder, source, [SMALL], options=OPTIONS)
     inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1]), np.zeros((1, 1), np.float32))
-    with pytest.raises(InputError, match="^frame is missing"):
-        inputs.crops(96)
+    assert_refused("^frame is missing", inputs.crops, 96)
 
 
 def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
@@ -208,8 +205,7 @@ def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
         (["templates"], r"vit_small_patch14_dinov2\.safetensors has no tensor"),
     ):
         job = TrainJob(tmp_path / "run", DEFAULT, dataset=tmp_path, weights=tmp_path, baselines=names)
-        with pytest.raises(InputError, match=f"^weights.*{message}"):
-            run_train_job(job, lambda: pytest.fail("work began"))
+        assert_refused(f"^weights.*{message}", run_train_job, job, lambda: pytest.fail("work began"))
     assert not (tmp_path / "run").exists()
 
 

@@ -30,17 +30,14 @@ def test_camera_types_match_the_published_lists() -> None:
         assert camera_types(azimuth, polar) == tuple(np.array(VIEW_TYPES)[list(expected)])
 
 
-@pytest.mark.parametrize(
-    ("types", "areas"),
-    [
+def test_view_types_by_face_areas() -> None:
+    for types, areas in (
         (("front",), [(1, 1, 1), (0.8, 1, 1), (1, 0.5, 0.5)]),
         (("front", "side"), [(1, 1, 0.5), (1, 0.5, 1), (1, 0.7, 0.3), (0.7, 0.3, 1)]),
         (("side", "top"), [(0.5, 0.5, 1), (0.5, 1, 0.5), (0.3, 0.7, 1)]),
         (("top",), [(0.79, 1, 1)]),
-    ],
-)
-def test_view_types_by_face_areas(types: tuple[str, ...], areas: list[tuple[float, float, float]]) -> None:
-    assert {view_types(*each) for each in areas} == {types}
+    ):
+        assert {view_types(*each) for each in areas} == {types}
 
 
 @functools.cache
@@ -76,17 +73,12 @@ def test_most_confident_selected_classifier_decides() -> None:
         box((0.1, 0.1, 0.1), (0.0, -2.0, 0.0)),  # all equal: front
     )
     models = library()
-    types: list[tuple[str, ...]] = [
-        ("front", "side"),
-        ("side", "top"),
-        ("front", "side"),
-        ("front", "side"),
-        ("front",),
-    ]
+    selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
     probabilities = THOR(models, CONFIG).probabilities(clouds)
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
-    for row, (names, k) in enumerate(zip(types, (3, 3, 2, 3, 3), strict=True)):
-        rows = [np.asarray(apply(models[name, k], clouds.tops[row : row + 1, : 16 * k]))[0] for name in names]
+    for row, (names, k) in enumerate(selected):
+        tops = clouds.tops[row : row + 1, : 16 * k]
+        rows = [np.asarray(apply(models[name, k], tops))[0] for name in names.split()]
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
 
 

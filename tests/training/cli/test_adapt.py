@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, json_lines, run_thor2, untrained_run, write_frame
+from helpers import Command, assert_refused, json_lines, run_thor2, untrained_run, write_frame
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.camera_adaptation import write_adapted_run
@@ -70,8 +69,7 @@ def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, 
         (answer,) = json_lines(printed("recognize", "--model", run, video / "0", "--json"))
         confidences.append([one["confidence"] for one in answer["instances"]])
     assert np.abs(np.subtract(*confidences)).max() > 1e-4
-    with pytest.raises(InputError, match="adapted to different cameras"):
-        load_runs([model, adapted])
+    assert_refused("adapted to different cameras", load_runs, [model, adapted])
 
 
 @pytest.mark.slow
@@ -103,6 +101,5 @@ def test_a_device_in_a_run_is_not_copied(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.jsonl").symlink_to("/dev/zero")
     adaptation = Adaptation(ColorTransform(), 12, 0.5, 0.4)
-    with pytest.raises(InputError, match="metrics"):
-        write_adapted_run(tmp_path / "run", adaptation, tmp_path / "out")
+    assert_refused("metrics", write_adapted_run, tmp_path / "run", adaptation, tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -1,4 +1,4 @@
-"""Options of all commands, and usage errors."""
+"""Options of all commands, usage errors, progress, Ctrl-C, and compiled programs in the user's cache directory."""
 
 import gc
 import json
@@ -10,29 +10,29 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax  # noqa: F401  (its callback of the garbage collection)
 import pytest
-from helpers import Command
+from helpers import Command, assert_refused, untrained_run, write_frame
 from processes import HANG
 
 import thor2_jax as thor2
-from training.cli.app import _interrupt, finish
+from thor2_jax.model.run_directory import save_run
+from training.cli.app import _interrupt, enable_compilation_cache, finish, show_progress
 from training.cli.options import FrameOptions
+from training.storage.jobs import numbered
 
 ROOT = Path(__file__).parents[3]
 
 
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, "-c", *arguments], capture_output=True, text=True, env=environment, timeout=HANG
-    )
+    command, environment = [sys.executable, "-c", *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
 
 
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
+def test_a_usage_error_is_one_line(refused: Command) -> None:
+    for command, expected in (
         ("recognize", "--help"),
         ("trian", "--help"),
         ("train --out o --no-such-option", "--help"),
@@ -49,10 +49,8 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
         ("render --meshes m --out o --sensor --copies 0", "copies is 0; expected"),
         ("render --meshes m --out o --sensor --crops 99999999", "crops is 99999999; expected"),
-    ],
-)
-def test_a_usage_error_is_one_line(command: str, expected: str, refused: Command) -> None:
-    assert expected in refused(*shlex.split(command))
+    ):
+        assert expected in refused(*shlex.split(command))
 
 
 @pytest.mark.parametrize("command", ["recognize", "explain", "evaluate frames", "enroll mug", "doctor", "adapt"])
@@ -165,3 +163,112 @@ def test_ctrl_c_in_a_callback_of_jax() -> None:
     finally:
         signal.signal(signal.SIGINT, previous)
     assert reached
+
+
+# Progress on a standard error that is not a terminal.
+
+
+def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
+    with show_progress() as show:
+        for done in range(41):
+            show("describe", done, 40, "views")
+            now[0] += 1
+        show("describe", 40, 40, "views")
+        show("fit", 7, 9, "")
+    err = capsys.readouterr().err
+    lines = err.splitlines()
+    assert "\x1b" not in err and "\r" not in err
+    assert lines[0] == "describe: 0 of 40, views" and lines[-1] == "fit: 7 of 9"
+    assert len(lines) == 2 + 40 // 5  # one at the start of each stage, and one every five seconds
+    assert "20 of 40" in lines[4] and "20 s left" in lines[4]
+
+
+def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
+    shown: list[tuple[str, int, int, str]] = []
+    show = numbered(lambda *values: shown.append(values), {"render": 1.0, "cached": 0.0, "fit": 4.0})
+    calls = [("render", 0, 0), ("render", 2, 10), ("cached", 1, 50), ("fit", 1, 20), ("fit thor", 1, 9), ("fit", 2, 10)]
+    for stage, done, seconds in calls:  # The fit is resumed after one of four epochs.
+        now[0] += seconds
+        show(stage, done, 4 if stage == "fit" else 2, "loss 1" if stage == "fit" else "")
+    assert shown == [
+        ("stage 1 of 3: render", 0, 2, ""),
+        ("stage 1 of 3: render", 2, 2, "about 40 s left of all stages"),
+        ("stage 2 of 3: cached", 1, 2, ""),
+        ("stage 3 of 3: fit", 1, 4, "loss 1, about 30 s left of all stages"),
+        ("fit thor", 1, 2, ""),
+        ("stage 3 of 3: fit", 2, 4, "loss 1, about 38 s left of all stages"),
+    ]
+
+
+def test_a_line_is_written_at_once_unless_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    for quiet, expected in ((False, "render: 0 of 10\n"), (True, "")):
+        with show_progress(quiet=quiet) as show:
+            show("render", 0, 10, "")
+            assert capsys.readouterr() == ("", expected)
+
+
+def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with show_progress() as show:
+        show("render [red]", 3, 10, "of [/x]")
+    err: Any = capsys.readouterr().err
+    assert "━" in err and "render [red]" in err and "3/10" in err and "of [/x]" in err
+
+
+# Compiled programs.
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An environment without a cache, and a user's cache directory."""
+    for name in list(os.environ):
+        if name.startswith(("JAX_", "THOR2_")):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    return tmp_path / "home" / "thor2-jax" / "xla"
+
+
+def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "" and not environment.exists()
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        enable_compilation_cache()
+        assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
+
+
+def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A directory that cannot be created is ignored, and a file is refused."""
+    monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == ""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
+    assert_refused("THOR2_CACHE", enable_compilation_cache)
+
+
+@pytest.mark.slow
+def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
+    frame = write_frame(tmp_path / "frame", {1: "brick"})
+    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
+    variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    command = [sys.executable, "-m", "training.cli", "recognize", "--model", str(tmp_path / "run"), str(frame)]
+
+    def recognize() -> tuple[set[str], str]:
+        """Return the names of the cached programs, and what was printed."""
+        done = subprocess.run(command, capture_output=True, text=True, env=variables)
+        assert done.returncode == 0 and done.stderr == ""
+        return {path.name for path in environment.glob("*/*-cache")}, done.stdout
+
+    first = recognize()
+    assert len(first[0]) > 5 and recognize() == first

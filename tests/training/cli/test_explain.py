@@ -93,15 +93,11 @@ def test_advice_on_a_wrong_name() -> None:
 
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
-    for arguments, text in (
-        ((frame, "--instance", 9), "table: instance is 9; expected one of 1, 4"),
-        ((tmp_path / "absent",), "is not a directory"),
-    ):
-        assert text in refused("explain", "--model", model, *arguments, "--out", out)
-        assert not out.exists()
-    out.mkdir()
+    command = ("explain", "--model", model, frame, "--out", out)
+    assert "table: instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
+    out.mkdir()  # The error has not created it.
     (out / "mine.txt").write_text("x")
-    assert "mine.txt" in refused("explain", "--model", model, frame, "--out", out)
+    assert "mine.txt" in refused(*command)
 
 
 def test_options_of_recognition_hold_for_its_explanation(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, run_thor2, write_box, write_frame
+from helpers import Command, run_thor2, write_frame
 from PIL import Image
 
 from thor2_jax.model.run_directory import load_run
@@ -31,24 +31,12 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("meshes")
-    for name, size in (("brick", (0.1, 0.06, 0.2)), ("box", (0.1, 0.1, 0.1))):
-        write_box(folder / f"{name}.ply", size)
-    return folder
-
-
-def record_of(run: Path) -> dict[str, Any]:
-    return dict(load_run(run).record["dataset"])
-
-
 def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     run = tmp_path / "run"
     command = ("train", "--frames", frames / "0", frames / "1", "--out", run, *TINY)
     out = printed(*command)
     assert out.count("skipped: ") == 1 and "1: instance 7" in out
-    record = record_of(run)
+    record: Any = load_run(run).record["dataset"]
     assert record["views"] == 4 * 9 and record["frames"]["instances"] == {"brick": 2, "book": 2}
     recognizer = Recognizer.load(run)
     assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "classifiers"
@@ -66,14 +54,13 @@ def test_frames_join_the_views_of_meshes(
     run = tmp_path / "run"
     command = ("--meshes", meshes, "--frames", frames, "--out", run, *STEPS, *TINY)
     assert run_thor2("train", *command) == 0
-    record = record_of(run)
+    record: Any = load_run(run).record["dataset"]
     assert {entry["name"] for entry in record["job"]["objects"]} == {"box", "brick"}
     assert record["frames"]["instances"] == {"brick": 2, "book": 2}
     assert Recognizer.load(run).classes == ("box", "brick", "book") and not (run / "views").exists()
     assert "finished already" in printed("train", *command)
-    assert "with frames " in refused("train", "--meshes", meshes, "--out", run, *STEPS, *TINY)
-    other = ("--meshes", meshes, "--frames", frames / "0", "--out", run, *STEPS, *TINY)
-    assert "with frames " in refused("train", *other)
+    for other in ((), ("--frames", frames / "0")):
+        assert "with frames " in refused("train", "--meshes", meshes, *other, "--out", run, *STEPS, *TINY)
 
 
 @pytest.fixture(scope="module")
@@ -82,31 +69,26 @@ def invalid(meshes: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory
     folder = tmp_path_factory.mktemp("invalid")
     (folder / "meshes").symlink_to(meshes)
     (folder / "frames").symlink_to(frames)
-    for name in ("empty", "reserved", "broken", "bare", "full"):
-        (folder / name).mkdir()
+    (folder / "reserved").mkdir()
+    (folder / "full").mkdir()
     write_frame(folder / "one" / "a", {1: "brick"})
     write_frame(folder / "one" / "b", {1: "brick"}, 1)
     for name, labels in (("case", {"1": "Brick", "2": "BRICK"}), ("unlabelled", {})):
         frame = write_frame(folder / name / "a", {1: "brick", 2: "book"})
         (frame / "labels.json").write_text(json.dumps({"labels": labels}))
     shutil.copy(meshes / "box.ply", folder / "reserved" / "unknown.ply")
-    (folder / "broken" / "can.ply").write_bytes((meshes / "box.ply").read_bytes()[:500])
-    (folder / "bare" / "can.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     (folder / "full" / "file").touch()
     (folder / "names.json").write_text(json.dumps({"mug": "no_such_scan"}))
     return folder
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
+def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(invalid)
+    for arguments, expected in (
         ("", "give one of --meshes and --dataset, --frames, or both"),
         ("--meshes absent", "absent: no such folder"),
-        ("--meshes broken", "can.ply"),
-        ("--meshes bare", "can.obj"),
         ("--meshes meshes --names names.json", "no_such_scan"),
         ("--meshes meshes --azimuth-step 0", "azimuth_step is 0"),
-        ("--meshes meshes --azimuth-step 1e-9", "azimuth_step"),
         ("--meshes meshes --mesh-scale 0", "mesh_scale is 0"),
         ("--meshes meshes --classifiers shape", "shape"),
         ("--meshes meshes --epochs 0", "epochs"),
@@ -120,11 +102,9 @@ def invalid(meshes: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory
         ("--dataset views --processes 2", "processes is 2"),
         ("--dataset views --process 1", "process 1;"),
         ("--dataset views --coordinator localhost:1 --processes 2 --process 2", "process is 2"),
-        ("--frames empty", "has no color.png"),
         ("--frames unlabelled", "no frame has"),
         ("--frames one", "the objects are brick; expected at least two"),
         ("--frames frames --leave-out brick", "the objects are book; expected"),
-        ("--frames frames --leave-out nobody", "leave_out has 'nobody'"),
         ("--frames frames/0", "one usable instance"),
         ("--frames case --meshes meshes", "'brick' and 'Brick' differ only by case or form"),
         ("--frames one --meshes reserved", "name is 'unknown', which is reserved"),
@@ -134,11 +114,7 @@ def invalid(meshes: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory
         ("--frames frames --coordinator localhost:1 --processes 2", "coordinator: "),
         ("--frames frames --sequences table.yaml", "sequences is"),
         ("--frames frames frames/0 --embedding 9 --distractors meshes", "also a class"),
-    ],
-)
-def test_invalid_inputs(
-    arguments: str, expected: str, invalid: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(invalid)
-    assert expected in refused("train", "--out", tmp_path / "run", *TINY, *STEPS[4:], *arguments.split())
-    assert not (tmp_path / "run").exists() and [path.name for path in Path("full").iterdir()] == ["file"]
+    ):
+        command = ("train", "--out", tmp_path / "run", *TINY, *STEPS[4:], *arguments.split())
+        assert expected in refused(*command), arguments
+        assert not (tmp_path / "run").exists() and [path.name for path in Path("full").iterdir()] == ["file"]

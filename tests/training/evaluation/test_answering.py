@@ -17,9 +17,7 @@ class ToyRecognizer(UntaughtRecognizer):
 
     def __init__(self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, Any]) -> None:
         super().__init__(("mug", "bowl", "can"), ("tops", "tops2"))
-        self.instances = [
-            SimpleNamespace(label=label, reason=unusable.get(label), occluded=label == 4) for label in labels
-        ]
+        self.instances = [SimpleNamespace(label=k, reason=unusable.get(k), occluded=k == 4) for k in labels]
         self.table = {name: np.array(rows) for name, rows in probabilities.items()}
 
     def describe(self, frame: Any) -> Any:

@@ -13,7 +13,7 @@ from helpers import (
     ParsedPage,
     ToyDescriptors,
     UntaughtRecognizer,
-    input_error,
+    assert_refused,
     json_lines,
     small_frame,
     untrained_embedding_run,
@@ -227,8 +227,7 @@ def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
     assert without_times(evaluate_toys(tmp_path, dataset)) == without_times(first)
     for change in (lambda: (tmp_path / "1.png").write_bytes(b"changed"), (tmp_path / "1.png").unlink):
         change()
-        with pytest.raises(InputError, match=r"^out: .*1\.png"):
-            evaluate_toys(tmp_path, dataset)
+        assert_refused(r"^out: .*1\.png", evaluate_toys, tmp_path, dataset)
     (tmp_path / "1.png").write_bytes(bytes([1]))
     header, *lines = json_lines(answers.decode())
     lines = [{name: value for name, value in line.items() if name != "files"} for line in lines]  # of version 0.1.0
@@ -241,8 +240,7 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
         def __getitem__(self, number: int) -> LabelledFrame:
             raise InputError("color.png is damaged")
 
-    with pytest.raises(InputError, match="damaged"):
-        evaluate_toys(tmp_path, Unreadable(2))
+    assert_refused("damaged", evaluate_toys, tmp_path, Unreadable(2))
     assert not (tmp_path / "report").exists()
 
 
@@ -278,12 +276,10 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
         "digest1": (runs[:1], ToyDataset(3), DESCRIPTION),
     }
     for value, (evaluated, dataset, description) in cases.items():
-        with input_error(value, match="^out: "):
-            evaluate_dataset(evaluated, dataset, description, report)
+        assert_refused(f"^out: .*{value}", evaluate_dataset, evaluated, dataset, description, report)
     assert (report / "answers.jsonl").read_bytes() == before
     (report / "answers.jsonl").write_bytes(b"".join(before.splitlines(keepends=True)[:3]))
-    with pytest.raises(InputError, match="'frame0'.*'photo0'"):
-        evaluate_toys(tmp_path, ToyDataset(3, "photo"))
+    assert_refused("'frame0'.*'photo0'", evaluate_toys, tmp_path, ToyDataset(3, "photo"))
 
 
 def test_directories_of_others_are_refused(tmp_path: Path) -> None:
@@ -292,16 +288,14 @@ def test_directories_of_others_are_refused(tmp_path: Path) -> None:
     with locked(tmp_path / "report"), pytest.raises(InputError, match="^out: "):
         evaluate_toys(tmp_path, 1)
     (tmp_path / "report" / "thesis.tex").touch()
-    with pytest.raises(InputError, match="^out: "):
-        evaluate_toys(tmp_path, 1)
+    assert_refused("^out: ", evaluate_toys, tmp_path, 1)
     assert {p.name for p in (tmp_path / "report").iterdir()} == {"thesis.tex", LOCK}
 
 
 @pytest.mark.parametrize("content", ["", "[1]\n", "[" * 100_000 + "\n", "{}\n{}\n", '{"a": 1}\nnonsense\n'])
 def test_damaged_answer_file_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "answers.jsonl").write_text(content)
-    with pytest.raises(InputError, match="damaged"):
-        AnswerFile(tmp_path / "answers.jsonl", {"a": 1})
+    assert_refused("damaged", AnswerFile, tmp_path / "answers.jsonl", {"a": 1})
     assert (tmp_path / "answers.jsonl").read_text() == content
 
 

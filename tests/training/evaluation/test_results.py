@@ -1,6 +1,5 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
-import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -28,8 +27,6 @@ class ToyRun(NamedTuple):
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
-N_PREDICTORS = 5
-EYE = np.eye(3, dtype=np.float32)
 
 
 def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
@@ -41,7 +38,7 @@ def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
         for label in (1, 2):
             number = 2 * k + label
             truth = "dragon" if number % 11 == 0 else CLASSES[rng.integers(3)]
-            table = rng.dirichlet(np.ones(3), N_PREDICTORS).astype(np.float32)
+            table = rng.dirichlet(np.ones(3), 5).astype(np.float32)
             described = (None, table) if number % 7 else ("too few points", None)
             instances.append(InstancePrediction(label, truth, False, *described))
         attributes = {"environment": "lounge" if k % 2 else "warehouse", "occlusion": ("none", "low", "high")[k % 3]}
@@ -59,9 +56,8 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
     assert list(fusions(["thor", "tops", "pointnet", "tops2", "forest", "gallery", "both"])) == titles
 
 
-@pytest.mark.parametrize(
-    ("predictors", "answer_by", "expected"),
-    [
+def test_main_fusion_is_that_of_what_answers() -> None:
+    for predictors, answer_by, expected in (
         (["thor", "ce"], "classifiers", "CE"),
         (["ce", "tops"], "classifiers", "CE+TOPS"),
         (["ce", "tops", "tops2", "gallery", "both"], "classifiers", "THOR2"),
@@ -69,10 +65,8 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
         (["forest", "embedding", "gallery", "both"], "both", "both"),
         (["forest", "embedding"], "classifiers", "embedding"),
         (["tops", "tops2", "embedding", "THOR2+embedding"], "classifiers", "THOR2+embedding"),
-    ],
-)
-def test_main_fusion_is_that_of_what_answers(predictors: list[str], answer_by: str, expected: str) -> None:
-    assert main_fusion(fusions(predictors), answer_by) == expected
+    ):
+        assert main_fusion(fusions(predictors), answer_by) == expected
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
@@ -189,10 +183,8 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     """A mug in four frames, correct in two; a can in one; three dragons. The thresholds reject the less sure."""
     answers = [("mug", 0.9), ("mug", 0.7), ("can", 0.8), ("bowl", 0.6)]
     dragons: list[tuple[str, float]] = [("mug", 0.8), ("can", 0.65), ("can", 0.5)]
-    frames = [
-        FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0))])
-        for answer in answers
-    ]
+    mugs = [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0)) for answer in answers]
+    frames = [FrameAnswers("f", {}, 1.0, [mug]) for mug in mugs]
     frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
     frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
     frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
@@ -223,23 +215,21 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
 
 
-@pytest.mark.parametrize(
-    "instances",
-    [[], [InstancePrediction(1, "mug", False, None, EYE[:2])], [InstancePrediction(1, "mug", False, "too few points")]],
-    ids=["none", "incorrect", "not described"],
-)
-def test_results_of_no_or_one_instance(instances: list[InstancePrediction]) -> None:
-    report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
-    assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
-    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
-    if instances:
-        assert report["known_unknown"] is None
-        accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
-        assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
-        assert report["confusion"][2][3] == (instances[0].reason is not None)
-        assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
-        assert report["rejection"]["threshold"]["runs"] == 0
-        assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
+def test_results_of_no_or_one_instance() -> None:
+    incorrect = InstancePrediction(1, "mug", probabilities=np.eye(2, 3, dtype=np.float32))
+    for instances in ([], [incorrect], [InstancePrediction(1, "mug", reason="too few points")]):
+        report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
+        assert report["instances"]["scored"] == len(instances) and report["published_tables"] == []
+        assert report["speed"]["frames_per_second"] is None
+        assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
+        if instances:
+            assert report["known_unknown"] is None
+            accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
+            assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
+            assert report["confusion"][2][3] == (instances[0].reason is not None)
+            assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
+            assert report["rejection"]["threshold"]["runs"] == 0
+            assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 def test_grouping_by_attributes() -> None:
@@ -251,20 +241,3 @@ def test_grouping_by_attributes() -> None:
     assert attribute_tables("bop", attributes) == [(), ("a",), ("b",)]
     assert attribute_tables("uwis", [{"environment": "lounge"}]) == [(), ("environment",)]
     assert summarize_runs([0.5, float("nan"), 0.7])["runs"] == 2
-
-
-@pytest.mark.parametrize("own", [True, False])
-def test_ocid_has_a_table_by_sequence_and_published_ones(own: bool) -> None:
-    """The protocol decides which: the models know the objects of one sequence, or those of all sequences."""
-    answer = InstancePrediction(1, "mug", probabilities=EYE[:2])
-    names = ["table/bottom/mixed/seq21", "table/bottom/mixed/seq22"]
-    attributes = {"camera": "lower", "place": "table", "type": "mixed"}
-    frames = [FrameAnswers(f"{name}/{k}", attributes, 1.0, [answer]) for name in names for k in range(2)]
-    report = compute_results("ocid", RUNS[:1], frames, own_objects=own)
-    tables = report["accuracy"]["max"]
-    assert tables[-1]["by"] == ["sequence"] and [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
-    (lower,) = next(table for table in tables if table["by"] == ["camera"])["cells"]
-    assert lower["published"]["THOR2"] == pytest.approx(0.7507 if own else 0.5996)
-    published = json.loads(json.dumps(report))["published_tables"]
-    assert [table["number"] for table in published] == ([1, 8, None] if own else [3])
-    assert compute_results("ocid", RUNS[:1], [])["published_tables"] == []

@@ -6,14 +6,13 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import SMALL_CONFIG, random_clouds, untrained_embedding_run
+from helpers import SMALL_CONFIG, assert_refused, random_clouds, untrained_embedding_run
 from scipy.special import softmax
 from sklearn.metrics import log_loss
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP, Feature, class_probabilities
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.fusion import with_temperature
@@ -21,13 +20,6 @@ from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
 from thor2_jax.types import Cloud
 from training.fitting import calibration
-from training.fitting.calibration import (
-    fit_calibration,
-    fit_temperature,
-    negative_log_likelihood,
-    sample_probabilities,
-    temperatures,
-)
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
 from training.views.normalized_views import CLOUDS_PER_BATCH, MemoryViews, padded_batches
@@ -50,7 +42,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     rows = np.array([7, 0, 7, 3, 5])
     context = FitContext(feature, NETWORK, CONFIG)
-    probabilities = sample_probabilities(model, samples, rows, context)
+    probabilities = calibration.sample_probabilities(model, samples, rows, context)
     probabilities_of = jax.jit(lambda described: class_probabilities(model, described, feature))
     expected = []
     for index in range(2):
@@ -60,17 +52,18 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
             described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
             expected.append(np.asarray(probabilities_of(described)))
     np.testing.assert_allclose(probabilities, np.concatenate(expected)[rows], atol=1e-5)
-    assert sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
+    assert calibration.sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
 
 
 def test_temperatures_are_fitted_to_the_held_out_set() -> None:
     samples = build_samples(source(3), NETWORK, CONFIG)
     model = MLP(input_size("tops", CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     held_out = samples.view == 1
-    fitted = temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
-    probabilities = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
-    assert fitted == {"tops": fit_temperature(probabilities, samples.label[held_out])}
-    assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
+    fitted = calibration.temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
+    context, rows = FitContext("tops", NETWORK, CONFIG), np.flatnonzero(held_out)
+    probabilities = calibration.sample_probabilities(model, samples, rows, context)
+    assert fitted == {"tops": calibration.fit_temperature(probabilities, samples.label[held_out])}
+    assert calibration.temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])
@@ -79,7 +72,7 @@ def test_known_temperature_is_recovered(temperature: float) -> None:
     logits = rng.normal(0, 2, (20_000, 5))
     truth = (softmax(logits, axis=1).cumsum(axis=1) < rng.random((20_000, 1))).sum(axis=1)
     scaled = softmax(logits * temperature, axis=1)
-    assert fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
+    assert calibration.fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
 
 
 def test_likelihood_matches_scipy_and_sklearn() -> None:
@@ -88,19 +81,17 @@ def test_likelihood_matches_scipy_and_sklearn() -> None:
     probabilities = softmax(logits, axis=1)
     np.testing.assert_allclose(with_temperature(probabilities, 2.5), softmax(logits / 2.5, axis=1), rtol=1e-6)
     expected = log_loss(truth, softmax(logits / 2.5, axis=1), labels=range(4))
-    assert negative_log_likelihood(probabilities, truth, 2.5) == pytest.approx(expected)
-    best = fit_temperature(probabilities, truth)
-    grid = [negative_log_likelihood(probabilities, truth, t) for t in np.geomspace(0.01, 100, 400)]
-    assert negative_log_likelihood(probabilities, truth, best) <= min(grid) + 1e-9
+    assert calibration.negative_log_likelihood(probabilities, truth, 2.5) == pytest.approx(expected)
+    best = calibration.fit_temperature(probabilities, truth)
+    grid = [calibration.negative_log_likelihood(probabilities, truth, t) for t in np.geomspace(0.01, 100, 400)]
+    assert calibration.negative_log_likelihood(probabilities, truth, best) <= min(grid) + 1e-9
 
 
 def test_probabilities_of_zero_and_invalid_arguments() -> None:
     probabilities = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], np.float32)
-    assert 1 < fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
-    with pytest.raises(InputError, match="shapes"):
-        fit_temperature(np.zeros((0, 3)), np.zeros(0, int))
-    with pytest.raises(InputError, match=r"truth.* 3; expected 0 to 2"):
-        fit_temperature(np.full((2, 3), 1 / 3), np.array([0, 3]))
+    assert 1 < calibration.fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
+    assert_refused("shapes", calibration.fit_temperature, np.zeros((0, 3)), np.zeros(0, int))
+    assert_refused(r"truth.* 3; expected 0 to 2", calibration.fit_temperature, np.full((2, 3), 1 / 3), np.array([0, 3]))
 
 
 Views = list[tuple[int, Cloud]]
@@ -120,7 +111,7 @@ def fit(fused: np.ndarray, embedded: np.ndarray, held_out: Views) -> tuple[Calib
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibration, "infer_clouds", lambda *_: inference)
-        return fit_calibration(run, run.embedding, held_out)
+        return calibration.fit_calibration(run, run.embedding, held_out)
 
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
@@ -160,7 +151,7 @@ def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) 
     assert run.embedding is not None
     sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
-    fitted, accuracy = fit_calibration(run, run.embedding, views)
+    fitted, accuracy = calibration.fit_calibration(run, run.embedding, views)
     assert fitted is not None
     ((_, clouds),) = padded_batches([cloud for _, cloud in views], CLOUDS_PER_BATCH)
     thresholds = []

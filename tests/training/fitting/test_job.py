@@ -2,20 +2,19 @@
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import Interrupted, brick_and_stick, files_of, full_disk, random_clouds, stop_when
+from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full_disk, random_clouds, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
 from thor2_jax.model.classifier import model_arrays
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from thor2_jax.types import Cloud
 from training.evaluation.runs import load_runs
 from training.fitting import job as module
 from training.fitting import loop
@@ -94,34 +93,25 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(module, "build_samples", lambda *_, **__: pytest.fail("the training started"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("x")
-    with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} already contains kept"):
-        train(tmp_path / "run")
-    with pytest.raises(thor2.InputError, match=r"classifiers is \('shape',\)"):
-        train(tmp_path / "new", ("shape",))
-    with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run' / 'kept' / 'run'} "):
-        train(tmp_path / "run" / "kept" / "run")
+    assert_refused(f"out: {tmp_path / 'run'} already contains kept", train, tmp_path / "run")
+    assert_refused(r"classifiers is \('shape',\)", train, tmp_path / "new", ("shape",))
     assert [p.name for p in tmp_path.rglob("*")] == ["run", "kept"]
 
 
 STICK = brick_and_stick(1)["stick"]
 
 
-@pytest.mark.parametrize(
-    ("bad", "folds", "message"),
-    [
+def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
+    for bad, folds, message in (
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
         ({"mug": STICK}, 1, "views of 1 classes"),
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
-    ],
-)
-def test_nothing_is_written_for_bad_views(
-    bad: Mapping[str, list[Cloud]], folds: int, message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(thor2.InputError, match=message):
-        train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
-    assert names(tmp_path) == []
+    ):
+        with pytest.raises(thor2.InputError, match=message):
+            train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
+        assert names(tmp_path) == []
 
 
 def test_an_interrupted_run_resumes_to_the_same_result(
@@ -136,15 +126,13 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     for stage, step in (("fit ce", 2), ("fit ce", 8), ("fit tops", 9)):
         with pytest.raises(Interrupted):
             train(out, ("tops", "ce"), progress=stop_when(stage, step))
-        with pytest.raises(thor2.InputError, match=r"run\.json"):
-            load_run(out)
+        assert_refused(r"run\.json", load_run, out)
     run = train(out, ("tops", "ce"))
     same_weights(run, whole[1])
     assert run.record == whole[1].record
     assert logged_rows(out) == logged_rows(whole[0])
     assert names(out) == FINISHED
-    with pytest.raises(thor2.InputError, match="out: .* already contains"):
-        train(out, ("tops", "ce"))
+    assert_refused("out: .* already contains", train, out, ("tops", "ce"))
 
 
 @pytest.mark.usefixtures("unfitted")
@@ -189,16 +177,14 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
             train_run(source(seed), out, dataclasses.replace(begun, **changes))
     assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
-    with pytest.raises(thor2.InputError, match=r"begun\.json cannot be read"):
-        train(out)
+    assert_refused(r"begun\.json cannot be read", train, out)
 
 
 def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     out = tmp_path / "run"
     (out / "checkpoints").mkdir(parents=True)
     (out / "checkpoints" / "epoch1.pt").write_text("a user's")
-    with pytest.raises(thor2.InputError, match=r"already contains epoch1\.pt"):
-        train(out)
+    assert_refused(r"already contains epoch1\.pt", train, out)
     (out / "checkpoints" / "epoch1.pt").rename(tmp_path / "epoch1.pt")
     with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 4))
@@ -212,18 +198,15 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
 
 
-@pytest.mark.slow
-def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A training that could not write any of its files resumes."""
+@pytest.mark.usefixtures("unfitted")
+def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
-    writers = ((Checkpoints, "save"), *((module, name) for name in ("append_metrics", "draw_curves", "save_run")))
-    for where, name in ((module, "begin_job"), *writers):
-        with monkeypatch.context() as patch:
-            patch.setattr(where, name, full_disk)
-            with pytest.raises(OSError, match="No space left"):
-                train(out, ("tops", "ce"))
+    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+            patch.setattr(module, name, full_disk)
+            train(out)
         assert not (out / "run.json").exists()
-    same_weights(train(out, ("tops", "ce")), whole[1])
+    train(out)
     assert names(out) == FINISHED
 
 
@@ -266,5 +249,4 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert logged_rows(out) == rows
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
-    with pytest.raises(thor2.InputError, match="out: .* already contains"):
-        run()
+    assert_refused("out: .* already contains", run)

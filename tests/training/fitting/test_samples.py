@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from helpers import assert_refused
 from helpers import random_clouds as views
 
 import colornet
@@ -15,7 +16,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
-from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand, fold_of_views
+from training.fitting.samples import PAPER_MIRRORS, build_samples, expand, fold_of_views
 from training.views.normalized_views import MemoryViews, SourceShard
 
 NETWORK = colornet.load_default()
@@ -23,10 +24,6 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 expand_batch = jax.jit(lambda batch, config: expand(batch, region_sets(NETWORK).weights, config), static_argnums=1)
-
-
-def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFIG) -> thor2.Strips:
-    return expand_batch(samples.take(np.asarray(rows)), config)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +52,7 @@ def test_every_view_is_used_mirrored_in_four_ways(
         points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
         assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
-    descriptors = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
+    descriptors = thor2.describe_strips(expand_batch(samples.take(np.arange(16)), config), NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))
@@ -117,5 +114,4 @@ def test_samples_of_a_view_stay_together_and_folds_are_even() -> None:
     assert (fold_numbers != fold_of(label, view, 5, 1)).any()
     assert not fold_of(label, view, 1, 0).any()
     for folds in (14, 0):
-        with pytest.raises(thor2.InputError, match=f"folds is {folds}"):
-            fold_of(label, view, folds, 0)
+        assert_refused(f"folds is {folds}", fold_of, label, view, folds, 0)

@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 
-from training.objects.mesh import TexturedMesh
 from training.objects.procedural import _FAMILIES, SIZES, procedural_object
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
 
-SEEDS = range(60)
-OBJECTS = [procedural_object(seed) for seed in SEEDS]
-
-
-def mean_color(mesh: TexturedMesh) -> np.ndarray:
-    return np.mean([texture.reshape(-1, 3).mean(axis=0) for texture in mesh.textures], axis=0)
+OBJECTS = [procedural_object(seed) for seed in range(60)]
 
 
 def test_a_seed_determines_the_object() -> None:
@@ -52,7 +46,8 @@ def test_siblings_share_shape_or_paint() -> None:
 
 def test_shapes_and_colors_differ() -> None:
     extents = np.array([np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in OBJECTS[::5]])
-    colors = np.array([mean_color(mesh) for mesh in OBJECTS[::5]])
+    means = [[texture.reshape(-1, 3).mean(axis=0) for texture in mesh.textures] for mesh in OBJECTS[::5]]
+    colors = np.array([np.mean(of_textures, axis=0) for of_textures in means])
     for values, least in ((extents, 1e-3), (colors, 2)):
         distance = np.linalg.norm(values[:, None] - values, axis=-1)
         assert distance[~np.eye(len(values), dtype=bool)].min() > least

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dataset_files import K, write_bop, write_folder, write_ocid, write_uwis
-from helpers import input_error
+from helpers import assert_refused, input_error
 from PIL import Image
 
 from training.readers import BOP, OCID, FrameFolder, UWISOccluded
@@ -93,8 +93,7 @@ def test_paths_that_are_not_a_dataset(kind: str, tmp_path: Path) -> None:
     (tmp_path / "empty" / "41" / "images").mkdir(parents=True)
     (tmp_path / "file").touch()
     for name, expected in (("absent", "is not a directory"), ("file", "is not a directory"), ("empty", "has no ")):
-        with input_error(f"{tmp_path / name} {expected}", match="^(dataset|frames): "):
-            READERS[kind](tmp_path / name)
+        assert_refused(f"^(dataset|frames): {tmp_path / name} {expected}", READERS[kind], tmp_path / name)
 
 
 def camera(**changes: Any) -> dict[str, Any]:

@@ -1,20 +1,21 @@
-"""OCID on small datasets with the layout of the real one; the fitted camera against the one that made the clouds."""
+"""OCID on small datasets with the layout of the real one, PCD files, and the fitted camera."""
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, points_of, write_ocid
-from helpers import Command, NamesInOrder, input_error
+from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, points_of, write_ocid
+from helpers import Command, NamesInOrder, assert_refused, input_error
 from PIL import Image
 
 from thor2_jax.frames.frames import backproject
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import OCID
-from training.readers.ocid import fit_intrinsics
+from training.readers.ocid import fit_intrinsics, read_organized_points
 
 ALL = {"seq36": ["mug", "bowl", "banana"]}
 
@@ -41,14 +42,11 @@ def test_a_frame(tmp_path: Path, place: str, first: int, data: str) -> None:
     assert item.frame.instances == (first, first + 1, first + 2)
     np.testing.assert_array_equal(item.frame.labels, np.where(labels < first, 0, labels))
     fitted = item.frame.intrinsics
-    np.testing.assert_allclose(
-        (fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale), (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4
-    )
+    numbers = fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale
+    np.testing.assert_allclose(numbers, (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4)
     # The points of the frame equal those of the cloud.
-    there = depth > 0
-    np.testing.assert_allclose(
-        backproject(item.frame.depth_m, fitted)[there], points_of(depth)[there], rtol=1e-4, atol=1e-6
-    )
+    points, there = backproject(item.frame.depth_m, fitted), depth > 0
+    np.testing.assert_allclose(points[there], points_of(depth)[there], rtol=1e-4, atol=1e-6)
 
 
 def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
@@ -71,11 +69,8 @@ def test_the_order_of_the_dataset(tmp_path: Path) -> None:
     (root / "table" / "top" / "mixed" / "seq99").mkdir()
     names = write_names(tmp_path, {"seq21": ["a", "b", "c"], "seq02": ["d", "e", "f"]})
     whole = OCID(tmp_path, names)
-    assert whole.identifiers == [
-        f"{sequence}/result_{stem}"
-        for sequence in ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
-        for stem in "ab"
-    ]
+    sequences = ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
+    assert whole.identifiers == [f"{sequence}/result_{stem}" for sequence in sequences for stem in "ab"]
     assert [item.identifier for item in whole] == whole.identifiers == OCID(root, names).identifiers
     assert [item.attributes["camera"] for item in whole] == ["lower"] * 2 + ["upper"] * 4
 
@@ -129,22 +124,18 @@ def test_the_camera_against_least_squares_of_numpy() -> None:
         np.testing.assert_allclose((focal, centre), (1 / slope, -offset / slope), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda p: -p, "the cloud has 0 points"),
-        (lambda p: np.where(np.arange(9)[:, None] == 3, p, np.nan), "the cloud has 6 points"),
-        (lambda p: p * [1, -1, 1], "fy -565.21"),
-        (lambda p: np.random.default_rng(0).permutation(p.reshape(-1, 3)).reshape(p.shape), "is not that"),
-        (lambda p: p * [0, 1, 1], "is not that"),
-        (lambda p: p * [1e300, 1e300, 1e-300], "is not that"),
-    ],
-)
-@pytest.mark.filterwarnings("error")
-def test_clouds_without_a_pinhole_camera(change: Any, expected: str) -> None:
-    depth = np.random.default_rng(0).uniform(0.5, 1.5, SHAPE)
-    with input_error(expected):
-        fit_intrinsics(change(backproject(depth, CAMERA)))
+def test_clouds_without_a_pinhole_camera() -> None:
+    rng = np.random.default_rng(0)
+    points = backproject(rng.uniform(0.5, 1.5, SHAPE), CAMERA)
+    for changed, expected in (
+        (-points, "the cloud has 0 points"),
+        (np.where(np.arange(9)[:, None] == 3, points, np.nan), "the cloud has 6 points"),
+        (points * [1, -1, 1], "fy -565.21"),
+        (rng.permutation(points.reshape(-1, 3)).reshape(points.shape), "is not that"),
+        (points * [0, 1, 1], "is not that"),
+        (points * [1e300, 1e300, 1e-300], "is not that"),
+    ):
+        assert_refused(expected, fit_intrinsics, changed)
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
@@ -161,12 +152,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert "Models: run." in page and "banana (unknown object)" in page
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"banana": 1}
-    accuracy = {
-        (*table["by"], *cell["where"].values()): (cell["instances"], cell["accuracy"]["TOPS"]["mean"])
-        for table in report["accuracy"]["max"]
-        for cell in table["cells"]
-    }
-    assert accuracy[()] == (4, 0.75)
+    tables = report["accuracy"]["max"]
+    cells = {(*table["by"], *cell["where"].values()): cell for table in tables for cell in table["cells"]}
+    accuracy = {where: (cell["instances"], cell["accuracy"]["TOPS"]["mean"]) for where, cell in cells.items()}
+    assert accuracy[()] == (4, 0.75) and cells["camera", "lower"]["published"]["THOR2"] == pytest.approx(0.5996)
     assert accuracy["camera", "lower"] == (2, 1.0) and accuracy["camera", "upper"] == (2, 0.5)
     assert accuracy["camera", "place", "lower", "table"] == (2, 1.0)
     assert accuracy["camera", "type", "upper", "mixed"] == (2, 0.5)
@@ -178,8 +167,9 @@ def test_each_sequence_has_its_own_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command
 ) -> None:
     """Each run has its own classes; one run serves both cameras."""
-    for place in ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08"):
-        write_ocid(tmp_path / "YCB10", place)
+    sequences = ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08")
+    for sequence in sequences:
+        write_ocid(tmp_path / "YCB10", sequence)
     table = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
     classes = {"seq36": ("mug", "bowl"), "seq08": ("banana", "apple")}
     runs = {name: [EvaluatedRun(name, name, NamesInOrder(each))] for name, each in classes.items()}
@@ -194,6 +184,81 @@ def test_each_sequence_has_its_own_run(
     assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
-    (by_sequence,) = [each["cells"] for each in report["accuracy"]["max"] if each["by"] == ["sequence"]]
-    assert [round(cell["accuracy"]["TOPS"]["mean"], 3) for cell in by_sequence] == [1.0, 1.0, 0.667]
+    cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
+    accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
+    assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
+    assert cells["camera",][0]["published"]["THOR2"] == pytest.approx(0.7507)
     assert "2 models are given" in refused(*command, "--per-sequence", tmp_path)
+
+
+# Clouds in PCD files.
+
+
+POINTS = np.array([(0.5 * k, -0.25 * k, np.nan if k == 4 else 1.0 + k) for k in range(6)]).reshape(2, 3, 3)
+SIGNALLING_NAN = b"\x01\0\x80\x7f"
+
+
+def write_cloud(path: Path, data: str, old: bytes = b"", new: bytes = b"") -> Path:
+    """Write six points, whose labels are 0 to 5, with bytes replaced that occur once."""
+    content = pack_pcd(POINTS, np.zeros((2, 3, 3), int), np.arange(1, 7).reshape(2, 3), data)
+    content = content.replace(struct.pack("<f", np.nan), SIGNALLING_NAN)
+    assert not old or content.count(old) == 1
+    path.write_bytes(content.replace(old, new) if old else content)
+    return path
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_points(tmp_path: Path, data: str) -> None:
+    for count in (b"COUNT 1 1 1 1 1\n", b""):
+        points = read_organized_points(write_cloud(tmp_path / "cloud.pcd", data, b"COUNT 1 1 1 1 1\n", count))
+        np.testing.assert_array_equal(points, POINTS, strict=True)
+
+
+def test_points_among_other_fields(tmp_path: Path) -> None:
+    """The file has a field of three numbers, padding, other number types, another order of axes and CR LF line ends."""
+    path = tmp_path / "cloud.pcd"
+    header = (
+        "VERSION .7\r\nFIELDS _ z normal x _ y\r\nSIZE 1 8 4 4 2 4\r\nTYPE U F F F I F\r\nCOUNT 3 1 3 1 1 1\r\n"
+        "WIDTH 2\r\nHEIGHT 1\r\nPOINTS 2\r\nDATA {}\r\n"
+    )
+    rows = [(0, 1, 2, 3.5, 9.0, 9.0, 9.0, 1.5, -7, 2.5), (0, 1, 2, float("nan"), 9.0, 9.0, 9.0, 4.0, -7, 5.0)]
+    path.write_bytes(header.format("binary").encode() + b"".join(struct.pack("<3Bd3ffhf", *row) for row in rows))
+    expected = [[[1.5, 2.5, 3.5], [4.0, 5.0, np.nan]]]
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+    text = "\r\n".join(" ".join(map(str, row)) for row in rows)
+    path.write_bytes((header.format("ascii") + text).encode())
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_damaged_headers(tmp_path: Path, data: str) -> None:
+    for old, new in (
+        (b"DATA", b"DATE"),
+        (b"FIELDS x y z", b"FIELDS x y w"),
+        (b"SIZE 4", b"SIZE 3"),
+        (b"SIZE 4", b"SIZE four"),
+        (b"TYPE F", b"TYPE X"),
+        (b"TYPE F F F U U\n", b""),
+        (b"COUNT 1", b"COUNT 2"),
+        (b"COUNT 1", b"COUNT 0"),
+        (b"COUNT 1 1 1 1 1", b"COUNT 1 1 1 1 9999999999999999999999"),
+        (b"WIDTH 3", b"WIDTH 0"),
+        (b"WIDTH 3", b"WIDTH"),
+        (b"HEIGHT 2", b"HEIGHT 3"),
+        (b"HEIGHT 2\n", b""),
+    ):
+        path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
+        assert_refused(str(path), read_organized_points, path)
+
+
+def test_damaged_data(tmp_path: Path) -> None:
+    for data, old, new, expected in (
+        ("binary", b"DATA binary", b"DATA binary_compressed", "DATA binary_compressed"),
+        ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
+        ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
+    ):
+        path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
+        with input_error(path, expected):
+            read_organized_points(path)

@@ -1,16 +1,20 @@
-"""UW-IS Occluded and folders of frames, on small datasets with the layout of the real ones."""
+"""UW-IS Occluded and folders of frames, on small datasets with the layout of the real ones, and recordings."""
 
+import functools
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 from dataset_files import images, write_folder, write_uwis
-from helpers import input_error
+from helpers import assert_refused, input_error
 from PIL import Image
+from recording_files import table_frame, write_recording
 
 from thor2_jax.frames.frames import Intrinsics, read_labels
+from thor2_jax.recordings.bags import Bag
 from training.readers import FrameFolder, UWISOccluded
-from training.readers.frame_files import find_frames
+from training.readers.frame_files import find_frames, recorded_sources
 from training.readers.labelled import LabelledFrame
 from training.readers.uwis import video_attributes
 
@@ -45,9 +49,8 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [item.truth for item in items] == [{1: "mug"}, {1: "mug"}, {1: "mug", 77: "spoon"}]
     for item, seed in zip(items, (2, 1, 0), strict=True):
         assert_images_of(item, seed)
-        assert item.frame.intrinsics == Intrinsics(
-            920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406, 1000
-        )
+        camera = 920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406
+        assert item.frame.intrinsics == Intrinsics(*camera, 1000)
     listed = {"environment": "lounge", "category": "food", "occlusion": "high", "light": "2"}
     assert [item.attributes for item in items] == [listed, listed, {"environment": "lounge"}]
     assert [item.identifier for item in dataset] == dataset.identifiers  # iterates again from the start
@@ -96,8 +99,7 @@ def test_frames_of_one_name_in_two_folders(tmp_path: Path) -> None:
         (("a", "b/deep"), ["a/000", "b/deep/000"]),
     ):
         assert [source.name for source in find_frames([tmp_path / path for path in paths])] == names
-    with input_error("000 is given twice"):
-        find_frames([tmp_path / "a", tmp_path / "a"])
+    assert_refused("000 is given twice", find_frames, [tmp_path / "a", tmp_path / "a"])
 
 
 def test_lossy_labels_are_refused(tmp_path: Path) -> None:
@@ -109,3 +111,36 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
     for name in ("lossy", "lossy.tiff"):
         with input_error(name, "JPEG", match="^labels: "):
             read_labels(tmp_path / name)
+
+
+RECORDED = [table_frame(k) for k in range(3)]
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_frames_are_read_in_any_order(tmp_path: Path, every: int) -> None:
+    path = write_recording(tmp_path / "a.mcap", RECORDED)
+    opened: list[weakref.ref[Bag]] = []
+
+    def open_bag() -> Bag:
+        bag = Bag(path)
+        opened.append(weakref.ref(bag))
+        return bag
+
+    sources, notes = recorded_sources(open_bag, every)
+    assert not notes
+    assert len({source.name for source in sources}) == len(sources) == len(RECORDED[::every])
+    for number in (0, 1, 1, 0, len(sources) - 1):
+        frame, expected = sources[number].read(), RECORDED[::every][number]
+        np.testing.assert_array_equal(frame.color, expected.color)
+        assert frame.labels is None
+    del sources
+    assert opened and all(bag() is None for bag in opened)  # closed at once, not by a later garbage collection
+
+
+def test_a_damaged_recording_has_the_frames_before(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
+    path.write_bytes(path.read_bytes()[: -(10**6)])
+    sources, (note,) = recorded_sources(functools.partial(Bag, path))
+    assert "mcap recover" in note and 0 < len(sources) < 8 and sources[-1].read().color.shape == RECORDED[0].color.shape
+    (tmp_path / "b.mcap").write_bytes(b"damaged")
+    assert_refused("damaged", recorded_sources, functools.partial(Bag, tmp_path / "b.mcap"))

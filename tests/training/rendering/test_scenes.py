@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers import input_error
+from helpers import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
-from training.objects.mesh import TexturedMesh
 from training.rendering.scenes import (
     MIN_PIXELS,
     SCENE_CAMERA,
@@ -26,10 +25,6 @@ SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
 
 def scenes(n: int, **options: float) -> list[Scene]:
     return [compose_scene(OBJECTS, np.random.default_rng(seed), camera=SMALL, **options) for seed in range(n)]
-
-
-def hull(mesh: TexturedMesh) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull
 
 
 def test_frame_and_truth_agree() -> None:
@@ -85,9 +80,8 @@ def test_degrees_of_occlusion() -> None:
 @pytest.mark.slow
 def test_clutter_increases_occlusion() -> None:
     def occluded_share(clutter: float) -> float:
-        return float(
-            np.mean([share <= 0.95 for scene in scenes(20, clutter=clutter) for share in scene.visible.values()])
-        )
+        visible = [share for scene in scenes(20, clutter=clutter) for share in scene.visible.values()]
+        return float(np.mean(np.array(visible) <= 0.95))
 
     open_table, default, crowded = occluded_share(0.0), occluded_share(0.85), occluded_share(1.0)
     assert open_table < 0.35 < crowded and open_table < default
@@ -99,15 +93,14 @@ def test_objects_stand_apart_on_the_table() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
         meshes = _arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
-        hulls = [hull(mesh) for mesh in meshes]
+        hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull for mesh in meshes]
         for k, one in enumerate(hulls):
             assert one.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
             for other in hulls[k + 1 :]:
                 # No vertex of one lies within the vertical prism over the footprint of the other.
                 for a, b in ((one, other), (other, one)):
-                    prism = trimesh.convex.convex_hull(
-                        np.concatenate([np.c_[b.vertices[:, :2], np.full(len(b.vertices), z)] for z in (-1, 1)])
-                    )
+                    ends = [np.c_[b.vertices[:, :2], np.full(len(b.vertices), z)] for z in (-1, 1)]
+                    prism = trimesh.convex.convex_hull(np.concatenate(ends))
                     inside = (a.vertices @ prism.face_normals.T) - (prism.triangles[:, 0] * prism.face_normals).sum(1)
                     assert (inside.max(axis=1) > 0.004).all()
 
@@ -142,9 +135,8 @@ def test_noise_of_depth() -> None:
 
 
 def test_light_changes_colours_by_a_gain() -> None:
-    plain, lit = (
-        compose_scene(OBJECTS, np.random.default_rng(5), camera=SMALL, noise=0, light=light) for light in (0.0, 0.3)
-    )
+    options = {"camera": SMALL, "noise": 0}
+    plain, lit = (compose_scene(OBJECTS, np.random.default_rng(5), light=light, **options) for light in (0.0, 0.3))
     assert np.array_equal(plain.frame.labels, lit.frame.labels)
     bright = (plain.frame.color > 60).all(axis=-1) & (lit.frame.color < 255).all(axis=-1)
     gain = lit.frame.color[bright] / plain.frame.color[bright]
@@ -159,10 +151,8 @@ def test_numbers_out_of_range_are_refused() -> None:
         ({"noise": -1.0}, "noise is -1.0"),
         ({"light": float("nan")}, "light is nan"),
     ):
-        with input_error(message):
-            compose_scene(OBJECTS, np.random.default_rng(0), **options)
-    with input_error("n_objects"):
-        compose_scene({}, np.random.default_rng(0))
+        assert_refused(message, compose_scene, OBJECTS, np.random.default_rng(0), **options)
+    assert_refused("n_objects", compose_scene, {}, np.random.default_rng(0))
 
 
 def test_views_of_a_scene_agree_in_space() -> None:
@@ -178,5 +168,4 @@ def test_views_of_a_scene_agree_in_space() -> None:
                 middles.setdefault(name, []).append((seen.min(axis=0) + seen.max(axis=0)) / 2)
     distances = [np.linalg.norm(a - b) for of_object in middles.values() for a in of_object for b in of_object]
     assert len(distances) > len(middles) and max(distances) < 0.06
-    with input_error("n_objects"):
-        compose_views(OBJECTS, np.random.default_rng(2), 99)
+    assert_refused("n_objects", compose_views, OBJECTS, np.random.default_rng(2), 99)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import input_error
+from helpers import assert_refused
 
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 
@@ -21,13 +21,10 @@ def test_default_views_are_the_papers() -> None:
 
 def test_invalid_steps_are_refused() -> None:
     for step in (0.0, -5.0, 7.0, math.nan, math.inf, 400.0, 1e-320):
-        with input_error(match="^azimuth_step is"):
-            view_angles(step, 5.0)
-        with input_error(match="^polar_step is"):
-            view_angles(5.0, step)
+        assert_refused("^azimuth_step is", view_angles, step, 5.0)
+        assert_refused("^polar_step is", view_angles, 5.0, step)
     for steps in ((1e-9, 5), (5, 1e-9), (0.1, 0.1)):  # too many views
-        with input_error(match="azimuth_step .* polar_step"):
-            view_angles(*steps)
+        assert_refused("azimuth_step .* polar_step", view_angles, *steps)
 
 
 @pytest.mark.parametrize(("azimuth", "polar"), [(0, 0), (1.0, 0), (0.3, 1.1), (4.0, 2.5), (2.0, math.pi)])

@@ -5,24 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, Interrupted, ParsedPage, run_thor2
+from helpers import SMALL_CONFIG, Interrupted, ParsedPage, assert_refused, run_thor2
 from PIL import Image
 
 import colornet
-import thor2_jax as thor2
 from thor2_jax.figures import plain_text
 from training import demo
 from training.fitting.loop import FitOptions
 from training.objects.builtin_objects import builtin_objects
+from training.reports import plots
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
-from training.reports.plots import (
-    draw_accuracy,
-    draw_confusion,
-    draw_curves,
-    draw_known_unknown,
-    draw_reliability,
-)
 
 pytestmark = pytest.mark.usefixtures("drawn_pictures")
 
@@ -49,7 +42,7 @@ def test_a_confusion_matrix_shows_all_of_its_label(tmp_path: Path, n_classes: in
     """A label that is cut reaches the border of the picture."""
     classes = [f"object {k}" for k in range(n_classes)]
     for name in ("gallery", "embedding + classifiers"):
-        draw_confusion(np.eye(n_classes, n_classes + 1, dtype=int), classes, name, tmp_path / "confusion.png")
+        plots.draw_confusion(np.eye(n_classes, n_classes + 1, dtype=int), classes, name, tmp_path / "confusion.png")
         with Image.open(tmp_path / "confusion.png") as image:
             pixels = np.asarray(image.convert("L"))
         assert all((side == 255).all() for side in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]))
@@ -58,11 +51,11 @@ def test_a_confusion_matrix_shows_all_of_its_label(tmp_path: Path, n_classes: in
 def test_plots_draw_any_name(tmp_path: Path) -> None:
     """Names are no mathtext, and no character is missing from the fonts: matplotlib would raise or warn."""
     names = ["$\\frac{", "$x$", "[red]mug[/x]", "茶碗", "\U0001f34e", "a\u202eb", "Tasse ä"]
-    draw_confusion(np.eye(7, 8, dtype=int), names, "THOR2", tmp_path / "confusion.png")
-    draw_accuracy(("A",), {name: [0.5] for name in names}, dict.fromkeys(names, 4), tmp_path / "accuracy.png")
-    draw_curves({names[0]: [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
-    draw_known_unknown({"kept": [0, 0.5, 1], "named": [0, 0.1, 1]}, (0.5, 0.1), "THOR2", tmp_path / "unknown.png")
-    draw_reliability({"answers": [0, 3], "accuracy": [None, 0.5]}, "THOR2", tmp_path / "reliability.png")
+    plots.draw_confusion(np.eye(7, 8, dtype=int), names, "THOR2", tmp_path / "confusion.png")
+    plots.draw_accuracy(("A",), {name: [0.5] for name in names}, dict.fromkeys(names, 4), tmp_path / "accuracy.png")
+    plots.draw_curves({names[0]: [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
+    plots.draw_known_unknown({"kept": [0, 0.5, 1], "named": [0, 0.1, 1]}, (0.5, 0.1), "THOR2", tmp_path / "unknown.png")
+    plots.draw_reliability({"answers": [0, 3], "accuracy": [None, 0.5]}, "THOR2", tmp_path / "reliability.png")
     draw_objects(dict.fromkeys(names, builtin_objects()["mug_blue"]), tmp_path / "objects.png")
     points, colors = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1), np.full((200, 3), 200)
     drawn = points, colors.astype(np.uint8), colornet.load_default(), SMALL_CONFIG, names[0]
@@ -73,15 +66,14 @@ def test_plots_draw_any_name(tmp_path: Path) -> None:
 
 def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
     with pytest.raises(OSError):
-        draw_curves({"ce": []}, tmp_path / "absent" / "curves.png")
+        plots.draw_curves({"ce": []}, tmp_path / "absent" / "curves.png")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
-    with pytest.raises(thor2.InputError, match="already contains pictures"):
-        demo.run_demo(tmp_path)
+    assert_refused("already contains pictures", demo.run_demo, tmp_path)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["scene-0.png"]
 
 
@@ -97,25 +89,16 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": fit, "config": SMALL_CONFIG}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
-    def interrupt_at(last: str) -> list[str]:
-        """Interrupt the demo at this stage; return the stages so far."""
-        stages = []
+    for last in ("fit tops", "recognize scenes"):
 
-        def report(stage: str, done: int, total: int, note: str) -> None:
-            stages.append(stage)
-            if stage == last:
+        def interrupt(stage: str, *_: object) -> None:
+            if stage == last:  # noqa: B023
                 raise Interrupted
 
         with pytest.raises(Interrupted):
-            demo.run_demo(tmp_path, 1, report)
-        return list(dict.fromkeys(stages))
-
-    assert interrupt_at("render views") == ["render views"]
-    assert interrupt_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
-    assert "fit ce" not in interrupt_at("recognize scenes")
+            demo.run_demo(tmp_path, 1, interrupt)
     assert not (tmp_path / "report.html").exists()
-    with pytest.raises(thor2.InputError, match="^out: .*seed 1, not 2"):
-        demo.run_demo(tmp_path, 2)
+    assert_refused("^out: .*seed 1, not 2", demo.run_demo, tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
     summaries, run_demo = [], demo.run_demo
 
@@ -130,8 +113,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     printed = capsys.readouterr().out
     assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
     assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
-    with pytest.raises(thor2.InputError, match="^out: "):
-        run_demo(tmp_path, 1)
+    assert_refused("^out: ", run_demo, tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
     subsets = {name: count for name, count in summary.instances.items() if name != "all"}
     assert summary.instances["all"] == sum(subsets.values()) > 6

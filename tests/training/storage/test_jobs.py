@@ -1,41 +1,68 @@
-"""Job records."""
+"""Job records, and exclusive locks on output directories."""
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import assert_refused
 
-from thor2_jax.errors import InputError
-from training.storage.jobs import begin_job, check_same_job
+from training.storage.jobs import LOCK, begin_job, check_same_job, locked
 
 JOB: dict[str, Any] = {"seed": 0, "steps": [5.0, 15.0], "camera": {"width": 800}, "variations": None}
 
 
-@pytest.mark.parametrize(
-    ("changes", "difference"),
-    [
-        ({"seed": 1}, "seed 0, not 1"),
-        ({"steps": [5, 20]}, r"steps\[1\] 15.0, not 20"),
-        ({"steps": [5]}, r"steps\[1\] 15.0, not null"),
-        ({"camera": {"width": 640}}, "camera.width 800, not 640"),
-        ({"variations": {"seed": 0}}, r'variations null, not \{"seed": 0\}'),
-        ({"folds": 5}, "folds null, not 5"),
-        ({"seed": "x" * 1000}, r'seed 0, not "x{99}\.\.\.;'),
-    ],
-)
-def test_the_first_difference_is_named(changes: dict[str, Any], difference: str) -> None:
-    with pytest.raises(InputError, match=f"out: run was written with {difference}"):
-        check_same_job(Path("run"), JOB, JOB | changes)
+def test_the_first_difference_is_named() -> None:
+    without_camera = {name: value for name, value in JOB.items() if name != "camera"}
+    for requested, difference in (
+        (JOB | {"seed": 1}, "seed 0, not 1"),
+        (JOB | {"steps": [5, 20]}, r"steps\[1\] 15.0, not 20"),
+        (JOB | {"steps": [5]}, r"steps\[1\] 15.0, not null"),
+        (JOB | {"camera": {"width": 640}}, "camera.width 800, not 640"),
+        (JOB | {"variations": {"seed": 0}}, r'variations null, not \{"seed": 0\}'),
+        (JOB | {"folds": 5}, "folds null, not 5"),
+        (JOB | {"seed": "x" * 1000}, r'seed 0, not "x{99}\.\.\.;'),
+        (without_camera, "camera .*, not null"),
+    ):
+        assert_refused(f"out: run was written with {difference}", check_same_job, Path("run"), JOB, requested)
 
 
 def test_a_directory_begins_with_one_job(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     begin_job(out, JOB)
     begin_job(out, JOB | {"steps": (5, 15)})
+    assert_refused("seed 0, not 1", begin_job, out, JOB | {"seed": 1})
     assert json.loads((out / "job.json").read_bytes()) == JOB
-    with pytest.raises(InputError, match="seed 0, not 1"):
-        begin_job(out, JOB | {"seed": 1})
-    with pytest.raises(InputError, match="camera .*, not null"):
-        begin_job(out, {name: value for name, value in JOB.items() if name != "camera"})
-    assert json.loads((out / "job.json").read_bytes()) == JOB
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from training.storage.jobs import locked
+with locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(10_000)
+"""
+
+
+def test_a_lock_excludes_others_until_its_end(tmp_path: Path) -> None:
+    for _ in range(2):
+        with locked(tmp_path):
+            assert_refused(str(tmp_path), locked, tmp_path)
+    with pytest.raises(ZeroDivisionError), locked(tmp_path):
+        1 / 0  # noqa: B018
+    with locked(tmp_path):
+        assert [path.name for path in tmp_path.iterdir()] == [LOCK]
+
+
+def test_a_lock_ends_with_a_killed_process(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == "locked\n"
+        assert_refused("another process", locked, tmp_path)
+        holder.send_signal(signal.SIGKILL)
+        assert holder.wait() == -signal.SIGKILL
+    with locked(tmp_path):
+        pass

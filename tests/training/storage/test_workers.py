@@ -9,9 +9,9 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from helpers import assert_refused
 from processes import HANG, is_running, wait_until
 
-from thor2_jax.errors import InputError
 from training.storage import workers as worker_pools
 from training.storage.workers import IN_PROCESS, local_workers, ray_workers
 
@@ -94,15 +94,13 @@ time.sleep(10_000)
 
 def test_invalid_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for make in (local_workers, ray_workers):
-        with pytest.raises(InputError, match="workers is 0"):
-            make(0)
+        assert_refused("workers is 0", make, 0)
 
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(worker_pools.importlib, "import_module", absent)
-    with pytest.raises(InputError, match=r"engine is ray"):
-        ray_workers(2)
+    assert_refused(r"engine is ray", ray_workers, 2)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such options")

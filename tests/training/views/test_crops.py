@@ -8,11 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import files_of, run_thor2, write_box
+from helpers import assert_refused, files_of, run_thor2
 from scipy.ndimage import generic_filter
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, view_angles
@@ -120,21 +119,11 @@ def test_instances_that_cannot_be_cropped_are_refused() -> None:
     frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
     empty = thor2.RGBDFrame(frame.color, frame.depth * (frame.labels == 0), frame.labels, CAMERA)  # type: ignore[operator]
     for bad, label, size, argument in ((frame, 2, 8, "label"), (frame, 0, 8, "label"), (frame, 3, 0, "size")):
-        with pytest.raises(InputError, match=f"^{argument} is"):
-            rgbd_crop(bad, label, size)
-    with pytest.raises(InputError, match="^label 3 has no depth"):
-        rgbd_crop(empty, 3)
+        assert_refused(f"^{argument} is", rgbd_crop, bad, label, size)
+    assert_refused("^label 3 has no depth", rgbd_crop, empty, 3)
 
 
 SIZE = 24
-
-
-@pytest.fixture(scope="module")
-def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("meshes")
-    for name, size, color in (("brick", (0.1, 0.06, 0.2), (200, 40, 40)), ("box", (0.1, 0.1, 0.1), (40, 200, 90))):
-        write_box(folder / f"{name}.ply", size, color)
-    return folder
 
 
 def render_command(meshes: Path, out: Path) -> list[object]:
@@ -172,8 +161,7 @@ def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, 
     (copied / "crops").mkdir()
     for file in (dataset.directory / "crops").glob("*.npz"):
         (copied / "crops" / file.name).write_text("a user's")
-    with pytest.raises(InputError, match="already contains"):
-        render_crops(find_meshes(meshes), ViewDataset.open(copied), SIZE)
+    assert_refused("already contains", render_crops, find_meshes(meshes), ViewDataset.open(copied), SIZE)
     assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
 
 
@@ -184,8 +172,7 @@ def test_interrupted_crops_resume_with_the_same_bytes(
     directory = dataset.directory / "crops"
     before, first = files_of(directory), min(directory.glob("*.npz"))
     first.write_bytes(first.read_bytes()[:-1])
-    with pytest.raises(InputError, match="is missing or damaged"):
-        dataset.read_crops(0, SIZE)
+    assert_refused("is missing or damaged", dataset.read_crops, 0, SIZE)
     written = []
     encode = render_job.crops.encode_crops
     monkeypatch.setattr(render_job.crops, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
@@ -197,20 +184,16 @@ def test_interrupted_crops_resume_with_the_same_bytes(
 
 
 def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"crops of {SIZE} pixels; expected at least 25"):
-        dataset.read_crops(0, SIZE + 1)
+    assert_refused(f"crops of {SIZE} pixels; expected at least 25", dataset.read_crops, 0, SIZE + 1)
     plain = render_dataset(find_meshes(meshes), tmp_path / "plain", 180, 90)
-    with pytest.raises(InputError, match="has no crops.*--crops"):
-        plain.read_crops(0, SIZE)
+    assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
     render_crops(find_meshes(meshes), plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
     content = json.loads(manifest.read_text())
     manifest.write_text(json.dumps({**content, "dataset": "0"}))
-    with pytest.raises(InputError, match="crops of other views"):
-        plain.read_crops(0, 8)
+    assert_refused("crops of other views", plain.read_crops, 0, 8)
     manifest.write_text("[]")
-    with pytest.raises(InputError, match="manifest.json is damaged"):
-        plain.read_crops(0, 8)
+    assert_refused("manifest.json is damaged", plain.read_crops, 0, 8)
 
 
 def test_reduced_crops_are_means_of_areas() -> None:

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import input_error, random_clouds
+from helpers import assert_refused, input_error, random_clouds
 
 import thor2_jax
-from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.views.dataset import Manifest, ViewDataset, encode, remove_views
@@ -89,8 +88,7 @@ def test_empty_views_and_views_beyond_the_range() -> None:
     line = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([0, 0, 1], np.float32)
     rgb = np.zeros((50, 3), np.uint8)
     assert views_of([(line * np.float32(MAX_VIEW_LENGTH / 2.5), rgb)]).xyz.max() == MAX_VIEW_LENGTH
-    with pytest.raises(InputError, match="4.05 scaled units"):
-        views_of([(line, rgb), (line * np.float32(1.62), rgb)])
+    assert_refused("4.05 scaled units", views_of, [(line, rgb), (line * np.float32(1.62), rgb)])
 
 
 def test_padded_batches() -> None:
