@@ -33,15 +33,16 @@ NEAR, FAR = 2, 6
 """Pixels between an edge and the values that are extrapolated."""
 
 
-def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
-    """Return the steps and the folds of a depth image.
+def depth_edges(depth: DepthImage) -> tuple[Mask, Mask, Mask]:
+    """Return the edges of a depth image.
 
     Returns:
-        Steps and folds, [H, W] each.
+        Steps along rows, steps along columns, and folds, [H, W] each.
     """
     known = depth.valid
     if not known.any():
-        return np.zeros(known.shape, bool), np.zeros(known.shape, bool)
+        none = np.zeros(known.shape, bool)
+        return none, none, none
     inverse = depth.inverse[known].take(nearest_known(known))
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
     unknown = (~known).view(np.uint8)
@@ -51,15 +52,16 @@ def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
     least = STEP[0] * inverse * inverse + STEP[1]
     least_step = least + (2 * GAP * pixel) * gap * inverse
     least_fold = 0.5 * least + (NEAR * BEND * pixel) * inverse + gap
-    steps, folds = np.zeros(known.shape, bool), np.zeros(known.shape, bool)
+    steps, folds = [], np.zeros(known.shape, bool)
     for along_rows in (True, False):
         before, after, difference = (_filter(inverse, kernel, along_rows) for kernel in _kernels())
         smaller = np.minimum(np.abs(before), np.abs(after))
         opposite = (before > 0) != (after > 0)
-        steps |= (smaller > least_step) & opposite & (np.abs(difference) > NARROW * least_step)
+        steps.append((smaller > least_step) & opposite & (np.abs(difference) > NARROW * least_step))
         folds |= np.minimum(before, after) > least_fold
-    numbers, sizes = components(steps, connectivity=8)
-    return (sizes >= LEAST_EDGE)[numbers], folds
+    numbers, sizes = components(steps[0] | steps[1], connectivity=8)
+    large = (sizes >= LEAST_EDGE)[numbers]
+    return steps[0] & large, steps[1] & large, folds
 
 
 def _kernels() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

@@ -78,7 +78,7 @@ class Evidence:
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
         plain: pixels whose colour is the support's, including soft shadows and highlights.
         region: pixels in the convex hull of the support.
-        steps: steps of depth, see `depth_edges`.
+        steps: steps of depth along rows and along columns, see `depth_edges`.
         folds: folds of depth.
     """
 
@@ -88,7 +88,7 @@ class Evidence:
     colored: Mask
     plain: Mask
     region: Mask
-    steps: Mask
+    steps: tuple[Mask, Mask]
     folds: Mask
 
 
@@ -119,7 +119,8 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
     plain = _plain_parts(smooth, (contrast < UNIT) & on_support) & (contrast < LARGEST_SMOOTH * UNIT)
     beside = on_support | (~depth.valid & region)
     colored = open_round(beside & known & (contrast > UNIT) & ~plain)
-    return Evidence(heights, open_round(high), contrast, colored, plain, region, *depth_edges(depth))
+    *steps, folds = depth_edges(depth)
+    return Evidence(heights, open_round(high), contrast, colored, plain, region, (steps[0], steps[1]), folds)
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:

@@ -59,11 +59,11 @@ ENCLOSED = 0.7
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
 
-SAME_HUE = 0.25
-"""Largest distance of the mean colours, as unit vectors, of the two sides of a hollow thing; their light differs."""
+SAME_HEIGHT, RIM_SHARE = 0.015, 97
+"""Largest difference, metres, of the upper rims of the two sides of a hollow thing, and their percentile of heights."""
 
-SAME_HEIGHT = 0.015
-"""Largest difference of the heights, metres, of the two sides of a hollow thing."""
+CONCAVE = 0.2
+"""Least bend of the inner side of a hollow thing, as a share of its size."""
 
 BEFORE, AFTER = 2, 2
 """Pixels beside a border at which the two pieces are compared."""
@@ -82,7 +82,7 @@ def flood(
     Returns:
         Labels [H, W], 0 for the background, and for each label [n] whether the piece was found by its colour alone.
     """
-    steps, folds = evidence.steps, evidence.folds
+    steps, folds = evidence.steps[0] | evidence.steps[1], evidence.folds
     high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
     like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
     like_plane &= ~shrink(high, BLEEDING)
@@ -197,23 +197,25 @@ def merge_pieces(
     n = len(colored)
     borders = _find_borders(labels, n, color, depth, evidence)
     shapes = _measure(labels, n, color, evidence)
-    together = _belong_together(borders, shapes, colored)
+    apart = borders.length < LEAST_CONTACT * borders.perimeter[borders.pairs].min(axis=1)
+    together = _belong_together(borders, shapes, colored, apart)
     for k, (a, b) in enumerate(borders.pairs.tolist()):
-        if not together[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
-            together[k] = _is_hollow(k, a, b, borders, shapes, labels, evidence)
+        if not together[k] and not apart[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
+            together[k] = _is_hollow(k, a, b, borders, labels, depth, evidence)
     merged = borders.pairs[together & (borders.pairs[:, 0] > 0)]
     graph = coo_matrix((np.ones(len(merged)), merged.T), (n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)[labels]
 
 
-def _belong_together(borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _belong_together(
+    borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_], apart: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return which pairs [N] are of one thing, but for hollow things."""
     a, b = borders.pairs.T
     # One piece surrounds the other, which is not nearer to the camera: the bottom of a bowl.
     most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
     enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
-    apart = borders.length < LEAST_CONTACT * np.minimum(borders.perimeter[a], borders.perimeter[b])
     cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
     answers: list[Any] = [True, borders.contrast < PART, True, False]
     is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
@@ -221,35 +223,31 @@ def _belong_together(borders: _Borders, shapes: _Shapes, colored: NDArray[np.boo
 
 
 def _is_hollow(
-    k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, labels: NDArray[np.int32], evidence: Evidence
+    k: int, a: int, b: int, borders: _Borders, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence
 ) -> bool:
-    """Return whether one piece is the inner side of the other, as in a mug.
-
-    It lies behind, has about its hue, width and height, and meets the background at its upper rim only.
-    """
-    hues = shapes.color[[a, b]] / (np.linalg.norm(shapes.color[[a, b]], axis=1, keepdims=True) + 1)
-    if abs(borders.behind[k]) < 0.1 or np.linalg.norm(hues[0] - hues[1]) > SAME_HUE:
-        return False
+    """Return whether the piece that is farther is the inner side of the other: concave, with the same upper rim."""
     inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
-    inner_height, inner_width = _size(inner, labels, evidence)
-    outer_height, outer_width = _size(outer, labels, evidence)
-    rim = borders.height[(borders.first == 0) & (borders.second == inner) & (borders.height != 0)]
-    return bool(
-        abs(inner_height - outer_height) < SAME_HEIGHT
-        and borders.length[k] > 0.6 * inner_width
-        and inner_width > 0.6 * outer_width
-        and len(rim) > 0
-        and np.percentile(rim, 20) > 0.7 * inner_height
-    )
+    heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
+    rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
+    return abs(rims[0] - rims[1]) < SAME_HEIGHT and _is_concave((labels == inner) & evidence.high, depth)
 
 
-def _size(piece: int, labels: NDArray[np.int32], evidence: Evidence) -> tuple[float, int]:
-    """Return the height, metres, and the width, pixels, of a piece."""
-    rows, columns = np.nonzero(labels[::2, ::2] == piece)
-    if len(rows) == 0:
-        return 0.0, 0
-    heights = evidence.heights[::2, ::2][rows, columns]
-    return float(np.percentile(heights, 97)), 2 * int(np.ptp(columns) + 1)
+def _is_concave(mask: Mask, depth: DepthImage) -> bool:
+    """Return whether the inner part of a surface is nearer to the camera at its border than in its middle.
+
+    A plane is linear in inverse depth, so the coefficient of the squared distance to the middle is the curvature.
+    """
+    rows, columns = np.nonzero(shrink(mask, RIM) & depth.valid)
+    if len(rows) < 2 * LEAST_MARKER:
+        return False
+    x, y, inverse = depth.x[columns], depth.y[rows], depth.inverse[rows, columns]
+    x, y = x - x.mean(), y - y.mean()
+    squared = x * x + y * y
+    terms = np.stack([np.ones_like(x), x, y, squared], axis=1).astype(np.float64)
+    fitted, *_ = np.linalg.lstsq(terms, inverse)
+    bend = fitted[3] * squared.mean()
+    noise = np.sqrt(np.mean((terms @ fitted - inverse) ** 2))
+    return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
 
 
 def _measure(labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], evidence: Evidence) -> _Shapes:
@@ -270,10 +268,11 @@ def _find_borders(
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
     z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_step = grow(evidence.steps, 5).ravel()
-    near_edge = near_step | grow(evidence.folds, 3).ravel()
+    near_fold = grow(evidence.folds, 3).ravel()
     parts = []
-    for step in (1, labels.shape[1]):
+    for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
+        near_step = grow(steps, 5).ravel()
+        near_edge = near_step | near_fold
         here = np.flatnonzero(flat[:-step] != flat[step:])
         a, b = flat[here], flat[here + step]
         swap = a > b
