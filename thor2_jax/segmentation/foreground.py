@@ -57,6 +57,9 @@ NOISE = 4.0
 DARKER, LIGHTER = 0.35, 0.5
 """Weights of differences in brightness: shadows and highlights are less of a sign than another hue."""
 
+SHADE = 0.25
+"""Largest change of hue of a pixel in the shade, as a share of its change of brightness."""
+
 UNIT = 40
 """`Evidence.contrast` of a pixel with the least colour difference of a thing; 8 bits end at about six times as much."""
 
@@ -77,6 +80,7 @@ class Evidence:
         contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable; 0 far from the support.
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
         plain: pixels whose colour is the support's, including soft shadows and highlights.
+        shade: colored pixels on the support that are darker than it, but of its hue: deep shadows, and black things.
         region: pixels in the convex hull of the support.
         steps: steps of depth along rows and along columns, see `depth_edges`.
         folds: folds of depth.
@@ -87,6 +91,7 @@ class Evidence:
     contrast: NDArray[np.uint8]
     colored: Mask
     plain: Mask
+    shade: Mask
     region: Mask
     steps: tuple[Mask, Mask]
     folds: Mask
@@ -109,7 +114,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
         on_support &= np.abs(heights) <= np.abs(others)
-    contrast, near, known = _color_contrast(color, on_support)
+    contrast, darker, near, known = _color_contrast(color, on_support)
     region = shrink(planes[0].region(depth.z.shape), 3)
     known = near | (known & depth.valid & region)  # far from the plane, missing depth is rarely a thing on it
     contrast = contrast * known
@@ -119,8 +124,9 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
     plain = _plain_parts(smooth, (contrast < UNIT) & on_support) & (contrast < LARGEST_SMOOTH * UNIT)
     beside = on_support | (~depth.valid & region)
     colored = open_round(beside & known & (contrast > UNIT) & ~plain)
+    shade = open_round(colored & on_support & darker)
     *steps, folds = depth_edges(depth)
-    return Evidence(heights, open_round(high), contrast, colored, plain, region, (steps[0], steps[1]), folds)
+    return Evidence(heights, open_round(high), contrast, colored, plain, shade, region, (steps[0], steps[1]), folds)
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
@@ -134,11 +140,11 @@ def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
     return grow(plain[numbers], 3)
 
 
-def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask]:
+def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask, Mask]:
     """Compare each pixel with the pixels of the plane around it.
 
     Returns:
-        `Evidence.contrast`, and the pixels with enough of the plane in their window, and in their wide window.
+        `Evidence.contrast`, the pixels that are darker than the plane, but of its hue, and the pixels with enough of the plane in their window, and in their wide window.
     """
     height, width = plane.shape
     around, near, window_share, share = _plane_color(color, plane)
@@ -152,6 +158,7 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     across = float_image(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
     across -= along * along
     brightness = along - reference
+    darker = (brightness < 0) & (across < SHADE * SHADE * brightness * brightness)
     brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
     brightness *= brightness
     across += brightness
@@ -166,7 +173,7 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
         pixel_mask(cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST))
         for mask in (near, window_share > LEAST_PLANE)
     ]
-    return contrast, known[0], known[1]
+    return contrast, darker, known[0], known[1]
 
 
 def _plane_color(

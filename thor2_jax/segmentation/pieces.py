@@ -56,6 +56,9 @@ PART = 90.0
 ENCLOSED = 0.7
 """Least share of the border of a piece, all along another one, that is a part of the other one."""
 
+ATTACHED = 0.2
+"""Least share of the border of a piece without depth, or of a shadow, along the thing that it belongs to."""
+
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
 
@@ -98,8 +101,11 @@ def flood(
     body = (marked | alone)[body_numbers]
     colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
     near = grow(body, 5)
-    numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
-    markers = np.where(numbers > 0, numbers + n_bodies, markers)
+    n_pieces = n_bodies
+    for part in (colored & ~near & ~evidence.shade, colored & ~near & evidence.shade):
+        numbers, n_colored = _colored_markers(part, near, depth.valid)
+        markers = np.where(numbers > 0, numbers + n_pieces, markers)
+        n_pieces += n_colored
     # Pixels without depth may belong to a thing beside them, or to one that is found by its colour.
     clearly_colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
     beside = (grow(near | colored, 5) & ~like_plane) | (~evidence.region & grow(body, OUTSIDE))
@@ -107,7 +113,7 @@ def flood(
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
-    return labels, np.arange(1 + n_bodies + n_colored) > n_bodies
+    return labels, np.arange(1 + n_pieces) > n_bodies
 
 
 def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
@@ -179,11 +185,12 @@ class _Borders:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Statistics of pieces [n], of every second pixel in each direction: which are tall or low, and mean colours."""
+    """Which pieces [n] are tall, low, mostly without depth or in the shade, by every second pixel in each direction."""
 
     tall: NDArray[np.bool_]
     low: NDArray[np.bool_]
-    color: NDArray[np.float64]
+    unknown: NDArray[np.bool_]
+    shade: NDArray[np.bool_]
 
 
 def merge_pieces(
@@ -196,7 +203,7 @@ def merge_pieces(
     """Return the labels [H, W] of the pieces of `flood` after merging; the arguments are as there."""
     n = len(colored)
     borders = _find_borders(labels, n, color, depth, evidence)
-    shapes = _measure(labels, n, color, evidence)
+    shapes = _measure(labels, n, evidence)
     apart = borders.length < LEAST_CONTACT * borders.perimeter[borders.pairs].min(axis=1)
     together = _belong_together(borders, shapes, colored, apart)
     for k, (a, b) in enumerate(borders.pairs.tolist()):
@@ -204,7 +211,18 @@ def merge_pieces(
             together[k] = _is_hollow(k, a, b, borders, labels, depth, evidence)
     merged = borders.pairs[together & (borders.pairs[:, 0] > 0)]
     graph = coo_matrix((np.ones(len(merged)), merged.T), (n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)[labels]
+    groups = np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    groups[_is_shadow(groups, borders, shapes)] = 0
+    return groups[labels]
+
+
+def _is_shadow(groups: NDArray[np.int32], borders: _Borders, shapes: _Shapes) -> NDArray[np.bool_]:
+    """Return which pieces [n] lie in the shade along a tall thing and are part of nothing else."""
+    alone = ~np.isin(groups, groups[~shapes.shade])
+    tall = np.isin(groups, groups[shapes.tall])
+    ends, others = np.concatenate([borders.pairs, borders.pairs[:, ::-1]]).T
+    along = np.bincount(ends, np.tile(borders.length, 2) * tall[others], minlength=len(groups))
+    return alone & (along > ATTACHED * borders.perimeter)
 
 
 def _belong_together(
@@ -216,10 +234,20 @@ def _belong_together(
     most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
     enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
-    cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
-    answers: list[Any] = [True, borders.contrast < PART, True, False]
+    part_without_depth = part_by_color & (shapes.unknown & colored)[borders.pairs].any(axis=1)
+    cases = [enclosed, part_without_depth, part_by_color, shapes.low[a] & shapes.low[b], apart]
+    answers: list[Any] = [True, _main_contact(borders, part_without_depth, colored), borders.contrast < PART, True, False]
     is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
     return np.select(cases, answers, ~is_border)
+
+
+def _main_contact(borders: _Borders, chosen: NDArray[np.bool_], colored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which of the chosen pairs [N], each with one colored piece, have its longest contact, if that is long."""
+    part = np.where(colored[borders.pairs[:, 0]], *borders.pairs.T)
+    length = borders.length * chosen
+    longest = np.zeros(len(colored), length.dtype)
+    np.maximum.at(longest, part, length)
+    return chosen & (length == longest[part]) & (length > ATTACHED * borders.perimeter[part])
 
 
 def _is_hollow(
@@ -250,17 +278,17 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
 
 
-def _measure(labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], evidence: Evidence) -> _Shapes:
+def _measure(labels: NDArray[np.int32], n: int, evidence: Evidence) -> _Shapes:
     every = labels[::2, ::2].ravel()
     things = np.flatnonzero(every)
     every = every[things]
     heights = evidence.heights[::2, ::2].ravel()[things]
-    pixels = color[::2, ::2].reshape(-1, 3)[things]
     size = np.maximum(np.bincount(every, minlength=n), 1)
     tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
     low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
-    mean = np.stack([np.bincount(every, pixels[:, c], minlength=n) / size for c in range(3)], axis=1)
-    return _Shapes(tall, low, mean)
+    unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
+    shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
+    return _Shapes(tall, low & ~unknown, unknown, shade)
 
 
 def _find_borders(
