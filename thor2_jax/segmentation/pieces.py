@@ -103,7 +103,7 @@ def flood(
     near = grow(body, 5)
     n_pieces = n_bodies
     for part in (colored & ~near & ~evidence.shade, colored & ~near & evidence.shade):
-        numbers, n_colored = _colored_markers(part, near, depth.valid)
+        numbers, n_colored = _colored_markers(part)
         markers = np.where(numbers > 0, numbers + n_pieces, markers)
         n_pieces += n_colored
     # Pixels without depth may belong to a thing beside them, or to one that is found by its colour.
@@ -139,16 +139,10 @@ def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
     return markers, n_parts + int(whole.sum())
 
 
-def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of things that are found by their colour, and how many there are.
-
-    What is beside a body and has no depth is left to the flood.
-    """
+def _colored_markers(colored: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of things that are found by their colour, and how many there are."""
     numbers, sizes = components(colored, connectivity=8)
-    n_valid = np.bincount(numbers[valid], minlength=len(sizes))
-    beside = np.zeros(len(sizes), bool)
-    beside[numbers[grow(near, 3)]] = True
-    kept = (sizes >= LEAST_MARKER) & (~beside | (n_valid > 0.5 * sizes))
+    kept = sizes >= LEAST_MARKER
     return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
 
 
@@ -209,11 +203,19 @@ def merge_pieces(
     for k, (a, b) in enumerate(borders.pairs.tolist()):
         if not together[k] and not apart[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
             together[k] = _is_hollow(k, a, b, borders, labels, depth, evidence)
-    merged = borders.pairs[together & (borders.pairs[:, 0] > 0)]
-    graph = coo_matrix((np.ones(len(merged)), merged.T), (n, n))
-    groups = np.asarray(connected_components(graph, directed=False)[1], np.int32)
-    groups[_is_shadow(groups, borders, shapes)] = 0
+    a, b = borders.pairs.T
+    groups = _components(borders.pairs[together & (shapes.shade[a] == shapes.shade[b])], n)
+    shadow = _is_shadow(groups, borders, shapes)
+    groups = _components(borders.pairs[together & ~shadow[a] & ~shadow[b]], n)
+    groups[shadow] = 0
     return groups[labels]
+
+
+def _components(pairs: NDArray[np.int64], n: int) -> NDArray[np.int32]:
+    """Return the numbers [n] of the groups of connected pieces; the background is connected to none and has 0."""
+    pairs = pairs[pairs[:, 0] > 0]
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
 def _is_shadow(groups: NDArray[np.int32], borders: _Borders, shapes: _Shapes) -> NDArray[np.bool_]:
@@ -234,20 +236,26 @@ def _belong_together(
     most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
     enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
-    part_without_depth = part_by_color & (shapes.unknown & colored)[borders.pairs].any(axis=1)
-    cases = [enclosed, part_without_depth, part_by_color, shapes.low[a] & shapes.low[b], apart]
-    answers: list[Any] = [True, _main_contact(borders, part_without_depth, colored), borders.contrast < PART, True, False]
+    is_part = (borders.contrast < PART) | _main_contact(borders, shapes, part_by_color, colored)
+    cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
+    answers: list[Any] = [True, is_part, True, False]
     is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
     return np.select(cases, answers, ~is_border)
 
 
-def _main_contact(borders: _Borders, chosen: NDArray[np.bool_], colored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which of the chosen pairs [N], each with one colored piece, have its longest contact, if that is long."""
+def _main_contact(
+    borders: _Borders, shapes: _Shapes, parts: NDArray[np.bool_], colored: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return which pairs [N] of a body and a piece that was found by its colour are one thing without a step between.
+
+    The body must be that with the longest common border, and the piece must not be in the shade.
+    """
     part = np.where(colored[borders.pairs[:, 0]], *borders.pairs.T)
-    length = borders.length * chosen
+    length = borders.length * parts
     longest = np.zeros(len(colored), length.dtype)
     np.maximum.at(longest, part, length)
-    return chosen & (length == longest[part]) & (length > ATTACHED * borders.perimeter[part])
+    joined = (shapes.unknown[part] | (borders.step < EDGE)) & ~shapes.shade[part]
+    return parts & joined & (length == longest[part]) & (length > ATTACHED * borders.perimeter[part])
 
 
 def _is_hollow(
