@@ -56,7 +56,13 @@ PART = 90.0
 ENCLOSED = 0.7
 """Least share of the border of a piece, all along another one, that is a part of the other one."""
 
-ATTACHED = 0.2
+GAP = 5
+"""Pixels between parts of one thing that are found by their colour, less one."""
+
+SHADOW = 21
+"""Width, pixels, of the square around a body in which shadows are divided from other things."""
+
+ATTACHED = 0.15
 """Least share of the border of a piece without depth, or of a shadow, along the thing that it belongs to."""
 
 TALL, LOW = 0.035, 0.02
@@ -65,7 +71,7 @@ TALL, LOW = 0.035, 0.02
 SAME_HEIGHT, RIM_SHARE = 0.015, 97
 """Largest difference, metres, of the upper rims of the two sides of a hollow thing, and their percentile of heights."""
 
-CONCAVE = 0.2
+CONCAVE = 0.1
 """Least bend of the inner side of a hollow thing, as a share of its size."""
 
 BEFORE, AFTER = 2, 2
@@ -99,10 +105,11 @@ def flood(
     markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
     n_bodies += int(alone.sum())
     body = (marked | alone)[body_numbers]
-    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
+    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), GAP)
     near = grow(body, 5)
     n_pieces = n_bodies
-    for part in (colored & ~near & ~evidence.shade, colored & ~near & evidence.shade):
+    shade = evidence.shade & grow(body, SHADOW)
+    for part in (colored & ~near & ~shade, colored & ~near & shade):
         numbers, n_colored = _colored_markers(part)
         markers = np.where(numbers > 0, numbers + n_pieces, markers)
         n_pieces += n_colored
@@ -296,7 +303,7 @@ def _measure(labels: NDArray[np.int32], n: int, evidence: Evidence) -> _Shapes:
     low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
     unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
     shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-    return _Shapes(tall, low & ~unknown, unknown, shade)
+    return _Shapes(tall, low, unknown, shade)
 
 
 def _find_borders(
