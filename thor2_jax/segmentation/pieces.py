@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
+from thor2_jax.segmentation.foreground import UNIT, Evidence
 from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
@@ -29,12 +29,6 @@ RIM = 3
 NECK = 2.4
 """Half the width, pixels, of a neck that divides a body."""
 
-CLEAR = 0.3
-"""Largest contrast, in units, of a pixel that is clearly the plane's."""
-
-BLEEDING = 7
-"""Width, pixels, of the square within which depth of a thing may reach over the plane."""
-
 OUTSIDE = 21
 """Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
 
@@ -44,17 +38,8 @@ LEAST_CONTACT = 0.08
 EDGE = 0.25
 """Least share of a common border that is a step, for two things."""
 
-FOLD = 0.4
-"""Least share of a common border that is a step or a fold, for two things of different colours."""
-
-CONTRAST = 25.0
-"""Least colour difference across a fold between two things, sum over the channels."""
-
 PART = 90.0
 """Largest colour difference between a body and a part of it that was found by its colour."""
-
-ENCLOSED = 0.7
-"""Least share of the border of a piece, all along another one, that is a part of the other one."""
 
 GAP = 5
 """Pixels between parts of one thing that are found by their colour, less one."""
@@ -93,11 +78,8 @@ def flood(
     """
     steps, folds = evidence.steps[0] | evidence.steps[1], evidence.folds
     high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
-    like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
-    like_plane &= ~shrink(high, BLEEDING)
-    body = high & ~like_plane
-    markers, n_bodies = _body_markers(body, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
-    body_numbers, body_sizes = components(body)
+    markers, n_bodies = _body_markers(high, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
+    body_numbers, body_sizes = components(high)
     marked = np.zeros(len(body_sizes), bool)
     marked[body_numbers[markers > 0]] = True
     alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
@@ -105,7 +87,7 @@ def flood(
     markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
     n_bodies += int(alone.sum())
     body = (marked | alone)[body_numbers]
-    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), GAP)
+    colored = close(evidence.colored | (high & ~body & (evidence.contrast > UNIT)), GAP)
     near = grow(body, 5)
     n_pieces = n_bodies
     shade = evidence.shade & grow(body, SHADOW)
@@ -113,10 +95,8 @@ def flood(
         numbers, n_colored = _colored_markers(part)
         markers = np.where(numbers > 0, numbers + n_pieces, markers)
         n_pieces += n_colored
-    # Pixels without depth may belong to a thing beside them, or to one that is found by its colour.
-    clearly_colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
-    beside = (grow(near | colored, 5) & ~like_plane) | (~evidence.region & grow(body, OUTSIDE))
-    unknown = (near & ~(like_plane & ~evidence.high)) | colored | (~depth.valid & (beside | clearly_colored))
+    beside = grow(near | colored, 5) | (~evidence.region & grow(body, OUTSIDE))
+    unknown = near | colored | (~depth.valid & beside)
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
@@ -155,30 +135,20 @@ def _colored_markers(colored: Mask) -> tuple[NDArray[np.int32], int]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Borders:
-    """Pixels of the borders between pieces [P], and pairs of neighbouring pieces [N], the smaller number first.
-
-    The background is a piece, too.
+    """Borders between pairs of neighbouring pieces [N], the smaller number first; the background is a piece, too.
 
     Attributes:
-        first: [P] one piece at each border pixel.
-        second: [P] the other one.
-        height: [P] height of the second piece beside the pixel, metres; 0 if missing.
         pairs: [N, 2] the pieces of each pair.
         length: [N] border pixels.
         step: [N] share of them at a step.
-        fold: [N] share of them at a step or a fold.
         contrast: [N] mean colour difference across, sum over the channels.
         behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
         perimeter: [n] border pixels of each piece.
     """
 
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    height: NDArray[np.float32]
     pairs: NDArray[np.int64]
     length: NDArray[np.intp]
     step: NDArray[np.float64]
-    fold: NDArray[np.float64]
     contrast: NDArray[np.float64]
     behind: NDArray[np.float64]
     perimeter: NDArray[np.intp]
@@ -239,15 +209,11 @@ def _belong_together(
 ) -> NDArray[np.bool_]:
     """Return which pairs [N] are of one thing, but for hollow things."""
     a, b = borders.pairs.T
-    # One piece surrounds the other, which is not nearer to the camera: the bottom of a bowl.
-    most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
-    enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
     is_part = (borders.contrast < PART) | _main_contact(borders, shapes, part_by_color, colored)
-    cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
-    answers: list[Any] = [True, is_part, True, False]
-    is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
-    return np.select(cases, answers, ~is_border)
+    cases = [part_by_color, shapes.low[a] & shapes.low[b], apart]
+    answers: list[Any] = [is_part, True, False]
+    return np.select(cases, answers, borders.step < EDGE)
 
 
 def _main_contact(
@@ -310,12 +276,10 @@ def _find_borders(
     labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
-    z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_fold = grow(evidence.folds, 3).ravel()
+    z = depth.z.ravel()
     parts = []
     for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
         near_step = grow(steps, 5).ravel()
-        near_edge = near_step | near_fold
         here = np.flatnonzero(flat[:-step] != flat[step:])
         a, b = flat[here], flat[here + step]
         swap = a > b
@@ -324,13 +288,13 @@ def _find_borders(
         at_a, at_b = np.where(swap, after, before), np.where(swap, before, after)
         behind = np.where((z[at_a] > 0) & (z[at_b] > 0), np.sign(z[at_b] - z[at_a]), 0)
         a, b = np.minimum(a, b), np.maximum(a, b)
-        parts.append((a, b, heights[at_b], near_step[here], near_edge[here], difference, behind))
-    a, b, height, at_step, at_edge, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
+        parts.append((a, b, near_step[here], difference, behind))
+    a, b, at_step, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
     keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
     length = np.bincount(pair, minlength=len(keys))
     pairs = np.stack(np.divmod(keys, n), axis=1)
     perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
-    step_share, edge_share, contrast, behind = (
-        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, at_edge, difference, behind)
+    step_share, contrast, behind = (
+        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, difference, behind)
     )
-    return _Borders(a, b, height, pairs, length, step_share, edge_share, contrast, behind, perimeter)
+    return _Borders(pairs, length, step_share, contrast, behind, perimeter)
