@@ -33,6 +33,12 @@ COARSE = 2
 WINDOW = 25
 """Coarse pixels, in each direction, that the colour of the plane is averaged over."""
 
+WIDE_WINDOW = 75
+"""The same where the window holds too little of the plane: inside large things."""
+
+WINDOWS_OF_OUTLIERS = (51, WINDOW)
+"""Windows of whose mean colour the plane's pixels are, one after the other; large flat things fill the small one."""
+
 OUTLIER = 30.0
 """Least difference of a coarse pixel that is no part of the plane, sum over the channels."""
 
@@ -100,15 +106,16 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
         on_support &= np.abs(heights) <= np.abs(others)
-    contrast, darker, near = _color_contrast(color, on_support)
+    contrast, darker, near, known = _color_contrast(color, on_support)
     region = shrink(planes[0].region(depth.z.shape), 3)
-    contrast = contrast * near
-    low = ((heights < FLAT) | ~depth.valid) & region & near
+    known = near | (known & depth.valid & region)  # far from the plane, missing depth is rarely a thing on it
+    contrast = contrast * known
+    low = ((heights < FLAT) | ~depth.valid) & region & known
     gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
     smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
     plain = _plain_parts(smooth, (contrast < UNIT) & on_support)
     beside = on_support | (~depth.valid & region)
-    colored = open_round(beside & near & (contrast > UNIT) & ~plain)
+    colored = open_round(beside & known & (contrast > UNIT) & ~plain)
     shade = open_round(colored & on_support & darker)
     *steps, folds = depth_edges(depth)
     return Evidence(heights, open_round(high), contrast, colored, shade, region, (steps[0], steps[1]), folds)
@@ -125,15 +132,15 @@ def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
     return grow(plain[numbers], 3)
 
 
-def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask]:
+def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask, Mask]:
     """Compare each pixel with the pixels of the plane around it.
 
     Returns:
         `Evidence.contrast`, the pixels that are darker than the plane, but of its hue, and those with enough of the
-        plane in their window.
+        plane in their window, and in their wide window.
     """
     height, width = plane.shape
-    around, window_share, share = _plane_color(color, plane)
+    around, near, window_share, share = _plane_color(color, plane)
     ones = np.ones((1, 3), np.float32)
     length = np.sqrt(float_image(cv2.transform(around * around, ones))) + np.float32(1e-3)
     direction = float_image(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
@@ -155,33 +162,43 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     least = np.maximum(DIFFERENCE, NOISE * noise)
     scale = cv2.resize((UNIT / least).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
     contrast = np.asarray(cv2.multiply(difference, scale, dtype=cv2.CV_8U), np.uint8)
-    near = cv2.resize((window_share > LEAST_PLANE).view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    return contrast, darker, pixel_mask(near)
+    known = [
+        pixel_mask(cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST))
+        for mask in (near, window_share > LEAST_PLANE)
+    ]
+    return contrast, darker, known[0], known[1]
 
 
 def _plane_color(
     color: NDArray[np.uint8], plane: Mask
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], Mask, NDArray[np.float32], NDArray[np.float32]]:
     """Return, for coarse pixels [h, w]: the colour [h, w, 3] of the plane around, and the share of the plane.
 
-    The first share is that of the window, the second that of the pixel itself.
+    The mask has the pixels with enough of the plane in their window; elsewhere, the wide window is used. The first
+    share is that of the window, the second that of the pixel itself.
     """
     height, width = plane.shape
     size = (-(-width // COARSE), -(-height // COARSE))
     masked = cv2.bitwise_and(color, color, mask=plane.view(np.uint8))
     total = float_image(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
     share = float_image(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-    off = _channel_sum(float_image(total / np.maximum(share, 0.05)[..., None]), _window_mean(total, share))
-    full = share > 0.5
-    typical = median_high(off[full]) if full.any() else 0.0
-    kept = off < max(OUTLIER, 3 * typical)  # leave out what has another colour than most of the window
-    share, total = share * kept, total * kept[..., None]
+    own = float_image(total / np.maximum(share, 0.05)[..., None])
+    for window in WINDOWS_OF_OUTLIERS:  # leave out what has another colour than most of the window
+        off = _channel_sum(own, _window_mean(total, share, window))
+        full = share > 0.5
+        typical = median_high(off[full]) if full.any() else 0.0
+        kept = off < max(OUTLIER, 3 * typical)
+        share, total = share * kept, total * kept[..., None]
     window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
-    return float_image(cv2.blur(_window_mean(total, share), (3, 3))), window_share, share
+    mean = _window_mean(total, share, WINDOW)
+    far = window_share < LEAST_PLANE  # inside large things
+    mean[far] = _window_mean(total, share, WIDE_WINDOW)[far]
+    window_share[far] = cv2.blur(share, (WIDE_WINDOW, WIDE_WINDOW))[far]
+    return float_image(cv2.blur(mean, (3, 3))), ~far, window_share, share
 
 
-def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    size = (WINDOW, WINDOW)
+def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    size = (window, window)
     return float_image(cv2.blur(total, size)) / (float_image(cv2.blur(share, size))[..., None] + np.float32(1e-4))
 
 
