@@ -45,7 +45,7 @@ GAP = 5
 """Pixels between parts of one thing that are found by their colour, less one."""
 
 SHADOW = 21
-"""Width, pixels, of the square around a body in which shadows are divided from other things."""
+"""Width, pixels, of the square around a body in which its shadow begins; shadows are divided from other things."""
 
 ATTACHED = 0.15
 """Least share of the border of a piece without depth, or of a shadow, along the thing that it belongs to."""
@@ -90,7 +90,9 @@ def flood(
     colored = close(evidence.colored | (high & ~body & (evidence.contrast > UNIT)), GAP)
     near = grow(body, 5)
     n_pieces = n_bodies
-    shade = evidence.shade & grow(body, SHADOW)
+    shades, sizes = components(evidence.shade)
+    beside_body = np.bincount(shades[grow(body, SHADOW)], minlength=len(sizes)) > 0
+    shade = evidence.shade & beside_body[shades]
     for part in (colored & ~near & ~shade, colored & ~near & shade):
         numbers, n_colored = _colored_markers(part)
         markers = np.where(numbers > 0, numbers + n_pieces, markers)
