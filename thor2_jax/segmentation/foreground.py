@@ -54,7 +54,7 @@ NOISE = 4.0
 DARKER, LIGHTER = 0.35, 0.5
 """Weights of differences in brightness: shadows and highlights are less of a sign than another hue."""
 
-SHADE = 0.7
+SHADE = 0.5
 """Largest change of hue of a pixel in the shade, as a share of its change of brightness."""
 
 UNIT = 40

@@ -44,6 +44,9 @@ PART = 90.0
 GAP = 5
 """Pixels between parts of one thing that are found by their colour, less one."""
 
+OPEN = 0.3
+"""Least share of the border of a shadow along the plane; what is darker in a bowl is its bottom."""
+
 SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are divided from other things."""
 
@@ -176,7 +179,7 @@ def merge_pieces(
     """Return the labels [H, W] of the pieces of `flood` after merging; the arguments are as there."""
     n = len(colored)
     borders = _find_borders(labels, n, color, depth, evidence)
-    shapes = _measure(labels, n, evidence)
+    shapes = _measure(labels, n, borders, evidence)
     apart = borders.length < LEAST_CONTACT * borders.perimeter[borders.pairs].min(axis=1)
     together = _belong_together(borders, shapes, colored, apart)
     for k, (a, b) in enumerate(borders.pairs.tolist()):
@@ -261,7 +264,7 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
 
 
-def _measure(labels: NDArray[np.int32], n: int, evidence: Evidence) -> _Shapes:
+def _measure(labels: NDArray[np.int32], n: int, borders: _Borders, evidence: Evidence) -> _Shapes:
     every = labels[::2, ::2].ravel()
     things = np.flatnonzero(every)
     every = every[things]
@@ -271,7 +274,8 @@ def _measure(labels: NDArray[np.int32], n: int, evidence: Evidence) -> _Shapes:
     low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
     unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
     shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-    return _Shapes(tall, low, unknown, shade)
+    to_plane = np.bincount(borders.pairs[:, 1], borders.length * (borders.pairs[:, 0] == 0), minlength=n)
+    return _Shapes(tall, low, unknown, shade & (to_plane > OPEN * borders.perimeter))
 
 
 def _find_borders(
