@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.pixels import Mask, components, nearest_known
+from thor2_jax.segmentation.pixels import Mask, nearest_known
 from thor2_jax.segmentation.planes import DepthImage
 
 __all__ = ["depth_edges"]
@@ -20,12 +20,6 @@ STEP = (0.006, 0.015)
 NARROW = 0.4
 """Least share of a step between the two neighbours of a pixel."""
 
-LEAST_EDGE = 8
-"""Smaller connected groups of step pixels are noise."""
-
-GAP = 2.0
-"""Steepest slope of a surface across a gap without depth. Shadows of the projector beside a step are narrower."""
-
 BEND = 0.4
 """Least change of slope at a fold."""
 
@@ -33,33 +27,31 @@ NEAR, FAR = 2, 6
 """Pixels between an edge and the values that are extrapolated."""
 
 
-def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
-    """Return the steps and the folds of a depth image.
+def depth_edges(depth: DepthImage) -> tuple[Mask, Mask, Mask]:
+    """Return the edges of a depth image.
 
     Returns:
-        Steps and folds, [H, W] each.
+        Steps along rows, steps along columns, and folds, [H, W] each.
     """
     known = depth.valid
     if not known.any():
-        return np.zeros(known.shape, bool), np.zeros(known.shape, bool)
+        none = np.zeros(known.shape, bool)
+        return none, none, none
     inverse = depth.inverse[known].take(nearest_known(known))
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
     unknown = (~known).view(np.uint8)
     gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))
     # Metres are differences of inverse depth times the squared depth.
-    pixel = np.float32(depth.pixel_size)
     least = STEP[0] * inverse * inverse + STEP[1]
-    least_step = least + (2 * GAP * pixel) * gap * inverse
-    least_fold = 0.5 * least + (NEAR * BEND * pixel) * inverse + gap
-    steps, folds = np.zeros(known.shape, bool), np.zeros(known.shape, bool)
+    least_fold = 0.5 * least + (NEAR * BEND * depth.pixel_size) * inverse + gap
+    steps, folds = [], np.zeros(known.shape, bool)
     for along_rows in (True, False):
         before, after, difference = (_filter(inverse, kernel, along_rows) for kernel in _kernels())
         smaller = np.minimum(np.abs(before), np.abs(after))
         opposite = (before > 0) != (after > 0)
-        steps |= (smaller > least_step) & opposite & (np.abs(difference) > NARROW * least_step)
+        steps.append((smaller > least) & opposite & (np.abs(difference) > NARROW * least))
         folds |= np.minimum(before, after) > least_fold
-    numbers, sizes = components(steps, connectivity=8)
-    return (sizes >= LEAST_EDGE)[numbers], folds
+    return steps[0], steps[1], folds
 
 
 def _kernels() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

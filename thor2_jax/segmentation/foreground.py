@@ -19,13 +19,13 @@ from thor2_jax.segmentation.pixels import (
 )
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
-__all__ = ["FLAT", "UNIT", "Evidence", "find_foreground"]
+__all__ = ["UNIT", "Evidence", "find_foreground"]
 
 HEIGHT = (0.006, 0.005)
 """Least height of a thing over its plane: the first in metres, plus the second times the squared depth in metres."""
 
-FLAT = 0.03
-"""Height, metres, below which depth at the border of a thing is not trusted where the colour is the plane's."""
+FLAT = 0.05
+"""Height, metres, below which smooth parts of the image may be the plane."""
 
 COARSE = 2
 """Pixels of the image in a pixel of the coarse image of the plane's colour, in each direction."""
@@ -38,9 +38,6 @@ WIDE_WINDOW = 75
 
 WINDOWS_OF_OUTLIERS = (51, WINDOW)
 """Windows of whose mean colour the plane's pixels are, one after the other; large flat things fill the small one."""
-
-SHIFT = 12
-"""Distance, coarse pixels, of the neighbouring windows, of which the most similar one counts at borders of colours."""
 
 OUTLIER = 30.0
 """Least difference of a coarse pixel that is no part of the plane, sum over the channels."""
@@ -57,14 +54,14 @@ NOISE = 4.0
 DARKER, LIGHTER = 0.35, 0.5
 """Weights of differences in brightness: shadows and highlights are less of a sign than another hue."""
 
+SHADE = 0.5
+"""Largest change of hue of a pixel in the shade, as a share of its change of brightness."""
+
 UNIT = 40
 """`Evidence.contrast` of a pixel with the least colour difference of a thing; 8 bits end at about six times as much."""
 
 SMOOTH = 0.5
 """Largest change of contrast, in units, between neighbours in a smooth part of the plane, such as a soft shadow."""
-
-LARGEST_SMOOTH = 3
-"""Largest contrast, in units, of a soft shadow or a highlight."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,9 +73,9 @@ class Evidence:
         high: pixels that are above a plane.
         contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable; 0 far from the support.
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
-        plain: pixels whose colour is the support's, including soft shadows and highlights.
+        shade: colored pixels on the support that are darker than it, but of its hue: deep shadows, and black things.
         region: pixels in the convex hull of the support.
-        steps: steps of depth, see `depth_edges`.
+        steps: steps of depth along rows and along columns, see `depth_edges`.
         folds: folds of depth.
     """
 
@@ -86,9 +83,9 @@ class Evidence:
     high: Mask
     contrast: NDArray[np.uint8]
     colored: Mask
-    plain: Mask
+    shade: Mask
     region: Mask
-    steps: Mask
+    steps: tuple[Mask, Mask]
     folds: Mask
 
 
@@ -109,17 +106,19 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
         on_support &= np.abs(heights) <= np.abs(others)
-    contrast, near, known = _color_contrast(color, on_support)
+    contrast, darker, near, known = _color_contrast(color, on_support)
     region = shrink(planes[0].region(depth.z.shape), 3)
     known = near | (known & depth.valid & region)  # far from the plane, missing depth is rarely a thing on it
     contrast = contrast * known
-    low = ((heights < FLAT + 0.02) | ~depth.valid) & region & known
+    low = ((heights < FLAT) | ~depth.valid) & region & known
     gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
     smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
-    plain = _plain_parts(smooth, (contrast < UNIT) & on_support) & (contrast < LARGEST_SMOOTH * UNIT)
+    plain = _plain_parts(smooth, (contrast < UNIT) & on_support)
     beside = on_support | (~depth.valid & region)
     colored = open_round(beside & known & (contrast > UNIT) & ~plain)
-    return Evidence(heights, open_round(high), contrast, colored, plain, region, *depth_edges(depth))
+    shade = open_round(colored & on_support & darker)
+    *steps, folds = depth_edges(depth)
+    return Evidence(heights, open_round(high), contrast, colored, shade, region, (steps[0], steps[1]), folds)
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
@@ -133,11 +132,12 @@ def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
     return grow(plain[numbers], 3)
 
 
-def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask]:
+def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask, Mask]:
     """Compare each pixel with the pixels of the plane around it.
 
     Returns:
-        `Evidence.contrast`, and the pixels with enough of the plane in their window, and in their wide window.
+        `Evidence.contrast`, the pixels that are darker than the plane, but of its hue, and those with enough of the
+        plane in their window, and in their wide window.
     """
     height, width = plane.shape
     around, near, window_share, share = _plane_color(color, plane)
@@ -151,6 +151,7 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     across = float_image(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
     across -= along * along
     brightness = along - reference
+    darker = (brightness < 0) & (across < SHADE * SHADE * brightness * brightness)
     brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
     brightness *= brightness
     across += brightness
@@ -165,7 +166,7 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
         pixel_mask(cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST))
         for mask in (near, window_share > LEAST_PLANE)
     ]
-    return contrast, known[0], known[1]
+    return contrast, darker, known[0], known[1]
 
 
 def _plane_color(
@@ -178,14 +179,12 @@ def _plane_color(
     """
     height, width = plane.shape
     size = (-(-width // COARSE), -(-height // COARSE))
-    shown = float_image(cv2.resize(color, size, interpolation=cv2.INTER_AREA))
     masked = cv2.bitwise_and(color, color, mask=plane.view(np.uint8))
     total = float_image(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
     share = float_image(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
     own = float_image(total / np.maximum(share, 0.05)[..., None])
     for window in WINDOWS_OF_OUTLIERS:  # leave out what has another colour than most of the window
-        mean = _window_mean(total, share, window)
-        off = _channel_sum(own, mean)
+        off = _channel_sum(own, _window_mean(total, share, window))
         full = share > 0.5
         typical = median_high(off[full]) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
@@ -195,29 +194,12 @@ def _plane_color(
     far = window_share < LEAST_PLANE  # inside large things
     mean[far] = _window_mean(total, share, WIDE_WINDOW)[far]
     window_share[far] = cv2.blur(share, (WIDE_WINDOW, WIDE_WINDOW))[far]
-    return float_image(cv2.blur(_most_similar_window(shown, mean), (3, 3))), ~far, window_share, share
+    return float_image(cv2.blur(mean, (3, 3))), ~far, window_share, share
 
 
 def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     size = (window, window)
     return float_image(cv2.blur(total, size)) / (float_image(cv2.blur(share, size))[..., None] + np.float32(1e-4))
-
-
-def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return for each coarse pixel the mean of the window, its own or a neighbouring one, that is most like it.
-
-    At the border of two materials, a window holds both.
-    """
-    height, width = shown.shape[:2]
-    padded = float_image(cv2.copyMakeBorder(mean, SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_REPLICATE))
-    nearest, least = mean.copy(), _channel_sum(shown, mean)
-    for down in (0, 2 * SHIFT):
-        for right in (0, 2 * SHIFT):
-            other = padded[down : down + height, right : right + width]
-            off = _channel_sum(shown, other)
-            nearest = float_image(cv2.copyTo(other, (off < least).view(np.uint8), nearest))
-            np.minimum(least, off, out=least)
-    return nearest
 
 
 def _channel_sum(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:

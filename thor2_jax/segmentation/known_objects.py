@@ -2,9 +2,9 @@
 
 labels = segment_known(frame, labels, recognize)          # labels of any segmenter, [H, W]
 
-Each piece is divided into parts of about one colour and place. The parts, unions of neighbouring ones, whole pieces and
-pairs of neighbouring pieces are candidates for an object, which are all recognized. A piece is divided if its best
-division has objects of different names, and two pieces are merged if they are recognized much better together.
+Each piece is divided into parts of about one colour and place. The parts, unions of neighbouring ones and whole pieces
+are candidates for an object, which are all recognized. A piece is divided if its best division has objects of different
+names. Neighbouring things are then merged, again and again, where one object is recognized better in both together.
 """
 
 import dataclasses
@@ -54,11 +54,11 @@ MOST = 0.99
 SHARE = 0.5
 """Least share of a piece that is recognized in its division."""
 
-COST = 0.5
-"""Penalty for each part of a division: these log-odds, times the area of the piece."""
+COST, COST_OF_UNKNOWN = 0.3, 0.5
+"""Penalties for each known and unknown part of a division: these log-odds, times the area of the piece."""
 
-MERGED = 3.0
-"""Log-odds that two pieces must gain in the mean when they are merged."""
+GAIN = 1.0
+"""Log-odds that a known object must gain when two things are merged."""
 
 
 def segment_known(
@@ -75,29 +75,44 @@ def segment_known(
         Labels [H, W]: 0 is background, and the things are numbered from 1.
     """
     parts, piece_of = _parts(frame, labels)
-    pieces = [frozenset(np.flatnonzero(piece_of == k).tolist()) for k in range(1, int(piece_of.max()) + 1)]
-    inside, pairs = _candidates(parts, piece_of, pieces)
-    candidates = list(dict.fromkeys([c for each in inside for c in each] + [a | b for a, b in pairs]))
-    answers = recognize([_shown(frame, parts, candidate) for candidate in candidates])
+    beside = _neighbours(parts)
     sizes = np.bincount(parts.ravel(), minlength=len(piece_of))
-    area = {candidate: int(sizes[list(candidate)].sum()) for candidate in candidates}
-    named = dict(zip(candidates, answers, strict=True))
-    odds = {candidate: _log_odds(*named[candidate]) for candidate in candidates}
-    divided = {piece: _best_division(piece, each, area, odds) for piece, each in zip(pieces, inside, strict=True)}
-    for piece, division in divided.items():
-        known = [part for part in division if odds[part] > 0]
-        covered = sum(area[part] for part in known)
-        if len({named[part][0] for part in known}) < 2 or covered < SHARE * area[piece]:
-            divided[piece] = (piece,)
-    gains = {(a, b): _gain(a, b, divided, area, odds) for a, b in pairs}
-    for a, b in sorted(pairs, key=lambda pair: -gains[pair]):
-        if gains[a, b] > MERGED and a in divided and b in divided:
-            del divided[a], divided[b]
-            divided[a | b] = (a | b,)
+    known = _Known(lambda candidates: recognize([_shown(frame, parts, each) for each in candidates]), sizes)
+    pieces = [frozenset(np.flatnonzero(piece_of == k).tolist()) for k in range(1, int(piece_of.max()) + 1)]
+    inside = [_candidates(piece, beside) for piece in pieces]
+    known.look_at([each for candidates in inside for each in candidates])
+    things = {thing for piece, each in zip(pieces, inside, strict=True) for thing in _best_division(piece, each, known)}
+    while merged := _merged(things, beside, known):
+        things = merged
     result = np.zeros(parts.shape, np.int32)
-    for number, thing in enumerate((thing for division in divided.values() for thing in division), start=1):
+    for number, thing in enumerate(sorted(things, key=min), start=1):
         result[_mask(parts, thing)] = number
     return result
+
+
+class _Known:
+    """Candidates that were recognized.
+
+    Attributes:
+        area: candidate -> pixels.
+        name: candidate -> name, None for an unknown object.
+        odds: candidate -> log-odds of the confidence, 0 if it does not count.
+    """
+
+    def __init__(self, recognize: Callable[[Sequence[Parts]], Sequence[Answer]], sizes: NDArray[np.intp]) -> None:
+        self.area: dict[Parts, int] = {}
+        self.name: dict[Parts, str | None] = {}
+        self.odds: dict[Parts, float] = {}
+        self._recognize, self._sizes = recognize, sizes
+
+    def look_at(self, candidates: Sequence[Parts]) -> None:
+        """Recognize the candidates that are new, all at once."""
+        new = [each for each in dict.fromkeys(candidates) if each not in self.odds]
+        for each, (name, confidence) in zip(new, self._recognize(new), strict=True):
+            counts = name is not None and confidence >= LEAST
+            self.name[each] = name if counts else None
+            self.odds[each] = float(logit(min(confidence, MOST))) if counts else 0.0
+            self.area[each] = int(self._sizes[list(each)].sum())
 
 
 def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
@@ -141,31 +156,27 @@ def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[n
     return np.where(mask, rank[numbers[known]].take(nearest_known(known)), 0)
 
 
-def _candidates(
-    parts: NDArray[np.int32], piece_of: NDArray[np.intp], pieces: Sequence[Parts]
-) -> tuple[list[list[Parts]], list[tuple[Parts, Parts]]]:
-    """Return the candidates in each piece, the piece itself first, and the pairs of neighbouring pieces."""
-    beside: dict[int, set[int]] = {}
-    touching = set()
-    image = parts.astype(np.float32)
-    grown = np.where(parts > 0, parts, cv2.dilate(image, np.ones((BESIDE, BESIDE), np.uint8)).astype(np.int32))
+def _neighbours(parts: NDArray[np.int32]) -> dict[int, set[int]]:
+    """Return the parts beside each part."""
+    beside: dict[int, set[int]] = {part: set() for part in range(1, int(parts.max()) + 1)}
+    grown = cv2.dilate(parts.astype(np.float32), np.ones((BESIDE, BESIDE), np.uint8)).astype(np.int32)
+    grown = np.where(parts > 0, parts, grown)
     for a, b in ((grown[:-1], grown[1:]), (grown[:, :-1], grown[:, 1:])):
         at = (a != b) & (a > 0) & (b > 0)
         for one, other in np.unique(np.stack([a[at], b[at]], axis=1), axis=0).tolist():
-            if piece_of[one] == piece_of[other]:
-                beside.setdefault(one, set()).add(other)
-                beside.setdefault(other, set()).add(one)
-            else:
-                touching.add((min(piece_of[one], piece_of[other]), max(piece_of[one], piece_of[other])))
-    inside = []
-    for piece in pieces:
-        level = {frozenset([part]) for part in piece}
-        candidates = {piece, *level}
-        for _ in range(MOST_JOINED - 1):
-            level = {each | {other} for each in level for part in each for other in beside.get(part, set()) - each}
-            candidates |= level
-        inside.append([piece, *sorted(candidates - {piece}, key=sorted)])
-    return inside, [(pieces[a - 1], pieces[b - 1]) for a, b in sorted(touching)]
+            beside[one].add(other)
+            beside[other].add(one)
+    return beside
+
+
+def _candidates(piece: Parts, beside: dict[int, set[int]]) -> list[Parts]:
+    """Return the candidates in a piece, the piece itself first."""
+    level = {frozenset([part]) for part in piece}
+    candidates = {piece, *level}
+    for _ in range(MOST_JOINED - 1):
+        level = {each | {other} for each in level for part in each for other in (beside[part] & piece) - each}
+        candidates |= level
+    return [piece, *sorted(candidates - {piece}, key=sorted)]
 
 
 def _mask(parts: NDArray[np.int32], candidate: Parts) -> Mask:
@@ -186,16 +197,12 @@ def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBD
     return RGBDFrame(frame.color[here], frame.depth[here], labels, moved)
 
 
-def _log_odds(name: str | None, confidence: float) -> float:
-    """Return the log-odds of the confidence of an answer, 0 if it does not count."""
-    return 0.0 if name is None or confidence < LEAST else float(logit(min(confidence, MOST)))
+def _best_division(piece: Parts, candidates: Sequence[Parts], known: _Known) -> tuple[Parts, ...]:
+    """Return the division of a piece into candidates with the largest sum of area times log-odds, less the costs.
 
-
-def _best_division(
-    piece: Parts, candidates: Sequence[Parts], area: dict[Parts, int], odds: dict[Parts, float]
-) -> tuple[Parts, ...]:
-    """Return the division of a piece into candidates with the largest sum of area times log-odds, less the costs."""
-    cost = COST * area[piece]
+    A piece without two known objects remains.
+    """
+    area = known.area[piece]
 
     @functools.cache
     def best(left: Parts) -> tuple[float, tuple[Parts, ...]]:
@@ -205,14 +212,33 @@ def _best_division(
         for candidate in candidates:
             if first in candidate and candidate <= left:
                 value, others = best(left - candidate)
-                results.append((value + area[candidate] * odds[candidate] - cost, (candidate, *others)))
+                odds = known.odds[candidate]
+                value += known.area[candidate] * odds - area * (COST if odds else COST_OF_UNKNOWN)
+                results.append((value, (candidate, *others)))
         return max(results, key=lambda result: result[0])
 
-    return best(piece)[1]
+    division = best(piece)[1]
+    named = [each for each in division if known.odds[each]]
+    is_known = len({known.name[each] for each in named}) > 1 and sum(known.area[each] for each in named) >= SHARE * area
+    return division if is_known else (piece,)
 
 
-def _gain(
-    a: Parts, b: Parts, divided: dict[Parts, tuple[Parts, ...]], area: dict[Parts, int], odds: dict[Parts, float]
-) -> float:
-    apart = sum(area[thing] * odds[thing] for piece in (a, b) for thing in divided[piece])
-    return odds[a | b] - apart / area[a | b]
+def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> set[Parts]:
+    """Return things of which neighbours are merged where a known object gains by it; nothing if none does."""
+    at = {part: thing for thing in things for part in thing}
+    touching = {(at[part], at[other]) for part in at for other in beside[part] if min(at[part]) < min(at[other])}
+    pairs = sorted(
+        ((a, b) for a, b in touching if len({known.name[a], known.name[b]} - {None}) < 2),
+        key=lambda pair: [min(each) for each in pair],
+    )
+    known.look_at([a | b for a, b in pairs])
+    gains = {
+        (a, b): known.odds[a | b] - max(known.odds[a], known.odds[b])
+        for a, b in pairs
+        if {known.name[a], known.name[b]} <= {None, known.name[a | b]}
+    }
+    left = set(things)
+    for a, b in sorted(gains, key=lambda pair: -gains[pair]):
+        if gains[a, b] > GAIN and {a, b} <= left:
+            left = left - {a, b} | {a | b}
+    return left if left != things else set()

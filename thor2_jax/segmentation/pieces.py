@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
+from thor2_jax.segmentation.foreground import UNIT, Evidence
 from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
@@ -29,12 +29,6 @@ RIM = 3
 NECK = 2.4
 """Half the width, pixels, of a neck that divides a body."""
 
-CLEAR = 0.3
-"""Largest contrast, in units, of a pixel that is clearly the plane's."""
-
-BLEEDING = 7
-"""Width, pixels, of the square within which depth of a thing may reach over the plane."""
-
 OUTSIDE = 21
 """Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
 
@@ -44,26 +38,29 @@ LEAST_CONTACT = 0.08
 EDGE = 0.25
 """Least share of a common border that is a step, for two things."""
 
-FOLD = 0.4
-"""Least share of a common border that is a step or a fold, for two things of different colours."""
-
-CONTRAST = 25.0
-"""Least colour difference across a fold between two things, sum over the channels."""
-
 PART = 90.0
 """Largest colour difference between a body and a part of it that was found by its colour."""
 
-ENCLOSED = 0.7
-"""Least share of the border of a piece, all along another one, that is a part of the other one."""
+GAP = 5
+"""Pixels between parts of one thing that are found by their colour, less one."""
+
+OPEN = 0.3
+"""Least share of the border of a shadow along the plane; what is darker in a bowl is its bottom."""
+
+SHADOW = 21
+"""Width, pixels, of the square around a body in which its shadow begins; shadows are divided from other things."""
+
+ATTACHED = 0.15
+"""Least share of the border of a piece without depth, or of a shadow, along the thing that it belongs to."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
 
-SAME_HUE = 0.25
-"""Largest distance of the mean colours, as unit vectors, of the two sides of a hollow thing; their light differs."""
+SAME_HEIGHT, RIM_SHARE = 0.015, 97
+"""Largest difference, metres, of the upper rims of the two sides of a hollow thing, and their percentile of heights."""
 
-SAME_HEIGHT = 0.015
-"""Largest difference of the heights, metres, of the two sides of a hollow thing."""
+CONCAVE = 0.1
+"""Least bend of the inner side of a hollow thing, as a share of its size."""
 
 BEFORE, AFTER = 2, 2
 """Pixels beside a border at which the two pieces are compared."""
@@ -82,13 +79,10 @@ def flood(
     Returns:
         Labels [H, W], 0 for the background, and for each label [n] whether the piece was found by its colour alone.
     """
-    steps, folds = evidence.steps, evidence.folds
+    steps, folds = evidence.steps[0] | evidence.steps[1], evidence.folds
     high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
-    like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
-    like_plane &= ~shrink(high, BLEEDING)
-    body = high & ~like_plane
-    markers, n_bodies = _body_markers(body, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
-    body_numbers, body_sizes = components(body)
+    markers, n_bodies = _body_markers(high, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
+    body_numbers, body_sizes = components(high)
     marked = np.zeros(len(body_sizes), bool)
     marked[body_numbers[markers > 0]] = True
     alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
@@ -96,18 +90,22 @@ def flood(
     markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
     n_bodies += int(alone.sum())
     body = (marked | alone)[body_numbers]
-    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
+    colored = close(evidence.colored | (high & ~body & (evidence.contrast > UNIT)), GAP)
     near = grow(body, 5)
-    numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
-    markers = np.where(numbers > 0, numbers + n_bodies, markers)
-    # Pixels without depth may belong to a thing beside them, or to one that is found by its colour.
-    clearly_colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
-    beside = (grow(near | colored, 5) & ~like_plane) | (~evidence.region & grow(body, OUTSIDE))
-    unknown = (near & ~(like_plane & ~evidence.high)) | colored | (~depth.valid & (beside | clearly_colored))
+    n_pieces = n_bodies
+    shades, sizes = components(evidence.shade)
+    beside_body = np.bincount(shades[grow(body, SHADOW)], minlength=len(sizes)) > 0
+    shade = evidence.shade & beside_body[shades]
+    for part in (colored & ~near & ~shade, colored & ~near & shade):
+        numbers, n_colored = _colored_markers(part)
+        markers = np.where(numbers > 0, numbers + n_pieces, markers)
+        n_pieces += n_colored
+    beside = grow(near | colored, 5) | (~evidence.region & grow(body, OUTSIDE))
+    unknown = near | colored | (~depth.valid & beside)
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
-    return labels, np.arange(1 + n_bodies + n_colored) > n_bodies
+    return labels, np.arange(1 + n_pieces) > n_bodies
 
 
 def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
@@ -133,45 +131,29 @@ def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
     return markers, n_parts + int(whole.sum())
 
 
-def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of things that are found by their colour, and how many there are.
-
-    What is beside a body and has no depth is left to the flood.
-    """
+def _colored_markers(colored: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of things that are found by their colour, and how many there are."""
     numbers, sizes = components(colored, connectivity=8)
-    n_valid = np.bincount(numbers[valid], minlength=len(sizes))
-    beside = np.zeros(len(sizes), bool)
-    beside[numbers[grow(near, 3)]] = True
-    kept = (sizes >= LEAST_MARKER) & (~beside | (n_valid > 0.5 * sizes))
+    kept = sizes >= LEAST_MARKER
     return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Borders:
-    """Pixels of the borders between pieces [P], and pairs of neighbouring pieces [N], the smaller number first.
-
-    The background is a piece, too.
+    """Borders between pairs of neighbouring pieces [N], the smaller number first; the background is a piece, too.
 
     Attributes:
-        first: [P] one piece at each border pixel.
-        second: [P] the other one.
-        height: [P] height of the second piece beside the pixel, metres; 0 if missing.
         pairs: [N, 2] the pieces of each pair.
         length: [N] border pixels.
         step: [N] share of them at a step.
-        fold: [N] share of them at a step or a fold.
         contrast: [N] mean colour difference across, sum over the channels.
         behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
         perimeter: [n] border pixels of each piece.
     """
 
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    height: NDArray[np.float32]
     pairs: NDArray[np.int64]
     length: NDArray[np.intp]
     step: NDArray[np.float64]
-    fold: NDArray[np.float64]
     contrast: NDArray[np.float64]
     behind: NDArray[np.float64]
     perimeter: NDArray[np.intp]
@@ -179,11 +161,12 @@ class _Borders:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Statistics of pieces [n], of every second pixel in each direction: which are tall or low, and mean colours."""
+    """Which pieces [n] are tall, low, mostly without depth or in the shade, by every second pixel in each direction."""
 
     tall: NDArray[np.bool_]
     low: NDArray[np.bool_]
-    color: NDArray[np.float64]
+    unknown: NDArray[np.bool_]
+    shade: NDArray[np.bool_]
 
 
 def merge_pieces(
@@ -196,84 +179,113 @@ def merge_pieces(
     """Return the labels [H, W] of the pieces of `flood` after merging; the arguments are as there."""
     n = len(colored)
     borders = _find_borders(labels, n, color, depth, evidence)
-    shapes = _measure(labels, n, color, evidence)
-    together = _belong_together(borders, shapes, colored)
+    shapes = _measure(labels, n, borders, evidence)
+    apart = borders.length < LEAST_CONTACT * borders.perimeter[borders.pairs].min(axis=1)
+    together = _belong_together(borders, shapes, colored, apart)
     for k, (a, b) in enumerate(borders.pairs.tolist()):
-        if not together[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
-            together[k] = _is_hollow(k, a, b, borders, shapes, labels, evidence)
-    merged = borders.pairs[together & (borders.pairs[:, 0] > 0)]
-    graph = coo_matrix((np.ones(len(merged)), merged.T), (n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)[labels]
+        if not together[k] and not apart[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
+            together[k] = _is_hollow(k, a, b, borders, labels, depth, evidence)
+    a, b = borders.pairs.T
+    groups = _components(borders.pairs[together & (shapes.shade[a] == shapes.shade[b])], n)
+    shadow = _is_shadow(groups, borders, shapes)
+    groups = _components(borders.pairs[together & ~shadow[a] & ~shadow[b]], n)
+    groups[shadow] = 0
+    return groups[labels]
 
 
-def _belong_together(borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _components(pairs: NDArray[np.int64], n: int) -> NDArray[np.int32]:
+    """Return the numbers [n] of the groups of connected pieces; the background is connected to none and has 0."""
+    pairs = pairs[pairs[:, 0] > 0]
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
+
+def _is_shadow(groups: NDArray[np.int32], borders: _Borders, shapes: _Shapes) -> NDArray[np.bool_]:
+    """Return which pieces [n] lie in the shade along a tall thing and are part of nothing else."""
+    alone = ~np.isin(groups, groups[~shapes.shade])
+    tall = np.isin(groups, groups[shapes.tall])
+    ends, others = np.concatenate([borders.pairs, borders.pairs[:, ::-1]]).T
+    along = np.bincount(ends, np.tile(borders.length, 2) * tall[others], minlength=len(groups))
+    return alone & (along > ATTACHED * borders.perimeter)
+
+
+def _belong_together(
+    borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_], apart: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return which pairs [N] are of one thing, but for hollow things."""
     a, b = borders.pairs.T
-    # One piece surrounds the other, which is not nearer to the camera: the bottom of a bowl.
-    most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
-    enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
-    apart = borders.length < LEAST_CONTACT * np.minimum(borders.perimeter[a], borders.perimeter[b])
-    cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
-    answers: list[Any] = [True, borders.contrast < PART, True, False]
-    is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
-    return np.select(cases, answers, ~is_border)
+    is_part = (borders.contrast < PART) | _main_contact(borders, shapes, part_by_color, colored)
+    cases = [part_by_color, shapes.low[a] & shapes.low[b], apart]
+    answers: list[Any] = [is_part, True, False]
+    return np.select(cases, answers, borders.step < EDGE)
+
+
+def _main_contact(
+    borders: _Borders, shapes: _Shapes, parts: NDArray[np.bool_], colored: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return which pairs [N] of a body and a piece that was found by its colour are one thing without a step between.
+
+    The body must be that with the longest common border, and the piece must not be in the shade.
+    """
+    part = np.where(colored[borders.pairs[:, 0]], *borders.pairs.T)
+    length = borders.length * parts
+    longest = np.zeros(len(colored), length.dtype)
+    np.maximum.at(longest, part, length)
+    joined = (shapes.unknown[part] | (borders.step < EDGE)) & ~shapes.shade[part]
+    return parts & joined & (length == longest[part]) & (length > ATTACHED * borders.perimeter[part])
 
 
 def _is_hollow(
-    k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, labels: NDArray[np.int32], evidence: Evidence
+    k: int, a: int, b: int, borders: _Borders, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence
 ) -> bool:
-    """Return whether one piece is the inner side of the other, as in a mug.
-
-    It lies behind, has about its hue, width and height, and meets the background at its upper rim only.
-    """
-    hues = shapes.color[[a, b]] / (np.linalg.norm(shapes.color[[a, b]], axis=1, keepdims=True) + 1)
-    if abs(borders.behind[k]) < 0.1 or np.linalg.norm(hues[0] - hues[1]) > SAME_HUE:
-        return False
+    """Return whether the piece that is farther is the inner side of the other: concave, with the same upper rim."""
     inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
-    inner_height, inner_width = _size(inner, labels, evidence)
-    outer_height, outer_width = _size(outer, labels, evidence)
-    rim = borders.height[(borders.first == 0) & (borders.second == inner) & (borders.height != 0)]
-    return bool(
-        abs(inner_height - outer_height) < SAME_HEIGHT
-        and borders.length[k] > 0.6 * inner_width
-        and inner_width > 0.6 * outer_width
-        and len(rim) > 0
-        and np.percentile(rim, 20) > 0.7 * inner_height
-    )
+    heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
+    rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
+    return abs(rims[0] - rims[1]) < SAME_HEIGHT and _is_concave((labels == inner) & evidence.high, depth)
 
 
-def _size(piece: int, labels: NDArray[np.int32], evidence: Evidence) -> tuple[float, int]:
-    """Return the height, metres, and the width, pixels, of a piece."""
-    rows, columns = np.nonzero(labels[::2, ::2] == piece)
-    if len(rows) == 0:
-        return 0.0, 0
-    heights = evidence.heights[::2, ::2][rows, columns]
-    return float(np.percentile(heights, 97)), 2 * int(np.ptp(columns) + 1)
+def _is_concave(mask: Mask, depth: DepthImage) -> bool:
+    """Return whether the inner part of a surface is nearer to the camera at its border than in its middle.
+
+    A plane is linear in inverse depth, so the coefficient of the squared distance to the middle is the curvature.
+    """
+    rows, columns = np.nonzero(shrink(mask, RIM) & depth.valid)
+    if len(rows) < 2 * LEAST_MARKER:
+        return False
+    x, y, inverse = depth.x[columns], depth.y[rows], depth.inverse[rows, columns]
+    x, y = x - x.mean(), y - y.mean()
+    squared = x * x + y * y
+    terms = np.stack([np.ones_like(x), x, y, squared], axis=1).astype(np.float64)
+    fitted, *_ = np.linalg.lstsq(terms, inverse)
+    bend = fitted[3] * squared.mean()
+    noise = np.sqrt(np.mean((terms @ fitted - inverse) ** 2))
+    return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
 
 
-def _measure(labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], evidence: Evidence) -> _Shapes:
+def _measure(labels: NDArray[np.int32], n: int, borders: _Borders, evidence: Evidence) -> _Shapes:
     every = labels[::2, ::2].ravel()
     things = np.flatnonzero(every)
     every = every[things]
     heights = evidence.heights[::2, ::2].ravel()[things]
-    pixels = color[::2, ::2].reshape(-1, 3)[things]
     size = np.maximum(np.bincount(every, minlength=n), 1)
     tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
     low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
-    mean = np.stack([np.bincount(every, pixels[:, c], minlength=n) / size for c in range(3)], axis=1)
-    return _Shapes(tall, low, mean)
+    unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
+    shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
+    to_plane = np.bincount(borders.pairs[:, 1], borders.length * (borders.pairs[:, 0] == 0), minlength=n)
+    return _Shapes(tall, low, unknown, shade & (to_plane > OPEN * borders.perimeter))
 
 
 def _find_borders(
     labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
-    z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_step = grow(evidence.steps, 5).ravel()
-    near_edge = near_step | grow(evidence.folds, 3).ravel()
+    z = depth.z.ravel()
     parts = []
-    for step in (1, labels.shape[1]):
+    for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
+        near_step = grow(steps, 5).ravel()
         here = np.flatnonzero(flat[:-step] != flat[step:])
         a, b = flat[here], flat[here + step]
         swap = a > b
@@ -282,13 +294,13 @@ def _find_borders(
         at_a, at_b = np.where(swap, after, before), np.where(swap, before, after)
         behind = np.where((z[at_a] > 0) & (z[at_b] > 0), np.sign(z[at_b] - z[at_a]), 0)
         a, b = np.minimum(a, b), np.maximum(a, b)
-        parts.append((a, b, heights[at_b], near_step[here], near_edge[here], difference, behind))
-    a, b, height, at_step, at_edge, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
+        parts.append((a, b, near_step[here], difference, behind))
+    a, b, at_step, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
     keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
     length = np.bincount(pair, minlength=len(keys))
     pairs = np.stack(np.divmod(keys, n), axis=1)
     perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
-    step_share, edge_share, contrast, behind = (
-        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, at_edge, difference, behind)
+    step_share, contrast, behind = (
+        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, difference, behind)
     )
-    return _Borders(a, b, height, pairs, length, step_share, edge_share, contrast, behind, perimeter)
+    return _Borders(pairs, length, step_share, contrast, behind, perimeter)

@@ -39,6 +39,7 @@ def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
     origin = -0.8 * rotation.apply([0, 0, 1])
     depth = -origin[2] / directions[:, 2]
     truth, light = np.zeros(len(depth), np.int32), np.ones(len(depth))
+    inside = np.zeros(len(depth), bool)
     for number, (mesh, _) in enumerate(things, start=1):
         points, ray, face = mesh.ray.intersects_location(
             np.broadcast_to(origin, directions.shape), directions, multiple_hits=False
@@ -46,8 +47,11 @@ def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
         z = ((points - origin) * directions[ray]).sum(axis=1) / (directions[ray] ** 2).sum(axis=1)
         near = z < depth[ray]
         depth[ray[near]], truth[ray[near]] = z[near], number
+        inside[ray[near]] = np.linalg.norm(points[near, :2] - mesh.centroid[:2], axis=1) < 0.0385
         light[ray[near]] = 0.55 + 0.45 * np.clip(mesh.face_normals[face[near]] @ LIGHT, 0, 1)
-    color = np.array([(150, 120, 90), *(color for _, color in things)])[truth] * light[:, None]
+    color = np.array([(150, 120, 90), *(color for _, color in things)])[truth]
+    color[inside & (truth == 2)] = WHITE  # the cup is white inside
+    color = color * light[:, None]
     frame = RGBDFrame(
         color.astype(np.uint8).reshape(240, 320, 3),
         np.rint(depth * 1000).astype(np.uint16).reshape(240, 320),

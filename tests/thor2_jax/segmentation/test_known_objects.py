@@ -46,6 +46,24 @@ def test_only_pieces_of_one_known_object_are_merged() -> None:
     np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
 
 
+def test_a_piece_is_divided_although_all_of_it_resembles_one_object() -> None:
+    apart = knows(TRUTH == 1, TRUTH == 2)
+
+    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
+        whole = int((TRUTH > 0).sum())
+        sizes = [int((frame.label_image == 1).sum()) for frame in frames]
+        return [("0", 0.985) if n == whole else each for n, each in zip(sizes, apart(frames), strict=True)]
+
+    assert (best_overlaps(segment_known(FRAME, ONE_PIECE, recognize), TRUTH) > 0.9).all()
+
+
+def test_more_than_two_pieces_of_one_object_are_merged() -> None:
+    column = np.nonzero(TRUTH)[1]
+    pieces = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), np.quantile(column, [0.45, 0.9])), 0)
+    assert pieces.max() == 3
+    np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
+
+
 def test_frames_without_pieces_or_without_depth_remain() -> None:
     unknown: Recognize = lambda frames: [(None, 0.0)] * len(frames)  # noqa: E731
     assert not segment_known(FRAME, np.zeros_like(TRUTH), unknown).any()

@@ -95,6 +95,25 @@ def test_a_soft_shadow_is_not_a_thing() -> None:
     assert segment_table(dataclasses.replace(frame, color=color)).max() == 1
 
 
+def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
+    frame = render([Box(0.0, 0.0, (0.06, 0.04), 0.12, YELLOW)])
+    shadow = np.roll(frame.label_image, (4, 14), axis=(0, 1)).astype(bool) & (frame.label_image == 0)
+    color = np.where(shadow[..., None], frame.color * 0.3, frame.color).astype(np.uint8)
+    labels = segment_table(dataclasses.replace(frame, color=color))
+    assert labels.max() == 1
+    assert best_overlaps(labels, frame.label_image)[0] > 0.85
+
+
+def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
+    frame = render([Box(0.0, 0.0, (0.04, 0.04), 0.14, RED)])
+    lower = (frame.label_image == 1) & (np.arange(240)[:, None] > np.nonzero(frame.label_image)[0].mean())
+    color, depth = frame.color.copy(), frame.depth.copy()
+    color[lower], depth[lower] = (25, 25, 25), 0
+    labels = segment_table(dataclasses.replace(frame, color=color, depth=depth))
+    assert labels.max() == 1
+    assert best_overlaps(labels, frame.label_image)[0] > 0.85
+
+
 def test_wall_sized_and_tiny_pieces_are_dropped() -> None:
     frame = render([Box(0.0, 0.3, (0.6, 0.02), 0.9, RED), Box(0.1, -0.05, (0.005, 0.005), 0.01, BLUE), APART[1]], 60)
     labels = segment_table(frame)
