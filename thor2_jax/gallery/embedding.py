@@ -46,7 +46,9 @@ MAX_EMBEDDING_SIZE = 256
 """Largest length of an embedding."""
 
 IMAGE_SHARE = 0.5
-"""Share of the persistence images in the projected block; each kind of colours has 1. Chosen on held-out frames."""
+BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
+"""Shares of the blocks in the similarity by `EmbeddingSizes.version`, before they are divided by their sum; the share
+of the persistence images in the projected block, where each kind of colours has 1. Chosen on held-out frames."""
 
 _METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
@@ -83,10 +85,8 @@ class EmbeddingSizes:
     nearest: bool = True
 
     def __post_init__(self) -> None:
-        values, flags = (
-            (self.cell, *self.hidden, self.learned, self.color + 1),
-            (self.balanced, self.shape, self.nearest),
-        )
+        values = (self.cell, *self.hidden, self.learned, self.color + 1)
+        flags = self.balanced, self.shape, self.nearest
         if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
             raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
@@ -94,11 +94,6 @@ class EmbeddingSizes:
     def version(self) -> int:
         """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
         return self.balanced + (self.balanced and self.shape)
-
-    @property
-    def block_weights(self) -> tuple[float, ...]:
-        """The shares of the blocks in the similarity, before they are divided by their sum."""
-        return ((1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2.0 + IMAGE_SHARE))[self.version]
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -136,14 +131,10 @@ class EmbeddingNetwork(nnx.Module):
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
         self.dropout = nnx.Dropout(0.15)
         self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
-        # Each version appends its features.
-        numbers = (
-            n_regions * config.n_strips * config.n_slices,
-            N_BALANCED,
-            config.n_slices * (-(-config.image_size // 2)) ** 2,
-        )
-        self.color_basis = nnx.BatchStat(jnp.zeros((sum(numbers[: sizes.version + 1]), sizes.color)))
-        self.block_weights = nnx.BatchStat(jnp.array(sizes.block_weights))
+        n_strips, cells = n_regions * config.n_strips, -(-config.image_size // 2)
+        n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # one more in each version
+        self.color_basis = nnx.BatchStat(jnp.zeros((sum(n_features[: sizes.version + 1]), sizes.color)))
+        self.block_weights = nnx.BatchStat(jnp.array(BLOCK_WEIGHTS[sizes.version]))
         if n_proxies:
             self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
             self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps anew
@@ -429,15 +420,8 @@ class Embedding:
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
             config = DescriptorConfig.of_record(about["descriptor_config"])
-            sizes = EmbeddingSizes(
-                **{
-                    "balanced": False,
-                    "shape": False,
-                    "nearest": False,
-                    **about["sizes"],
-                    "hidden": tuple(about["sizes"]["hidden"]),
-                }
-            )
+            earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest"), False)
+            sizes = EmbeddingSizes(**earlier | about["sizes"] | {"hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)

@@ -96,15 +96,15 @@ def _projected_features(version: int, network: ColorNetwork, config: DescriptorC
     return projected_features(descriptors, jnp.asarray(batch.statistics), version)
 
 
-def color_basis(
+def _color_basis(
     samples: Samples, network: ColorNetwork, config: DescriptorConfig, sizes: EmbeddingSizes, batch_size: int
 ) -> NDArray[np.float32]:
     """Return the principal components [F, C] of the projected features, not centred: projections keep cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
     batches = samples.batches(rows, batch_size)
     features = np.concatenate([_projected_features(sizes.version, network, config, batch) for batch in batches])
-    size = sizes.color
     variances, vectors = np.linalg.eigh(features @ features.T)
+    size = sizes.color
     largest = slice(-1, -size - 1, -1)
     basis = features.T @ (vectors[:, largest] / np.sqrt(np.maximum(variances[largest], 1e-6)))
     return np.pad(basis, ((0, 0), (0, size - basis.shape[1])))
@@ -199,7 +199,7 @@ def fit_embedding(
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
     n_objects = int(samples.label.max()) + 1
     embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
-    basis = color_basis(samples, network, embedding.config, embedding.sizes, options.batch_size)
+    basis = _color_basis(samples, network, embedding.config, embedding.sizes, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
     further = [
         embedding.create_further(int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0]))
