@@ -4,10 +4,11 @@
     similarity = embedding.embed(clouds) @ embedding.embed(others).T
 
 An embedding has two blocks, each of unit length before it is weighted: the output of a trained network on the
-descriptor; and the colour embeddings of the strips with the histogram of balanced colours, projected to their principal
-components, which depend little on what the network was trained on. In embeddings of earlier versions, the histogram is
-that of the colour regions, in a block of its own. The embedding of a run also classifies: by this network and
-further ones, whose class probabilities are averaged. `training.embedding` fits the networks.
+descriptor; and the colour embeddings of the strips, the histogram of balanced colours and the persistence images,
+projected to their principal components, which depend little on what the network was trained on. Embeddings of earlier
+versions have no images there, or the histogram of the colour regions in a block of its own. The embedding of a run also
+classifies: by this network and further ones, whose class probabilities are averaged. `training.embedding` fits the
+networks.
 """
 
 import dataclasses
@@ -44,6 +45,11 @@ EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 MAX_EMBEDDING_SIZE = 256
 """Largest length of an embedding."""
 
+IMAGE_SHARE = 0.5
+BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
+"""Shares of the blocks in the similarity by `EmbeddingSizes.version`, before they are divided by their sum; the share
+of the persistence images in the projected block, where each kind of colours has 1. Chosen on held-out frames."""
+
 _METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
 
@@ -60,8 +66,9 @@ class EmbeddingSizes:
         cell: outputs of the layer that is shared by all strip positions.
         hidden: units of the hidden layers.
         learned: length of the network's block of the embedding.
-        color: length of the block of projected colours.
+        color: length of the block of projected colours and images.
         balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
+        shape: whether it has the persistence images; False in embeddings of earlier versions.
         nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
             embeddings of earlier versions, where each counts with its own.
 
@@ -74,12 +81,19 @@ class EmbeddingSizes:
     learned: int = 128
     color: int = 120
     balanced: bool = True
+    shape: bool = True
     nearest: bool = True
 
     def __post_init__(self) -> None:
-        values, flags = (self.cell, *self.hidden, self.learned, self.color + 1), (self.balanced, self.nearest)
+        values = (self.cell, *self.hidden, self.learned, self.color + 1)
+        flags = self.balanced, self.shape, self.nearest
         if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
             raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
+
+    @property
+    def version(self) -> int:
+        """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
+        return self.balanced + (self.balanced and self.shape)
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -107,7 +121,7 @@ class EmbeddingNetwork(nnx.Module):
             rngs: generators of the weights and the dropout.
         """
         self.positions = max(config.image_size, config.n_strips)
-        self.n_regions, self.balanced = n_regions, sizes.balanced
+        self.n_regions, self.version = n_regions, sizes.version
         n_cells = config.n_slices * self.positions
         widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
         he = nnx.initializers.he_normal()
@@ -117,9 +131,10 @@ class EmbeddingNetwork(nnx.Module):
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
         self.dropout = nnx.Dropout(0.15)
         self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
-        n_colors = config.n_slices * n_regions * config.n_strips + (N_BALANCED if sizes.balanced else 0)
-        self.color_basis = nnx.BatchStat(jnp.zeros((n_colors, sizes.color)))
-        self.block_weights = nnx.BatchStat(jnp.array([1.0, 2.0]) if sizes.balanced else jnp.ones(3))
+        n_strips, cells = n_regions * config.n_strips, -(-config.image_size // 2)
+        n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # one more in each version
+        self.color_basis = nnx.BatchStat(jnp.zeros((sum(n_features[: sizes.version + 1]), sizes.color)))
+        self.block_weights = nnx.BatchStat(jnp.array(BLOCK_WEIGHTS[sizes.version]))
         if n_proxies:
             self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
             self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps anew
@@ -158,9 +173,9 @@ class EmbeddingNetwork(nnx.Module):
 
         The arguments are those of `learned`; if the colours are balanced, `balanced_histogram` ends the statistics.
         """
-        features = color_features(descriptors.embeddings, statistics if self.balanced else None)
+        features = projected_features(descriptors, statistics, self.version)
         blocks = [self.learned(descriptors, statistics), _unit(features @ self.color_basis[...])]
-        if not self.balanced:
+        if self.version == 0:
             blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
         weights = jnp.sqrt(self.block_weights[...])
         return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
@@ -175,13 +190,20 @@ def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
     return learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
 
 
-def color_features(embeddings: jax.Array, statistics: jax.Array | None) -> jax.Array:
-    """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length.
+def projected_features(descriptors: Descriptors, statistics: jax.Array, version: int) -> jax.Array:
+    """Return the features [B, F] that are projected to their principal components, by `EmbeddingSizes.version`.
 
-    With statistics, the `balanced_histogram` that they end with follows, also of unit length.
+    They are the square roots of the colour embeddings, `balanced_histogram`, with which the statistics end, and
+    the square roots of the persistence images, in cells of 2 x 2 pixels. Each part has a constant length.
     """
-    strips = _unit(square_root(embeddings).reshape(len(embeddings), -1))
-    return strips if statistics is None else jnp.concatenate([strips, statistics[:, -N_BALANCED:]], axis=1)
+    count = len(descriptors.embeddings)
+    parts = [_unit(square_root(descriptors.embeddings).reshape(count, -1))]
+    if version > 0:
+        parts.append(statistics[:, -N_BALANCED:])
+    if version > 1:
+        cells = nnx.avg_pool(jnp.moveaxis(descriptors.images, 1, -1), (2, 2), strides=(2, 2), padding="SAME")
+        parts.append(math.sqrt(IMAGE_SHARE) * _unit(square_root(cells).reshape(count, -1)))
+    return jnp.concatenate(parts, axis=1)
 
 
 def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) -> jax.Array:
@@ -398,9 +420,8 @@ class Embedding:
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
             config = DescriptorConfig.of_record(about["descriptor_config"])
-            sizes = EmbeddingSizes(
-                **{"balanced": False, "nearest": False, **about["sizes"], "hidden": tuple(about["sizes"]["hidden"])}
-            )
+            earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest"), False)
+            sizes = EmbeddingSizes(**earlier | about["sizes"] | {"hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)

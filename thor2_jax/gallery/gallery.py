@@ -35,12 +35,13 @@ GAMMA = 4.0
 RIDGE = 0.3
 """Regularization; chosen on held-out frames."""
 
-KEPT = {1: 0.17, 3: 0.24, 5: 0.27, 10: 0.29, 120: 0.3}
-KEPT_WITHOUT_REFERENCES = {1: 0.24, 3: 0.31, 5: 0.34, 10: 0.355, 120: 0.43}
-KEPT_BEFORE = {1: 0.05, 3: 0.11, 5: 0.115, 10: 0.12, 120: 0.3}
-KEPT_BEFORE_WITHOUT_REFERENCES = {1: 0.25, 3: 0.29, 5: 0.31, 10: 0.35, 120: 0.43}
-"""Views of an object -> score that 95 % of the correct answers reach: up to ten views from held-out frames, 120 views
-from meshes. `KEPT_BEFORE` and `KEPT_BEFORE_WITHOUT_REFERENCES` apply to embeddings without balanced colours."""
+KEPT: tuple[tuple[dict[int, float], dict[int, float]], ...] = (
+    ({1: 0.25, 3: 0.29, 5: 0.31, 10: 0.35, 120: 0.43}, {1: 0.05, 3: 0.11, 5: 0.115, 10: 0.12, 120: 0.3}),
+    ({1: 0.24, 3: 0.31, 5: 0.34, 10: 0.355, 120: 0.43}, {1: 0.17, 3: 0.24, 5: 0.27, 10: 0.29, 120: 0.3}),
+    ({1: 0.24, 3: 0.33, 5: 0.35, 10: 0.365, 120: 0.46}, {1: 0.15, 3: 0.24, 5: 0.28, 10: 0.31, 120: 0.39}),
+)
+"""Views of an object -> score that 95 % of the correct answers reach, by `EmbeddingSizes.version`, without and with
+reference views: up to ten views from held-out frames, 120 views from meshes."""
 
 EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
@@ -80,7 +81,7 @@ class Gallery:
         objects: name -> its views, in the order of enrolment.
         hidden: trained classes that were forgotten or replaced; no classifier answers by them.
         references: reference views of the embedding; None if it has none.
-        balanced: whether the embedding compares balanced colours, see `EmbeddingSizes`.
+        version: version of the embedding, see `EmbeddingSizes`.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
     """
@@ -90,7 +91,7 @@ class Gallery:
     hidden: tuple[str, ...] = ()
     search: str = "exact"
     references: References | None = None
-    balanced: bool = False
+    version: int = 0
 
     def __post_init__(self) -> None:
         if self.search not in ("exact", "usearch"):
@@ -181,9 +182,7 @@ class Gallery:
         Its score grows with the logarithm of the object's views between the numbers of `KEPT`.
         """
         views = [len(views.clouds) for views in self.objects.values()]
-        kept = KEPT if self.balanced else KEPT_BEFORE
-        if self.references is None:
-            kept = KEPT_WITHOUT_REFERENCES if self.balanced else KEPT_BEFORE_WITHOUT_REFERENCES
+        kept = KEPT[self.version][self.references is not None]
         odds = score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
         return (odds / (1 + odds)).round(3)
 

@@ -129,8 +129,8 @@ class ObjectGallery:
     def _set(self, stored: StoredGallery) -> None:
         """Keep a state, with what the embedding and the options add to it; references only once it has objects."""
         references = self.embedding.references if stored.gallery.objects else None
-        balanced = self.embedding.sizes.balanced
-        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references, balanced=balanced)
+        version = self.embedding.sizes.version
+        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references, version=version)
         self._stored = dataclasses.replace(stored, gallery=gallery)
 
     def check_writable(self) -> None:

@@ -26,7 +26,7 @@ from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, color_features
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, projected_features
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
@@ -35,7 +35,7 @@ from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 __all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding", "reference_views"]
 
 BASIS_SAMPLES = 2048
-"""Samples whose colours determine the principal components."""
+"""Samples whose features determine the principal components."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,20 +88,21 @@ def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -
     return LookDescriptors(each, statistics, jnp.ones((len(batch.label), 1)))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _color_features(network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
-    embeddings = batch_descriptors(batch.length, batch.color, network, config).embeddings
-    return color_features(embeddings, jnp.asarray(batch.statistics))
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _projected_features(version: int, network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
+    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    return projected_features(descriptors, jnp.asarray(batch.statistics), version)
 
 
 def _color_basis(
-    samples: Samples, network: ColorNetwork, config: DescriptorConfig, size: int, batch_size: int
+    samples: Samples, network: ColorNetwork, config: DescriptorConfig, sizes: EmbeddingSizes, batch_size: int
 ) -> NDArray[np.float32]:
-    """Return the principal components [F, size] of the colour features, not centred: projections keep cosines."""
+    """Return the principal components [F, C] of the projected features, not centred: projections keep cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
     batches = samples.batches(rows, batch_size)
-    features = np.concatenate([_color_features(network, config, batch) for batch in batches])
+    features = np.concatenate([_projected_features(sizes.version, network, config, batch) for batch in batches])
     variances, vectors = np.linalg.eigh(features @ features.T)
+    size = sizes.color
     largest = slice(-1, -size - 1, -1)
     basis = features.T @ (vectors[:, largest] / np.sqrt(np.maximum(variances[largest], 1e-6)))
     return np.pad(basis, ((0, 0), (0, size - basis.shape[1])))
@@ -196,7 +197,7 @@ def fit_embedding(
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
     n_objects = int(samples.label.max()) + 1
     embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
-    basis = _color_basis(samples, network, embedding.config, embedding.sizes.color, options.batch_size)
+    basis = _color_basis(samples, network, embedding.config, embedding.sizes, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
     further = [
         embedding.create_further(int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0]))
