@@ -47,7 +47,7 @@ def test_recordings_are_recognized(printed: Command) -> None:
     for words, count in zip(COMMANDS[:2], (FRAMES, 2), strict=True):
         assert not Path("answers.mcap").exists()
         lines = json_lines(printed(*words[1:]))
-        assert len(lines) == count and all(len(line["instances"]) >= 3 for line in lines)
+        assert len(lines) == count and all(len(line["instances"]) >= 4 for line in lines)
     assert Path("answers.mcap").is_file()
 
 
