@@ -51,7 +51,7 @@ SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are divided from other things."""
 
 ATTACHED = 0.15
-"""Least share of the border of a piece without depth, or of a shadow, along the thing that it belongs to."""
+"""Least share of the border of a piece without depth, an inner side or a shadow, along the thing it belongs to."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
@@ -241,6 +241,8 @@ def _is_hollow(
 ) -> bool:
     """Return whether the piece that is farther is the inner side of the other: concave, with the same upper rim."""
     inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
+    if borders.length[k] < ATTACHED * borders.perimeter[inner]:
+        return False
     heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
     rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
     return abs(rims[0] - rims[1]) < SAME_HEIGHT and _is_concave((labels == inner) & evidence.high, depth)
