@@ -229,12 +229,12 @@ def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
 
 def test_points_of_the_decisive_color_are_found(instance: PreparedInstance, red: ClassScores) -> None:
     cloud = red.orient(instance)
-    found = attributions.attribute_points(red, cloud, instance, 1)
+    attributed = attributions.attribute_points(red, cloud, instance, 1)
     is_red = instance.colors[:, 0] > instance.colors[:, 2]
     aligned = np.asarray(cloud.aligned.points[0])[: len(instance.points)]
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
-    assert found.values[is_red & inside].min() > 5 * np.abs(found.values[~is_red]).max()
-    assert found.faithfulness.holds and found.faithfulness.most_attributed > 0
+    assert attributed.values[is_red & inside].min() > 5 * np.abs(attributed.values[~is_red]).max()
+    assert attributed.faithfulness.holds and attributed.faithfulness.most_attributed > 0
 
 
 def test_smoothing_averages_over_neighbours() -> None:

@@ -50,8 +50,8 @@ def test_one_failing_frame_does_not_lose_the_others(
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000001", "000004"]
     coco = json.loads(coco_file.read_text())
     boxes = [10, 10, 40, 40], [60, 30, 50, 50]
-    found = sorted((entry["image_id"], entry["bbox"]) for entry in coco)
-    assert found == [(image, box) for image in (1, 4) for box in boxes]
+    instances = sorted((entry["image_id"], entry["bbox"]) for entry in coco)
+    assert instances == [(image, box) for image in (1, 4) for box in boxes]
 
 
 def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
