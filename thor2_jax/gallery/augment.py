@@ -54,7 +54,7 @@ def augmented_view(view: PreparedInstance, copy: int) -> PreparedInstance:
 def _relit(colors: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return the colours under another light: gamma, gain, colour cast, saturation, stray light and noise."""
     gamma, gain, saturation = rng.uniform(0.8, 1.25), rng.uniform(0.75, 1.25), rng.uniform(0.75, 1.3)
-    cast, veil = rng.uniform(0.94, 1.06, 3), rng.uniform(0, 0.05)
+    cast, veil = rng.uniform(0.8, 1.2, 3), rng.uniform(0, 0.05)
     values = (colors / np.float32(255)) ** np.float32(gamma) * np.float32(gain) * cast.astype(np.float32)
     grey = (values @ LUMA)[:, None]
     values = (grey + np.float32(saturation) * (values - grey)) * np.float32(1 - veil) + np.float32(veil)

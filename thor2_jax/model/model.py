@@ -114,7 +114,7 @@ class Model:
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
         """Return the least confidence [n] of an answer with each of the `names`; with `unknown_below`, it is that.
 
-        By default 97 % of the correct held-out answers to a class, and 95 % of those to an enrolled object, reach it.
+        By default 95 % of the correct held-out answers reach it.
         That of a class with an output of the classifiers is the run's own, measured on held-out views, or 0 in runs
         without one. That of other objects, and of all where the gallery alone answers, depends on the number of their
         views, see `Gallery.unknown_below`.

@@ -50,7 +50,7 @@ class Illumination(Settings):
 
     gamma: Range = limited((0.6, 1.6), 0.1, 10)
     gain: Range = limited((0.4, 1.7), 0, 10)
-    cast: float = limited(0.15, 0, 0.9)
+    cast: float = limited(0.25, 0, 0.9)
     shading: Range = limited((0.0, 1.0), 0, 1)
     saturation: Range = limited((0.4, 1.7), 0, 10)
     veil: Range = limited((0.0, 0.12), 0, 1)

@@ -43,8 +43,8 @@ class Occlusion(Settings):
         nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
     """
 
-    share: Range = limited((0.05, 0.6), 0, 0.95)
-    none: float = limited(0.3, 0, 1)
+    share: Range = limited((0.05, 0.8), 0, 0.95)
+    none: float = limited(0.2, 0, 1)
     straight: float = limited(0.3, 0, 1)
     nearer: Range = limited((1.0, 1.5), 1, 10)
 

@@ -34,7 +34,7 @@ class Segmentation(Settings):
         gap: distance between object and background otherwise, metres.
     """
 
-    pixels: Range = limited((-5.0, 4.0), -50, 50)
+    pixels: Range = limited((-8.0, 6.0), -50, 50)
     tilt: Range = limited((0.0, 70.0), 0, 75)
     touching: float = limited(0.7, 0, 1)
     gap: Range = limited((0.0, 0.5), 0, 10)
@@ -115,8 +115,8 @@ class Base(Settings):
         upright: probability that the object stands as its mesh does; otherwise it lies in a random orientation.
     """
 
-    missing: float = limited(0.3, 0, 1)
-    height: Range = limited((0.003, 0.015), 0, 0.1)
+    missing: float = limited(0.4, 0, 1)
+    height: Range = limited((0.003, 0.02), 0, 0.1)
     upright: float = limited(0.6, 0, 1)
 
 

@@ -124,11 +124,8 @@ def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> f
     return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
 
 
-KEPT = 0.97
-"""Share of the correct held-out answers whose confidence reaches the threshold of a run.
-
-Cameras are harder than held-out renderings: under them, about .95 reach it (docs/decisions.md).
-"""
+KEPT = 0.95
+"""Share of the correct held-out answers whose confidence reaches the threshold of a run."""
 
 
 def fit_calibration(

@@ -124,7 +124,7 @@ def test_empty_views_and_a_single_pixel(on: dict[str, Any]) -> None:
         assert same(augmented_view(nothing, seed, **on), nothing)
         for view in (flat_view(pixel), flat_view(pixel[:1, 6:])):
             augmented = augmented_view(view, seed, **on)
-            assert (augmented.depth > 0).sum() <= 25
+            assert (augmented.depth > 0).sum() <= 41  # dilated by 6 mm, four pixels
 
 
 def test_all_objects_from_all_sides() -> None:
@@ -135,7 +135,7 @@ def test_all_objects_from_all_sides() -> None:
         for polar in (0.0, np.pi / 2, 2.5):
             view = render_view(caster, camera_pose(0.0, polar, mesh.centre))
             shares = [(augment(view, ALL, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
-            assert 0.1 < min(shares) <= max(shares) < 1.7
+            assert 0.05 < min(shares) <= max(shares) < 2.2  # a fifth is visible, of a mask that is eroded to half
 
 
 # Illumination.
