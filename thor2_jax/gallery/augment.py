@@ -23,6 +23,9 @@ MAX_COPIES = 8
 MESH_COPIES = 1
 """Copies of each view from a mesh."""
 
+CAST, MESH_CAST = 0.06, 0.2
+"""Largest deviation from 1 of the factor of each colour channel, of views from frames and from meshes."""
+
 
 def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
     """Return copies of the views of one object.
@@ -32,30 +35,32 @@ def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[Pre
         source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view; with "frames", about `MAX_COPIES` in all,
             and none for more than that many views.
     """
-    copies = MESH_COPIES if source.startswith("mesh") else MAX_COPIES // max(len(views), 1)
-    return [augmented_view(view, copy) for view in views for copy in range(copies)]
+    of_mesh = source.startswith("mesh")
+    copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(views), 1), CAST)
+    return [augmented_view(view, copy, cast) for view in views for copy in range(copies)]
 
 
-def augmented_view(view: PreparedInstance, copy: int) -> PreparedInstance:
+def augmented_view(view: PreparedInstance, copy: int, cast: float = CAST) -> PreparedInstance:
     """Return an augmented copy of a view; it is determined by the arguments.
 
     Args:
         view: a view with at least one point.
         copy: number of the copy.
+        cast: largest deviation from 1 of the factor of each colour channel.
     """
     rng = np.random.default_rng([zlib.crc32(np.ascontiguousarray(view.colors).tobytes()), len(view.points), copy])
     points, keep = _sensed(view.points, rng), ~_cut(view.points, rng)
     if keep.sum() < MIN_POINTS:
         keep[:] = True
-    colors = _relit(view.colors, rng)
+    colors = _relit(view.colors, cast, rng)
     return PreparedInstance(view.label, points[keep], colors[keep], view.boundary[keep], view.occluded)
 
 
-def _relit(colors: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _relit(colors: NDArray[np.uint8], cast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return the colours under another light: gamma, gain, colour cast, saturation, stray light and noise."""
     gamma, gain, saturation = rng.uniform(0.8, 1.25), rng.uniform(0.75, 1.25), rng.uniform(0.75, 1.3)
-    cast, veil = rng.uniform(0.8, 1.2, 3), rng.uniform(0, 0.05)
-    values = (colors / np.float32(255)) ** np.float32(gamma) * np.float32(gain) * cast.astype(np.float32)
+    channels, veil = rng.uniform(1 - cast, 1 + cast, 3), rng.uniform(0, 0.05)
+    values = (colors / np.float32(255)) ** np.float32(gamma) * np.float32(gain) * channels.astype(np.float32)
     grey = (values @ LUMA)[:, None]
     values = (grey + np.float32(saturation) * (values - grey)) * np.float32(1 - veil) + np.float32(veil)
     values += np.float32(rng.uniform(0, 0.01)) * rng.standard_normal(values.shape, np.float32)
