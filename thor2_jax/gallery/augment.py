@@ -24,7 +24,7 @@ MESH_COPIES = 1
 """Copies of each view from a mesh."""
 
 CAST, MESH_CAST = 0.06, 0.2
-"""Largest deviation from 1 of the factor of each colour channel, of views from frames and from meshes."""
+"""Largest deviation from 1 of the factor of each colour channel, for objects from frames and for those with a mesh."""
 
 
 def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
@@ -32,8 +32,8 @@ def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[Pre
 
     Args:
         views: the views.
-        source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view; with "frames", about `MAX_COPIES` in all,
-            and none for more than that many views.
+        source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view, with colour casts up to `MESH_CAST`; with
+            "frames", about `MAX_COPIES` in all, with casts up to `CAST`, and none for more than that many views.
     """
     of_mesh = source.startswith("mesh")
     copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(views), 1), CAST)

@@ -40,7 +40,7 @@ class Illumination(Settings):
         gamma: exponent of all channels.
         gain: factor of all channels.
         cast: largest deviation from 1 of the factor of each channel. 0.1 remains of light of 3,000 K after a white
-            balance that corrects four fifths of it.
+            balance that corrects four fifths of it; the default is wider, so that networks depend less on colour.
         shading: weight of the Lambert term of one distant light from a random direction on the camera's side, less its
             mean over the view, so that only the gain changes the mean brightness.
         saturation: factor of a colour's distance from grey.

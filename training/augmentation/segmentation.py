@@ -1,4 +1,4 @@
-"""Augmentation of the mask: a few pixels too small or too large, so that points are missing or of the background.
+"""Augmentation of the mask: some pixels too small or too large, so that points are missing or of the background.
 
 The background is a plane: the table, or a wall behind. Beyond the outline only background near the object in depth is
 added: outlier removal in recognition drops the rest, a strip a few millimetres wide, as strays or as a small component.

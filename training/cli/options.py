@@ -47,7 +47,7 @@ UnknownOption = Annotated[
     typer.Option(
         "--unknown-below",
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own for trained "
-        "classes; for enrolled objects, it grows with the number of their views.",
+        "classes; for enrolled objects, it depends on the number of their views.",
     ),
 ]
 AnswerByOption = Annotated[
