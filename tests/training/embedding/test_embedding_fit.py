@@ -29,7 +29,7 @@ from training.storage.workers import IN_PROCESS
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
-OBJECTS = range(0, 40, 5)
+OBJECTS = range(2, 42, 5)  # all of their views have enough points
 CLASSES = ("a", "b")
 OPTIONS = EmbeddingFit(epochs=12, batch_size=32, rate=5e-3)
 
