@@ -1,8 +1,8 @@
 """Fit the packaged embedding on procedural objects: `python -m training.embedding.build --out FILE`.
 
-The packaged network is the result of the default options with the weaker augmentations of an earlier version, which
-separate unknown objects better there; the principal components and reference views beside it were computed later
-(benchmarks/notes/accuracy.md). On two cores that other jobs shared, it took 1,280 s: 90 s for
+The packaged network was fitted with the default options and the weaker augmentations of an earlier version: with the
+present ones, a gallery separates unknown objects less well. The principal components and reference views beside it were
+computed later (benchmarks/notes/accuracy.md). On two cores that other jobs shared, it took 1,280 s: 90 s for
 the views and 1,190 s for the fit. An interrupted build resumes from the samples in FILE.samples, which are removed at
 the end. `--meshes` adds the objects of a directory.
 """

@@ -135,7 +135,8 @@ def test_all_objects_from_all_sides() -> None:
         for polar in (0.0, np.pi / 2, 2.5):
             view = render_view(caster, camera_pose(0.0, polar, mesh.centre))
             shares = [(augment(view, ALL, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
-            assert 0.05 < min(shares) <= max(shares) < 2.2  # a fifth is visible, of a mask that is eroded to half
+            # A fifth is visible, half of it in the eroded mask, and .6 of that above the missing base.
+            assert 0.06 < min(shares) <= max(shares) < 1.7
 
 
 # Illumination.
