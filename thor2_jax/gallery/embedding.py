@@ -50,6 +50,10 @@ BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
 """Shares of the blocks in the similarity by `EmbeddingSizes.version`, before they are divided by their sum; the share
 of the persistence images in the projected block, where each kind of colours has 1. Chosen on held-out frames."""
 
+VIEW_WEIGHT, NEUTRAL_SIMILARITY = 10.0, 0.8
+"""Log-odds of an object being one of the classes for each unit of its similarity to the nearest reference view, as a
+logistic regression on held-out views weighs it; the similarity at which they stay as they are."""
+
 _METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
 
@@ -71,6 +75,7 @@ class EmbeddingSizes:
         shape: whether it has the persistence images; False in embeddings of earlier versions.
         nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
             embeddings of earlier versions, where each counts with its own.
+        views: whether the reference views take part in the classification; False in embeddings of earlier versions.
 
     Raises:
         InputError: a size is not a positive integer (`color` may be 0).
@@ -83,10 +88,11 @@ class EmbeddingSizes:
     balanced: bool = True
     shape: bool = True
     nearest: bool = True
+    views: bool = True
 
     def __post_init__(self) -> None:
         values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        flags = self.balanced, self.shape, self.nearest
+        flags = self.balanced, self.shape, self.nearest, self.views
         if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
             raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
@@ -210,20 +216,47 @@ def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) 
     return models[0](*oriented.flat).reshape(*oriented.weights.shape, -1)
 
 
-def _class_probabilities(
-    models: Sequence[EmbeddingNetwork], oriented: LookDescriptors, n_classes: int, nearest: bool
-) -> jax.Array:
+class _ClassViews(nnx.Module):
+    """The learned blocks of the reference views of the classes.
+
+    Attributes:
+        learned: [n, L], of unit length.
+        label: [n] index of the class.
+    """
+
+    def __init__(self, references: References, length: int) -> None:
+        of_class = references.label >= 0
+        learned = references.embeddings[of_class, :length].astype(np.float32)
+        self.learned = nnx.Variable(learned / np.linalg.norm(learned, axis=1, keepdims=True))
+        self.label = nnx.Variable(references.label[of_class])
+
+    def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
+        """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
+        cosines = jnp.einsum("bkl,nl->bkn", learned, self.learned[...])
+        return jnp.where(self.label[...] == label[:, None, None], cosines, -1).max(axis=-1)
+
+
+def _class_probabilities(models: Sequence[Any], oriented: LookDescriptors, n_classes: int, nearest: bool) -> jax.Array:
     """Return the probabilities [B, n_classes] of the first proxies.
 
     With `nearest`, all others are one column, with the sum that they would have if each had the logit of the nearest
-    one.
+    one. With `_ClassViews` as the last of the models, the odds of all classes together grow with the similarity of the
+    most probable one.
     """
-    logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
+    networks = [model for model in models if isinstance(model, EmbeddingNetwork)]
+    logits = jnp.stack([model.class_logits(*oriented.flat) for model in networks])
     if nearest:
         largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
         logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
-    return oriented.fuse(logits.mean(axis=0))[:, :n_classes]
+    probabilities = oriented.fuse(logits.mean(axis=0))
+    of_classes = probabilities[:, :n_classes]
+    for views in models[len(networks) :]:
+        learned = networks[0].learned(*oriented.flat).reshape(*oriented.weights.shape, -1)
+        similarity = (oriented.weights * views.similarity(learned, of_classes.argmax(axis=1))).sum(axis=1)
+        weighted = of_classes * jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
+        of_classes = weighted / (weighted.sum(axis=1) + probabilities[:, n_classes:].sum(axis=1))[:, None]
+    return of_classes
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
@@ -330,6 +363,8 @@ class Embedding:
     @functools.cached_property
     def _class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
         models = [self._embedder, *map(_split, self.further)]
+        if self.sizes.views and self.references is not None:
+            models.append(nnx.split(_ClassViews(self.references, self.sizes.learned)))
         return compiled(_class_probabilities, models, len(self.classes), self.sizes.nearest and self.distractors > 0)
 
     def embed(self, clouds: PointClouds) -> jax.Array:
@@ -420,7 +455,7 @@ class Embedding:
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
             config = DescriptorConfig.of_record(about["descriptor_config"])
-            earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest"), False)
+            earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest", "views"), False)
             sizes = EmbeddingSizes(**earlier | about["sizes"] | {"hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)

@@ -240,8 +240,8 @@ def fit_embedding(
 BACKGROUND_VIEWS = 4096
 """Views of the background; docs/decisions.md says why."""
 
-VIEWS_OF_CLASS = 64
-"""Views of each class, fewer if all classes have more than `BACKGROUND_VIEWS` together."""
+VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192
+"""Views of each class and, at most, of all classes together."""
 
 BATCH = 256
 
@@ -255,7 +255,7 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
         seed: seed for the choice of the views.
     """
     rng, n_classes = np.random.default_rng(seed), len(embedding.classes)
-    per_class = min(VIEWS_OF_CLASS, BACKGROUND_VIEWS // max(n_classes, 1))
+    per_class = min(VIEWS_OF_CLASS, CLASS_VIEWS // max(n_classes, 1))
     chosen = [_choose(samples.label == label, per_class, rng) for label in range(n_classes)]
     rows = np.concatenate([*chosen, _choose(samples.label >= n_classes, BACKGROUND_VIEWS, rng)])
     looks = (batch_looks(batch, embedding.network, embedding.config) for batch in samples.batches(rows, BATCH))
