@@ -236,27 +236,29 @@ class _ClassViews(nnx.Module):
         return jnp.where(self.label[...] == label[:, None, None], cosines, -1).max(axis=-1)
 
 
-def _class_probabilities(models: Sequence[Any], oriented: LookDescriptors, n_classes: int, nearest: bool) -> jax.Array:
+def _class_probabilities(
+    models: Sequence[Any], oriented: LookDescriptors, n_classes: int, n_networks: int, nearest: bool
+) -> jax.Array:
     """Return the probabilities [B, n_classes] of the first proxies.
 
     With `nearest`, all others are one column, with the sum that they would have if each had the logit of the nearest
-    one. With `_ClassViews` as the last of the models, the odds of all classes together grow with the similarity of the
-    most probable one.
+    one. With `_ClassViews` after the networks, the odds of all classes together grow with the similarity of the most
+    probable one.
     """
-    networks = [model for model in models if isinstance(model, EmbeddingNetwork)]
+    networks = models[:n_networks]
     logits = jnp.stack([model.class_logits(*oriented.flat) for model in networks])
     if nearest:
         largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
         logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
-    probabilities = oriented.fuse(logits.mean(axis=0))
-    of_classes = probabilities[:, :n_classes]
-    for views in models[len(networks) :]:
+    fused = oriented.fuse(logits.mean(axis=0))
+    probabilities = fused[:, :n_classes]
+    for views in models[n_networks:]:
         learned = networks[0].learned(*oriented.flat).reshape(*oriented.weights.shape, -1)
-        similarity = (oriented.weights * views.similarity(learned, of_classes.argmax(axis=1))).sum(axis=1)
-        weighted = of_classes * jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
-        of_classes = weighted / (weighted.sum(axis=1) + probabilities[:, n_classes:].sum(axis=1))[:, None]
-    return of_classes
+        similarity = (oriented.weights * views.similarity(learned, probabilities.argmax(axis=1))).sum(axis=1)
+        probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
+        probabilities /= (probabilities.sum(axis=1) + fused[:, n_classes:].sum(axis=1))[:, None]
+    return probabilities
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
@@ -363,9 +365,10 @@ class Embedding:
     @functools.cached_property
     def _class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
         models = [self._embedder, *map(_split, self.further)]
+        static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
         if self.sizes.views and self.references is not None:
             models.append(nnx.split(_ClassViews(self.references, self.sizes.learned)))
-        return compiled(_class_probabilities, models, len(self.classes), self.sizes.nearest and self.distractors > 0)
+        return compiled(_class_probabilities, models, *static)
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
@@ -389,7 +392,10 @@ class Embedding:
         """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
 
         They are the geometric mean over the networks and over the looks, by their weights. With `sizes.nearest`, every
-        distractor has the logit of the nearest one, for each network and look.
+        distractor has the logit of the nearest one, for each network and look. With `sizes.views`, the odds of all
+        classes are multiplied by exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between
+        the learned blocks of a look and of a reference view of the most probable class, averaged over the looks (Sun et
+        al., "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022).
 
         Args:
             oriented: K looks at clouds, described by this embedding's descriptor.

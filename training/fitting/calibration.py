@@ -152,17 +152,13 @@ def fit_calibration(
     chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet
-    features = answer_features(fused, probabilities[EMBEDDING])
     correct, known = fused.argmax(axis=1) == label, label < len(run.classes)
     accuracy = float(correct.sum() / max(known.sum(), 1))  # correct answers are to known objects
     if known.all() or not correct.any():
         return None, accuracy
-    of_known = _logistic(features[:, 1], known, "balanced")
-    if correct[known].all():  # nothing tells when a known object is named incorrectly; unknown ones still are
-        calibration = Calibration(MAX_ODDS, 0.0, *of_known, unknown_below=0.0)
-    else:
-        of_correct = _logistic(features[known, 0], correct[known])
-        calibration = Calibration(*of_correct, *of_known, unknown_below=0.0)
+    odds = answer_features(fused, probabilities[EMBEDDING])[:, 1]
+    calibration = Calibration(MAX_ODDS, 0.0, *_logistic(odds, known, "balanced"), unknown_below=0.0)
+    if not correct[known].all():
         score = logit(calibration.score(fused, probabilities[EMBEDDING]))
         bias, factor = _logistic(score[known], correct[known])
         if factor > 0:  # otherwise the confidence would not grow with the score

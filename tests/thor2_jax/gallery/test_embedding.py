@@ -16,6 +16,7 @@ from helpers import SMALL_CONFIG
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
+from thor2_jax.gallery.references import BACKGROUND, References
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
 
@@ -81,6 +82,34 @@ def test_class_probabilities_are_geometric_means(nearest: bool, clouds: thor2.Po
     assert np.abs(means[0] - means[1]).max() > 0.1
     expected = scipy.special.softmax(np.mean(means, axis=0), axis=1)[:, :2]
     np.testing.assert_allclose(actual, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("answer", [0, 1])
+def test_nearest_views_of_the_answered_class_raise_the_odds(answer: int, clouds: thor2.PointClouds) -> None:
+    embedding = ensemble()
+    if answer:  # exchange the classes
+        for model in (embedding.model, *embedding.further):
+            model.proxies[...] = model.proxies[...][:, [1, 0, 2, 3, 4]]
+    weights = np.array([[1, 0], [0.25, 0.75], [0.5, 0.5]], np.float32)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
+    oriented = dataclasses.replace(oriented, weights=jnp.asarray(weights))
+    before = np.asarray(embedding.class_probabilities(oriented), np.float64)
+    assert (before.argmax(axis=1) == answer).all()
+
+    views, label = np.random.default_rng(2).normal(size=(6, embedding.size)), np.array([0, 1, BACKGROUND, 1, 0, 0])
+    references = References(views.astype(np.float16), label.astype(np.int32), ("a", "b"))
+    with_views = dataclasses.replace(embedding, references=references)
+    learned, of_views = np.asarray(embedding.embed_oriented(oriented, clouds))[..., :8], views[:, :8]
+    norms = np.linalg.norm(learned, axis=-1)[..., None] * np.linalg.norm(of_views, axis=1)
+    cosines = np.einsum("bkl,nl->bkn", learned, of_views) / norms
+    nearest = (cosines[..., label == answer].max(axis=-1) * weights).sum(axis=1)
+    assert (nearest < (cosines.max(axis=-1) * weights).sum(axis=1)).any()
+    odds = before / (1 - before.sum(axis=1, keepdims=True)) * np.exp(10 * (nearest - 0.8))[:, None]
+    np.testing.assert_allclose(
+        with_views.class_probabilities(oriented), odds / (1 + odds.sum(axis=1, keepdims=True)), rtol=0.02
+    )
+    without = dataclasses.replace(with_views, sizes=dataclasses.replace(SIZES, views=False))
+    assert np.array_equal(without.class_probabilities(oriented), np.asarray(before, np.float32))
 
 
 def test_a_file_holds_all_networks(clouds: thor2.PointClouds, tmp_path: Path) -> None:
