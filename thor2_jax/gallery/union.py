@@ -85,9 +85,10 @@ class ClassUnion:
     def combine(self, probabilities: Values | None, scores: Values) -> Values:
         """Combine the confidences of the classifiers with the scores of the gallery.
 
-        What the classifiers leave to 1, the probability that their answer is not right, is divided among the enrolled
-        objects, by the odds of their scores, and unknown objects, with odds of 1. All values are then divided by one
-        sum. So an object takes probability only where its score is high, and little from a confident answer.
+        What the classifiers leave to 1, the probability that their answer is not right, is divided between an enrolled
+        object, by the odds of its score, and unknown objects, with odds of 1. The confidence in a trained class is
+        divided by the same sum, of the best object. So an object takes probability only where its score is high, and
+        little from a confident answer; and its own confidence does not depend on other enrolled objects that are alike.
 
         Args:
             probabilities: [B, C], fused; None if the gallery alone answers.
@@ -99,5 +100,5 @@ class ClassUnion:
         nothing: Values = np.zeros((len(scores), len(self.names)))
         trained = nothing if probabilities is None else self.of_classifiers(probabilities)
         rest = (1 - trained.max(axis=1, keepdims=True, initial=0)).clip(0)
-        enrolled = rest * score_odds(self.of_gallery(scores))
-        return (trained + enrolled) / (1 + enrolled.sum(axis=1, keepdims=True))
+        odds = rest * score_odds(self.of_gallery(scores))
+        return trained / (1 + odds.max(axis=1, keepdims=True, initial=0)) + odds / (1 + odds)
