@@ -6,9 +6,10 @@ answer is the product of two logistic functions,
 
     score = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
 
-The two kinds of objects have equal weights in the fit, so that the score separates them well. The confidence is a third
-logistic function, of the log-odds of the score: the share of correct answers to known objects with this score (Platt,
-1999). All three are fitted by `training` on views that no network was trained on.
+In new runs the first one is constant, since the answer to an object that looks like two classes is not one to an unknown
+object. The two kinds of objects have equal weights in the fit, so that the score separates them well. The confidence is a
+third logistic function, of the log-odds of the score: the share of correct answers to known objects with this score
+(Platt, 1999). They are fitted by `training` on views that no network was trained on.
 """
 
 import dataclasses
@@ -47,7 +48,7 @@ class Calibration:
 
     Attributes:
         correct_bias: log-odds of a correct answer, for a known object whose first feature is 0.
-        correct_factor: factor of the first feature, the fused log-odds of the answer.
+        correct_factor: factor of the first feature, the fused log-odds of the answer; 0 in new runs.
         known_bias: log-odds of a known object where the second feature is 0.
         known_factor: factor of the second feature, the embedding's log-odds of all classes against the distractors.
         unknown_below: confidence that 95 % of the correct held-out answers reach (97 % in runs of earlier versions).
