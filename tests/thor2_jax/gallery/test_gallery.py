@@ -69,7 +69,7 @@ def test_thresholds_grow_with_the_views_of_each_object() -> None:
     balanced = dataclasses.replace(with_references, version=1)
     odds = (np.array([0.17, 0.24, 0.27, 0.29]) / 0.2) ** 3
     np.testing.assert_allclose(balanced.unknown_below[[0, 2, 4, 6]], odds / (1 + odds), atol=6e-4)
-    odds = (np.array([0.15, 0.19, 0.205, 0.215, 0.22]) / 0.2) ** 3
+    odds = (np.array([0.145, 0.235, 0.25, 0.305, 0.39]) / 0.2) ** 3
     latest = dataclasses.replace(with_references, version=2)
     np.testing.assert_allclose(latest.unknown_below[[0, 2, 4, 6, 7]], odds / (1 + odds), atol=6e-4)
     assert Gallery("fingerprint").unknown_below.shape == (0,)

@@ -118,21 +118,21 @@ CALIBRATION = dataclasses.asdict(Calibration(0.0, 1.0, 0.0, 1.0, unknown_below=0
 def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embedding) -> None:
     """A trained class has the run's threshold, an object that of its views; brick has two, and book one.
 
-    The scores .2115 and .18 have the odds (.2115 / .2)^3 and (.18 / .2)^3, hence .542 and .422.
+    The scores .3118 and .255 have the odds (.3118 / .2)^3 and (.255 / .2)^3, hence .791 and .675.
     """
     calibrated = taught(dataclasses.replace(run, record={"calibration": CALIBRATION}), embedding)
     calibrated.enroll("b", [frame(RED)], extend=True)
     calibrated.enroll("c", [frame(RED)], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
-    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.542, 0.422, 0.422]
-    assert calibrated.thresholds("gallery")[1:].tolist() == [0.422, 0.542, 0.422, 0.422]
-    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.542, 0.422]
+    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.791, 0.675, 0.675]
+    assert calibrated.thresholds("gallery")[1:].tolist() == [0.675, 0.791, 0.675, 0.675]
+    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.791, 0.675]
     explicit = taught(run, embedding, unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
     assert thor2.Recognizer(run).model.thresholds().tolist() == [0, 0, 0]
 
 
-NAMED = {0.42: [None, None], 0.43: [None, "book"], 0.54: [None, "book"], 0.55: ["brick", "book"]}
+NAMED = {0.67: [None, None], 0.68: [None, "book"], 0.79: [None, "book"], 0.8: ["brick", "book"]}
 """Score -> the name of an instance that has it for the brick, and of one that has it for the book."""
 
 
@@ -140,7 +140,7 @@ NAMED = {0.42: [None, None], 0.43: [None, "book"], 0.54: [None, "book"], 0.55: [
 def test_a_gallery_alone_rejects_unknown_objects(
     unknown_below: float | None, embedding: Embedding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Values as given: the brick has two views and is named from .542, the book has one and is named from .422."""
+    """Values as given: the brick has two views and is named from .791, the book has one and is named from .675."""
     instance = instance_view(CLUTTER, 1, 2.5)
     recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
     _, inference = recognizer.infer([instance])
