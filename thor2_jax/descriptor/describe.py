@@ -26,9 +26,8 @@ from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_strips, persistence_images
-from thor2_jax.descriptor.slicing import strips_of_cloud
+from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips

@@ -3,6 +3,10 @@
 `strips_of_cloud` turns one aligned cloud of any number of points into tables of a fixed size. The paper's rule, and
 that of the authors' released code (`DescriptorConfig.released`), are in this module, and the soft one in `relaxation`.
 
+A colour belongs to one or more regions of the network (paper, "Color network"). The 140,608 colours of the grid have
+only 62 different sets of regions, so a point carries the number of its region set; region weights are applied after
+points have been counted.
+
 The released code rounds x and y to 0.01 and z to 0.1, half to even, in float64. Slices are the levels of z that occur,
 renumbered from 0; a strip is numbered by its upper edge; colour vectors are divided by their strip's number of points.
 """
@@ -15,12 +19,56 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from colornet import ColorNetwork
+from colornet.grid import GRID_LEVELS, GRID_STEP
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.types import Strips
 
-__all__ = ["slices_and_strips", "strip_births", "strips_of_cloud"]
+__all__ = ["RegionSets", "color_sets", "region_sets", "slices_and_strips", "strip_births", "strips_of_cloud"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RegionSets:
+    """The K different sets of regions that the colours of a network belong to.
+
+    Attributes:
+        of_color: [140608] unsigned integers, region set of each grid colour, in the smallest type so that the table
+            stays in a cache.
+        weights: [K, R] float32, weight 1/m in each of the m regions of a set; rows sum to 1.
+    """
+
+    of_color: jax.Array
+    weights: jax.Array
+
+
+def region_sets(network: ColorNetwork) -> RegionSets:
+    """Return the region sets of a network as device arrays."""
+    bits, of_color = np.unique(network.region_bits, return_inverse=True)
+    member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
+    weights = member / member.sum(axis=1, keepdims=True)
+    # By NumPy: JAX would compile a program for each conversion.
+    return RegionSets(
+        jax.device_put(of_color.astype(np.min_scalar_type(len(bits)))), jax.device_put(weights.astype(np.float32))
+    )
+
+
+def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
+    """Return the region set of each colour, that of the nearest grid colour.
+
+    Args:
+        colors: [..., 3] float32 sRGB in [0, 1]; rounded to 8 bits first, halves up.
+        sets: region sets of the network.
+
+    Returns:
+        [...] int32, rows of `sets.weights`.
+    """
+    eight_bit = jnp.floor(colors * 255 + 0.5).astype(jnp.int32)
+    level = (eight_bit + GRID_STEP // 2) // GRID_STEP
+    color = (level[..., 0] * GRID_LEVELS + level[..., 1]) * GRID_LEVELS + level[..., 2]
+    return sets.of_color.at[color].get(mode="clip").astype(jnp.int32)
+
 
 _COORDINATE_LIMIT = 2.0**20
 """Coordinates are clipped to this, far beyond any descriptor, so that hundredths of them fit into int32."""

@@ -108,18 +108,6 @@ def oriented(normalization: Normalization) -> tuple[jax.Array, jax.Array]:
     return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), first_end != last_end
 
 
-@jax.jit
-def _view_normalize(clouds: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    def one(cloud: PointClouds) -> PointClouds:
-        normalization = boxed(cloud, sigma_s)
-        points, camera = _place(
-            oriented(normalization)[0], normalization.points, normalization.mask, normalization.camera
-        )
-        return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
-
-    return jax.vmap(one)(clouds)
-
-
 def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Rotate each cloud to the axes of its minimal box, and translate it to the first octant.
 
@@ -145,7 +133,8 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
     Returns:
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
     """
-    return _view_normalize(clouds, _sigma_s_and_alpha(config, parameters)[0])
+    sigma_s, _ = _sigma_s_and_alpha(config, parameters)
+    return _normalized_and_turned(clouds, sigma_s, jnp.zeros_like(sigma_s))
 
 
 def _about_y(alpha: ArrayLike) -> jax.Array:
@@ -184,20 +173,24 @@ def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: Arra
     return points.T, camera
 
 
+def _normalized_and_turned(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> PointClouds:
+    points, camera = _align(clouds, sigma_s, alpha)
+    return dataclasses.replace(clouds, points=points, camera=camera)  # compiled, it would copy the other fields
+
+
 @jax.jit
 def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         normalization = boxed(cloud, sigma_s)
         points, camera = place_aligned(oriented(normalization)[0], normalization, alpha)
-        return points[: len(cloud.mask)], camera  # the other fields would be copied
+        return points[: len(cloud.mask)], camera
 
     return jax.vmap(one)(clouds)
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing."""
-    points, camera = _align(clouds, *_sigma_s_and_alpha(config, parameters))
-    return dataclasses.replace(clouds, points=points, camera=camera)
+    return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 
 
 @partial(jax.jit, static_argnums=1)

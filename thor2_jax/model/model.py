@@ -21,8 +21,7 @@ from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.classifier import EMBEDDING, RunClassifiers
-from thor2_jax.model.confidence import Calibration
-from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
+from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy, check_answer_by
 from thor2_jax.model.run_directory import TrainedRun
 

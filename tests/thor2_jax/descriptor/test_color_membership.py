@@ -5,7 +5,7 @@ import numpy as np
 from helpers import as_8_bit
 
 import colornet
-from thor2_jax.descriptor.color_membership import color_sets, region_sets
+from thor2_jax.descriptor.slicing import color_sets, region_sets
 
 NETWORK = colornet.load_default()
 

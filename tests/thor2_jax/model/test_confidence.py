@@ -8,8 +8,7 @@ import pytest
 from helpers import untrained_embedding_run
 
 import thor2_jax as thor2
-from thor2_jax.model.confidence import Calibration, answer_features
-from thor2_jax.model.fusion import FUSION_RULES, FusionRule
+from thor2_jax.model.fusion import FUSION_RULES, Calibration, FusionRule, answer_features
 
 FUSED = np.array([[0.7, 0.2, 0.1], [0.2, 0.2, 0.6]])
 EMBEDDED = np.array([[0.4, 0.5, 0.0], [0.01, 0.0, 0.001]])
