@@ -3,10 +3,9 @@
 Names are imported when they are first used, so that importing the package does not import JAX.
 """
 
-import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-import thor2_jax.jax_version  # noqa: F401  first: it refuses versions of jax that give wrong numbers
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
 
@@ -55,6 +54,13 @@ else:
 
 
 __version__ = "0.1.0"
+
+for _package in ("jax", "jaxlib"):  # pyproject.toml excludes it, too, but an installer only warns of a later upgrade
+    if importlib.metadata.version(_package) == "0.10.2":
+        raise ImportError(
+            f"{_package} 0.10.2 is not supported: it computes rotations of more than 32,768 points wrongly on CPU "
+            "(https://github.com/jax-ml/jax/issues/39103); install the versions in constraints.txt, or another 0.10"
+        )
 
 __all__ = [
     "ColorTransform",

@@ -12,8 +12,6 @@ renumbered from 0; a strip is numbered by its upper edge; colour vectors are div
 """
 
 import dataclasses
-from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -101,31 +99,14 @@ def slices_and_strips(
     return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
     """Return the least and the greatest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
 
-    Points whose segment number is `n_segments` or more are dropped. The gradient of an extreme reaches exactly one
-    point, even if several points tie.
+    Points whose segment number is `n_segments` or more are dropped. Points that tie share the gradient of an extreme.
     """
     keys = jnp.stack([-y, y], axis=-1)
     best = jnp.full((n_segments, 2), -jnp.inf, y.dtype).at[segment].max(keys, mode="drop")
     return -best[:, 0], best[:, 1]
-
-
-@_extremes.defjvp
-def _extremes_jvp(n_segments: int, primals: Any, tangents: Any) -> Any:
-    y, segment = primals
-    extremes = _extremes(y, segment, n_segments)
-    row = jnp.minimum(segment, n_segments - 1)
-    number = jnp.arange(len(y), dtype=jnp.int32)
-
-    def tangent(values: jax.Array) -> jax.Array:
-        candidate = jnp.where(y == values[row], number, -1)
-        index = jnp.full(n_segments, -1, jnp.int32).at[segment].max(candidate, mode="drop")
-        return jnp.where(index >= 0, tangents[0][jnp.maximum(index, 0)], 0)
-
-    return extremes, tuple(tangent(values) for values in extremes)
 
 
 def strips_of_cloud(

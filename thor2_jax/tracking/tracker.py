@@ -18,8 +18,8 @@ would be: a track whose frames all have the same probabilities has the confidenc
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol, Self
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Self
 
 import jax
 import numpy as np
@@ -30,10 +30,12 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, gallery_scores
-from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
+
+if TYPE_CHECKING:
+    from thor2_jax.recognizer import Recognizer
 
 __all__ = [
     "FusedEvidence",
@@ -183,17 +185,6 @@ class TrackedRecognition(Recognition):
         return dataclasses.replace(self, **{name: getattr(other, name) for name in changed})
 
 
-class FrameRecognizer(Protocol):
-    """The part of a recognizer that a tracker uses, see `Recognizer`."""
-
-    @property
-    def model(self) -> Model: ...
-
-    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]: ...
-
-    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]: ...
-
-
 class _Track:
     """An object that is followed.
 
@@ -223,7 +214,7 @@ class Tracker:
     With poses, each view of an object is described alone and as one cloud with those before it.
     """
 
-    def __init__(self, recognizer: FrameRecognizer) -> None:
+    def __init__(self, recognizer: "Recognizer") -> None:
         """Start without tracks; `Recognizer.track` calls this."""
         self._recognizer = recognizer
         self._tracks: list[_Track] = []

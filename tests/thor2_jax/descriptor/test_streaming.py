@@ -48,7 +48,7 @@ def test_clouds_are_read_two_batches_ahead_at_most() -> None:
 
 def test_bad_input() -> None:
     with pytest.raises(thor2.InputError, match="batch is 0"):
-        describe_stream(clouds(2), NETWORK, CONFIG, batch=0)
+        next(describe_stream(clouds(2), NETWORK, CONFIG, batch=0))
     bad = [*clouds(2), (np.full((3, 3), np.nan), np.zeros((3, 3), np.uint8))]
     with pytest.raises(thor2.InputError, match="2"):
         list(describe_stream(bad, NETWORK, CONFIG, capacity=512, batch=4))
