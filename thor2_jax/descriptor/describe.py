@@ -98,7 +98,7 @@ def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, 
         looks: number of looks at each cloud that the function describes.
     """
     n_clouds, capacity = clouds.mask.shape
-    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * looks))
+    size = max(1, MAX_LARGE_CHUNK_POINTS // max(capacity * looks, 1))
     if jax.default_backend() != "cpu" or n_clouds <= size:
         return function(clouds)
     return _map_slices(function, clouds, size)

@@ -21,7 +21,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
-from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
+from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
@@ -85,11 +85,6 @@ class LookDescriptors:
         return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
 
-def _check_count(count: int) -> None:
-    if count not in LOOK_COUNTS:
-        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
-
-
 @partial(jax.jit, static_argnums=3)
 def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> tuple[PointClouds, jax.Array]:
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
@@ -97,10 +92,10 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
 
     def placed(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
-        normalization = boxed(cloud, sigma_s)
-        rotation, end_is_occluded = oriented(normalization)
+        normalization = normalization_of(cloud, sigma_s)
+        rotation = normalization.rotation
         # Where the occlusion boundary decides which end comes first, there is no half turn.
-        both = jnp.stack([rotation, jnp.where(end_is_occluded, rotation, half_turn @ rotation)])
+        both = jnp.stack([rotation, jnp.where(normalization.end_is_occluded, rotation, half_turn @ rotation)])
         return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
     masks, colors = [clouds.mask], clouds.colors
@@ -139,7 +134,8 @@ def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
     Raises:
         InputError: `count` is another number.
     """
-    _check_count(count)
+    if count not in LOOK_COUNTS:
+        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
     if count == 1:
         return align(clouds, config), jnp.ones((len(clouds.mask), 1))
     return _looks(clouds, np.float32(config.sigma_s), np.float32(config.alpha), count)
@@ -185,7 +181,6 @@ def describe_looks(
         InputError: `count` is not one of `LOOK_COUNTS`.
     """
     count = config.looks if count is None else count
-    _check_count(count)
 
     def describe_chunk(chunk: PointClouds) -> LookDescriptors:
         aligned, weights = aligned_looks(chunk, config, count)

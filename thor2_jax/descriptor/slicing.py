@@ -94,9 +94,17 @@ def slices_and_strips(
     Returns:
         Two [N] int32 arrays. Numbers may lie outside the descriptor; those of padding are meaningless.
     """
-    if config.convention == "released":
-        return _released_slices_and_strips(x, z, mask, config)
-    return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
+    if config.convention == "paper":
+        return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
+    # Rounded to 0.01, x is k / 100. The first edge j / 40 at or above it has j = ceil(2 k / 5), in integer arithmetic.
+    strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
+    level = _round_scaled(z, 10).astype(jnp.int32)
+    # Levels from twice the number of slices on keep their own number, which is outside the descriptor.
+    n_levels = 2 * config.n_slices
+    ranked = (level >= 0) & (level < n_levels)
+    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")
+    rank = jnp.cumsum(occurs) - 1
+    return jnp.where(ranked, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
 
 
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
@@ -162,21 +170,6 @@ def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, 
     cell = segment * n_sets + region_set
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
     return jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
-
-
-def _released_slices_and_strips(
-    x: jax.Array, z: jax.Array, mask: jax.Array, config: DescriptorConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Return the slice and strip numbers of points; arguments and results as in `slices_and_strips`."""
-    # Rounded to 0.01, x is k / 100. The first edge j / 40 at or above it has j = ceil(2 k / 5), in integer arithmetic.
-    strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
-    level = _round_scaled(z, 10).astype(jnp.int32)
-    # Levels from twice the number of slices on keep their own number, which is outside the descriptor.
-    n_levels = 2 * config.n_slices
-    ranked = (level >= 0) & (level < n_levels)
-    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")
-    rank = jnp.cumsum(occurs) - 1
-    return jnp.where(ranked, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
 
 
 def _released_values(strips: Strips) -> Strips:
