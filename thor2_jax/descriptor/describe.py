@@ -110,8 +110,7 @@ def _map_slices(function: Callable[[PointClouds], T], clouds: PointClouds, size:
 
 
 def _concatenate(results: Sequence[T]) -> T:
-    concatenated: T = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
-    return concatenated
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
 
 
 @functools.lru_cache(maxsize=8)

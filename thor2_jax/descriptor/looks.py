@@ -49,8 +49,7 @@ class LookDescriptors:
     @property
     def first(self) -> Descriptors:
         """The descriptors [B, ...] of the first look, the paper's."""
-        first: Descriptors = jax.tree.map(lambda a: a[:, 0], self.each)
-        return first
+        return jax.tree.map(lambda a: a[:, 0], self.each)
 
     @property
     def overflow(self) -> jax.Array:
@@ -68,10 +67,7 @@ class LookDescriptors:
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
         """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
-        flat: tuple[Descriptors, jax.Array] = jax.tree.map(
-            lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
-        )
-        return flat
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics))
 
     @jax.jit
     def with_balanced(self, clouds: PointClouds) -> "LookDescriptors":

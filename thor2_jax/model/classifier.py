@@ -149,9 +149,9 @@ class RunClassifiers(dict[str, Classifier]):
     @classmethod
     def compiled(cls, models: Mapping[Feature, MLP], embedding: Classifier | None) -> Self:
         """Return compiled classifiers of MLPs, and the one of the embedding; None if it does not know the classes."""
-        classifiers = cls()
-        for name, model in models.items():
-            classifiers[name] = compiled(_fused_probabilities, [nnx.split(model)], name)
+        classifiers = cls(
+            (name, compiled(_fused_probabilities, [nnx.split(each)], name)) for name, each in models.items()
+        )
         if embedding is not None:
             classifiers[EMBEDDING] = embedding
         return classifiers
