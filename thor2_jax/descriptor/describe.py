@@ -113,13 +113,6 @@ def _concatenate(results: Sequence[T]) -> T:
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
 
 
-@functools.lru_cache(maxsize=8)
-def _region_sets(network: ColorNetwork) -> RegionSets:
-    # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
-    with jax.ensure_compile_time_eval():
-        return region_sets(network)
-
-
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 
@@ -169,7 +162,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: static.
     """
     _check_batch(aligned)
-    return strips_by_sets(aligned, _region_sets(network), config)
+    return strips_by_sets(aligned, region_sets(network), config)
 
 
 def describe_strips(

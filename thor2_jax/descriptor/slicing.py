@@ -12,6 +12,7 @@ renumbered from 0; a strip is numbered by its upper edge; colour vectors are div
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -41,15 +42,16 @@ class RegionSets:
     weights: jax.Array
 
 
+@functools.lru_cache(maxsize=8)
 def region_sets(network: ColorNetwork) -> RegionSets:
     """Return the region sets of a network as device arrays."""
     bits, of_color = np.unique(network.region_bits, return_inverse=True)
     member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
     weights = member / member.sum(axis=1, keepdims=True)
-    # By NumPy: JAX would compile a program for each conversion.
-    return RegionSets(
-        jax.device_put(of_color.astype(np.min_scalar_type(len(bits)))), jax.device_put(weights.astype(np.float32))
-    )
+    fields = of_color.astype(np.min_scalar_type(len(bits))), weights.astype(np.float32)
+    # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
+    with jax.ensure_compile_time_eval():
+        return RegionSets(*jax.device_put(fields))  # of NumPy arrays: JAX would compile a program for each conversion
 
 
 def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.describe import CHUNKS_PER_STEP, chunk_size, map_chunks, map_large_chunks
+from thor2_jax.descriptor.describe import CHUNKS_PER_STEP, chunk_size, map_chunks
 
 
 def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
@@ -37,18 +37,3 @@ def test_results_equal_those_of_the_whole_batch(count: int) -> None:
     assert max(sizes) <= 16 and len(sizes) <= 2 * CHUNKS_PER_STEP
     np.testing.assert_array_equal(results["x"], np.arange(count))
     np.testing.assert_array_equal(results["points"], clouds.points)
-
-
-@pytest.mark.parametrize(("count", "sizes"), [(31, [31]), (32, [32]), (33, [32, 1]), (70, [32, 32, 6])])
-def test_large_chunks_count_points_in_all_orientations(count: int, sizes: list[int]) -> None:
-    seen: list[int] = []
-
-    def keep(chunk: thor2.PointClouds) -> dict[str, jax.Array]:
-        seen.append(len(chunk.mask))
-        return {"points": chunk.points, "mask": chunk.mask}
-
-    clouds = clouds_of(count, 4096)
-    results = map_large_chunks(keep, clouds, 4)
-    assert seen == sizes
-    np.testing.assert_array_equal(results["points"], clouds.points)
-    np.testing.assert_array_equal(results["mask"], clouds.mask)
