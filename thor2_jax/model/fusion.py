@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit, softmax
 
 from thor2_jax.errors import InputError
-from thor2_jax.model.run_record import stored_value
 
 __all__ = [
     "DEFAULT_RULE",
@@ -138,15 +137,6 @@ class Calibration:
             raise InputError(f"calibration is {values}; expected finite numbers")
         if not 0 <= self.unknown_below <= 1:
             raise InputError(f"calibration: unknown_below is {self.unknown_below}; expected a confidence from 0 to 1")
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> "Calibration | None":
-        """Return the calibration in the record of a run; None if it has none.
-
-        Raises:
-            InputError: it is damaged.
-        """
-        return stored_value(cls, "calibration", record, "train the run again")
 
     def score(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
         """Return the score [B] of the most probable class, below 1; the arguments are those of `answer_features`."""

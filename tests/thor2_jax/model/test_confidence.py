@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import untrained_embedding_run
+from helpers import untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.fusion import FUSION_RULES, Calibration, FusionRule, answer_features
+from thor2_jax.model.model import Model
 
 FUSED = np.array([[0.7, 0.2, 0.1], [0.2, 0.2, 0.6]])
 EMBEDDED = np.array([[0.4, 0.5, 0.0], [0.01, 0.0, 0.001]])
@@ -41,8 +42,7 @@ def test_the_score_is_below_one() -> None:
 
 def test_records_without_a_third_function_are_read() -> None:
     record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
-    calibration = Calibration.of_record({"calibration": record})
-    assert calibration is not None
+    calibration = Calibration(**record)
     np.testing.assert_allclose(calibration.confidence(FUSED, EMBEDDED), CALIBRATION.score(FUSED, EMBEDDED))
 
 
@@ -58,8 +58,8 @@ def test_records_without_a_third_function_are_read() -> None:
 )
 def test_damaged_records_are_refused(record: Any) -> None:
     with pytest.raises(thor2.InputError, match="calibration"):
-        Calibration.of_record({"calibration": record})
-    assert Calibration.of_record({}) is None
+        Model.of_run(untrained_run("ab", record={"calibration": record})).calibration  # noqa: B018
+    assert Model.of_run(untrained_run("ab")).calibration is None
 
 
 def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
