@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.files import check_output_directory
 from thor2_jax.model.classifier import MLP, feature_of
 from thor2_jax.model.run_directory import TrainedRun, input_size, save_run

@@ -429,9 +429,7 @@ def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path
         window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
         mask[window] = label
         color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
-    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-    frame = thor2.RGBDFrame(color, depth, mask, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
-    return write_frame_files(directory, frame, objects)
+    return write_frame_files(directory, dataclasses.replace(tilted(mask), color=color), objects)
 
 
 def frame_options(folder: Path, **changes: object) -> list[object]:

@@ -3,25 +3,43 @@
 Names are imported when they are first used, so that importing the package does not import JAX.
 """
 
-import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-import thor2_jax.jax_version  # noqa: F401  first: it refuses versions of jax that give wrong numbers
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
-from thor2_jax.errors import InputError
+from thor2_jax.config import DESCRIPTOR_VERSION as DESCRIPTOR_VERSION
+from thor2_jax.config import DescriptorConfig as DescriptorConfig
+from thor2_jax.config import Relaxation as Relaxation
+from thor2_jax.errors import InputError as InputError
 
 if TYPE_CHECKING:
-    from thor2_jax.adaptation.color_transform import ColorTransform
-    from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
-    from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
-    from thor2_jax.explanation.explain import Explanation, explain
-    from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
-    from thor2_jax.model.recognition import Recognition
-    from thor2_jax.recognizer import Recognizer
-    from thor2_jax.segmentation.segmenters import segment, segmented
-    from thor2_jax.tracking.tracker import TrackedRecognition, Tracker
-    from thor2_jax.transformers import Tops2Transformer, TopsTransformer
-    from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips
+    from thor2_jax.adaptation.color_transform import ColorTransform as ColorTransform
+    from thor2_jax.descriptor.describe import describe as describe
+    from thor2_jax.descriptor.describe import describe_aligned as describe_aligned
+    from thor2_jax.descriptor.describe import describe_strips as describe_strips
+    from thor2_jax.descriptor.describe import diagrams as diagrams
+    from thor2_jax.descriptor.describe import strips as strips
+    from thor2_jax.descriptor.view_normalization import align as align
+    from thor2_jax.descriptor.view_normalization import mirror as mirror
+    from thor2_jax.descriptor.view_normalization import turn as turn
+    from thor2_jax.descriptor.view_normalization import view_normalize as view_normalize
+    from thor2_jax.explanation.explain import Explanation as Explanation
+    from thor2_jax.explanation.explain import explain as explain
+    from thor2_jax.frames.frames import Intrinsics as Intrinsics
+    from thor2_jax.frames.frames import RGBDFrame as RGBDFrame
+    from thor2_jax.frames.frames import read_frame as read_frame
+    from thor2_jax.model.recognition import Recognition as Recognition
+    from thor2_jax.recognizer import Recognizer as Recognizer
+    from thor2_jax.segmentation.segmenters import segment as segment
+    from thor2_jax.segmentation.segmenters import segmented as segmented
+    from thor2_jax.tracking.tracker import TrackedRecognition as TrackedRecognition
+    from thor2_jax.tracking.tracker import Tracker as Tracker
+    from thor2_jax.transformers import Tops2Transformer as Tops2Transformer
+    from thor2_jax.transformers import TopsTransformer as TopsTransformer
+    from thor2_jax.types import Descriptors as Descriptors
+    from thor2_jax.types import Diagrams as Diagrams
+    from thor2_jax.types import Parameters as Parameters
+    from thor2_jax.types import PointClouds as PointClouds
+    from thor2_jax.types import Strips as Strips
 else:
     _MODULES = {
         "adaptation.color_transform": ("ColorTransform",),
@@ -37,6 +55,7 @@ else:
         "types": ("Descriptors", "Diagrams", "Parameters", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+    __all__ = sorted([*_MODULE_OF, "DESCRIPTOR_VERSION", "DescriptorConfig", "InputError", "Relaxation"])
     _SUBMODULES = {name.partition(".")[0] for name in _MODULES}
     _SUBMODULES |= {"capacity", "client", "export", "persistence", "plot", "testing"}
 
@@ -56,37 +75,14 @@ else:
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "ColorTransform",
-    "DESCRIPTOR_VERSION",
-    "DescriptorConfig",
-    "Descriptors",
-    "Diagrams",
-    "Explanation",
-    "InputError",
-    "Intrinsics",
-    "Parameters",
-    "PointClouds",
-    "RGBDFrame",
-    "Recognition",
-    "Recognizer",
-    "Relaxation",
-    "Strips",
-    "Tops2Transformer",
-    "TopsTransformer",
-    "TrackedRecognition",
-    "Tracker",
-    "align",
-    "describe",
-    "describe_aligned",
-    "describe_strips",
-    "diagrams",
-    "explain",
-    "mirror",
-    "read_frame",
-    "segment",
-    "segmented",
-    "strips",
-    "turn",
-    "view_normalize",
-]
+NEWEST_SERIES = (0, 10)
+"""Newest series of jax that the tests have run on. pyproject.toml has the same rule; a later upgrade may ignore it."""
+
+for _package in ("jax", "jaxlib"):
+    _version = importlib.metadata.version(_package)
+    if _version == "0.10.2" or tuple(map(int, _version.split(".")[:2])) > NEWEST_SERIES:
+        raise ImportError(
+            f"{_package} {_version} is not supported: 0.10.2 computes rotations of more than 32,768 points wrongly on "
+            "CPU (https://github.com/jax-ml/jax/issues/39103), and series after 0.10 are not tested; install the "
+            "versions in constraints.txt, or another 0.10"
+        )

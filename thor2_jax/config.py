@@ -8,6 +8,7 @@
 
 import dataclasses
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -25,10 +26,14 @@ _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "relea
 
 
 def _is_finite(value: object) -> bool:
-    try:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer beyond the largest float
-        return False
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _check_positive(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if not (_is_finite(value) and value > 0):
+            raise InputError(f"{type(config).__name__}.{name} is {value!r}; expected a positive number")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +56,7 @@ class Relaxation:
     color: float = 1.0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not (_is_finite(value) and value > 0):
-                raise InputError(f"Relaxation.{field.name} is {value!r}; expected a positive number")
+        _check_positive(self, "slice", "strip", "extremum", "color")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,9 +104,7 @@ class DescriptorConfig:
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected one of {allowed}")
-        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight"):
-            if not (_is_finite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected a positive number")
+        _check_positive(self, "sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight")
         for name in ("n_slices", "n_strips", "image_size"):
             if type(getattr(self, name)) is not int or getattr(self, name) < 1:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected a positive integer")
@@ -149,6 +149,11 @@ class DescriptorConfig:
             orientations = stored.pop("orientations")
             stored["looks"] = 2 if orientations == 4 else orientations
         return cls(**stored, relaxation=None if relaxation is None else Relaxation(**relaxation))
+
+    @property
+    def uses_rim(self) -> bool:
+        """Whether one of the looks is without the points near the contour of the mask."""
+        return self.looks == 4
 
     @property
     def window(self) -> float:

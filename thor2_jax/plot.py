@@ -74,28 +74,28 @@ def _check_points(points: ArrayLike, colors: ArrayLike) -> tuple[NDArray[Any], N
     return xyz, np.clip(rgb / 255 if rgb.dtype == np.uint8 else rgb, 0, 1)
 
 
-def _paint(colors: NDArray[np.float64], values: ArrayLike | None, scale: ScalarMappable | None) -> NDArray[Any]:
-    if values is None:
-        return colors
-    painted = np.asarray(values, float)
-    if painted.shape != (len(colors),):
-        raise InputError(f"values is {list(painted.shape)}; expected [{len(colors)}], one value for each point")
-    return np.asarray((scale or attribution_colors(painted)).to_rgba(painted))
-
-
 def _scatter(
-    ax: Axes, places: NDArray[Any], nearness: NDArray[Any], paint: NDArray[Any], values: ArrayLike | None, size: float
+    ax: Axes,
+    places: NDArray[Any],
+    nearness: NDArray[Any],
+    colors: NDArray[np.float64],
+    values: ArrayLike | None,
+    scale: ScalarMappable | None,
+    size: float,
 ) -> PathCollection:
     """Draw near points [n, 2] over far ones; with values, large ones over small ones and up to three times as large."""
     if values is None:
         ax.set_facecolor("#e4e4e4")  # White points are seen on it.
         order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
-        magnitude = np.abs(np.asarray(values, float))
+        given = np.asarray(values, float)
+        if given.shape != (len(colors),):
+            raise InputError(f"values is {list(given.shape)}; expected [{len(colors)}], one value for each point")
+        colors, magnitude = (scale or attribution_colors(given)).to_rgba(given), np.abs(given)
         order = np.argsort(magnitude, kind="stable")
         areas = size * (1 + 2 * np.clip(magnitude / attribution_colors(magnitude).norm.vmax, 0, 1))
     x, y = places[order].T
-    return ax.scatter(x, y, c=paint[order], s=areas[order], linewidths=0)
+    return ax.scatter(x, y, c=colors[order], s=areas[order], linewidths=0)
 
 
 def cloud(
@@ -124,7 +124,7 @@ def cloud(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, :2], -xyz[:, 2], _paint(rgb, values, scale), values, size)
+    drawn = _scatter(ax, xyz[:, :2], -xyz[:, 2], rgb, values, scale, size)
     ax.set(aspect="equal", xlabel="x, to the right (m)", ylabel="y, down (m)")
     if not ax.yaxis_inverted():
         ax.invert_yaxis()
@@ -161,7 +161,7 @@ def slices(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], _paint(rgb, values, scale), values, size)
+    drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], rgb, values, scale, size)
     right, top = xyz[:, [0, 2]].max(axis=0, initial=0)
     used = min(config.n_slices, int(top / config.sigma_1) + 1)
     for level in np.arange(used + 1) * config.sigma_1:

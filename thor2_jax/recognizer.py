@@ -239,9 +239,10 @@ class Recognizer:
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
         """Prepare instances of a frame, by default all, with corrected colours, one after the other."""
-        model = self.model
+        model, config = self.model, self.run.config
         chosen = frame.instances if labels is None else labels
-        return (model.corrected(prepare_instance(frame, each, model.run.config.sigma_s)) for each in chosen)
+        prepared = (prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in chosen)
+        return map(model.corrected, prepared)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""

@@ -115,19 +115,15 @@ def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int]
 
 
 def _padded_size(sizes: list[int], capacity: int | None) -> int:
-    largest = max(sizes)
-    if capacity is None:
-        if largest > POINT_BUCKETS[-1]:
-            raise InputError(
-                f"clouds[{sizes.index(largest)}] has {largest} points; expected at most {POINT_BUCKETS[-1]}, the "
-                "largest bucket; downsample it or give a capacity"
-            )
-        return point_bucket(largest)
-    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+    if not (capacity is None or (type(capacity) is int and capacity > 0)):
         raise InputError(f"capacity is {capacity!r}; expected a positive integer")
-    if largest > capacity:
-        raise InputError(f"capacity is {capacity}; clouds[{sizes.index(largest)}] has {largest} points; raise it")
-    return capacity
+    largest, limit = max(sizes), capacity or POINT_BUCKETS[-1]
+    if largest > limit:
+        raise InputError(
+            f"clouds[{sizes.index(largest)}] has {largest} points; expected at most {limit}, the "
+            f"{'capacity' if capacity else 'largest bucket'}; downsample it or give a larger capacity"
+        )
+    return capacity or point_bucket(largest)
 
 
 def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:

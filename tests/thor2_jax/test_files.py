@@ -1,4 +1,4 @@
-"""Atomic writes, digests, and the check of output directories."""
+"""Atomic writes, digests, the check of output directories, and tables in YAML files."""
 
 import errno
 import hashlib
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from thor2_jax import files
 from thor2_jax.errors import InputError
 from thor2_jax.files import (
     atomic_directory,
@@ -16,6 +17,7 @@ from thor2_jax.files import (
     directory_digest,
     has_json,
     json_digest,
+    parse_yaml,
     remove_leftovers,
     remove_written,
     temporary_directory,
@@ -162,3 +164,28 @@ def write_below(path: Path) -> None:
 def test_json_is_known_by_its_keys(content: str, is_own: bool, tmp_path: Path) -> None:
     (tmp_path / "file").write_text(content)
     assert has_json(tmp_path / "file", ("a", "b")) == is_own and not has_json(tmp_path, ("a", "b"))
+
+
+def test_shared_and_nested_yaml_values_are_read() -> None:
+    assert parse_yaml(b"a: &row [1, 2]\nb: *row\n") == {"a": [1, 2], "b": [1, 2]}
+    assert parse_yaml(b"[" * 50 + b"]" * 50) is not None
+    assert parse_yaml(b"") is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}"],
+    ids=["deep", "cycle", "alias", "int", "digits", "merge"],
+)
+def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
+    with pytest.raises(ValueError):
+        parse_yaml(content)
+
+
+def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "MAX_YAML_BYTES", 10)
+    monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
+    assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
+    for content in (b"[1,2,3,4,5]", b"[1,1,1,1,]" + b" ", b"[1,1,1,1,1"):
+        with pytest.raises(ValueError):
+            parse_yaml(content)

@@ -10,7 +10,7 @@ from scipy.stats import gmean
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.classifier import feature_of
+from thor2_jax.model import classifier
 from thor2_jax.model.inference import Inference, answers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import THOR2, Recognizer
@@ -100,18 +100,10 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
 
 
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
-    """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))
     for name, probabilities in class_probabilities(recognizer, described.oriented).items():
-        model = run.classifiers[name]
-        x = np.asarray(feature_of(described.descriptors, name), np.float64) * np.asarray(model.input_scale[...])
-        for layer, norm in zip(model.layers, model.norms, strict=True):
-            x = x @ np.asarray(layer.kernel[...], np.float64) + np.asarray(layer.bias[...])
-            x = (x - np.asarray(norm.mean[...])) / np.sqrt(np.asarray(norm.var[...]) + 1e-5)
-            x = np.maximum(x * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...]), 0)
-        logits = x @ np.asarray(model.head.kernel[...], np.float64) + np.asarray(model.head.bias[...])
-        expected = np.exp(logits - logits.max(axis=1, keepdims=True))
-        np.testing.assert_allclose(probabilities, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+        expected = classifier.class_probabilities(run.classifiers[name], described.descriptors, name)
+        np.testing.assert_allclose(probabilities, expected, atol=1e-5)
 
 
 def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> None:

@@ -82,7 +82,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     [
         ({"clouds": []}, ["clouds is empty"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
-        ({"clouds": [(np.zeros(3), COLORS)]}, ["clouds[0]", "xyz", "[3]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
         ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb", "int64"]),
@@ -94,9 +93,8 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
-        ({"capacity": 2}, ["capacity is 2", "clouds[0]", "3"]),
+        ({"capacity": 2}, ["at most 2, the capacity", "clouds[0]", "3"]),
         ({"capacity": 0}, ["capacity is 0"]),
-        ({"capacity": -4}, ["capacity is -4"]),
         ({"capacity": 8.0}, ["capacity is 8.0"]),
         ({"clouds": [(np.zeros((8193, 3)), np.zeros((8193, 3)))]}, ["clouds[0]", "8193", "8192"]),
         ({"camera": [0, 0]}, ["camera", "[0.0, 0.0]"]),
@@ -107,8 +105,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
-        ({"rim": [np.zeros(2, bool)]}, ["rim[0]", "[2]", "[3]"]),
-        ({"rim": [np.zeros(3, np.uint8)]}, ["rim[0]", "uint8", "expected bool"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:

@@ -26,9 +26,8 @@ from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_strips, persistence_images
-from thor2_jax.descriptor.slicing import strips_of_cloud
+from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips
@@ -99,7 +98,7 @@ def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, 
         looks: number of looks at each cloud that the function describes.
     """
     n_clouds, capacity = clouds.mask.shape
-    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * looks))
+    size = max(1, MAX_LARGE_CHUNK_POINTS // max(capacity * looks, 1))
     if jax.default_backend() != "cpu" or n_clouds <= size:
         return function(clouds)
     return _map_slices(function, clouds, size)
@@ -111,15 +110,7 @@ def _map_slices(function: Callable[[PointClouds], T], clouds: PointClouds, size:
 
 
 def _concatenate(results: Sequence[T]) -> T:
-    concatenated: T = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
-    return concatenated
-
-
-@functools.lru_cache(maxsize=8)
-def _region_sets(network: ColorNetwork) -> RegionSets:
-    # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
-    with jax.ensure_compile_time_eval():
-        return region_sets(network)
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
 
 
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
@@ -171,7 +162,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: static.
     """
     _check_batch(aligned)
-    return strips_by_sets(aligned, _region_sets(network), config)
+    return strips_by_sets(aligned, region_sets(network), config)
 
 
 def describe_strips(
@@ -272,15 +263,10 @@ def describe_stream(
     """
     if batch < 1:
         raise InputError(f"batch is {batch}; expected at least 1")
-    return _stream(iter(clouds), network, config, capacity, batch)
-
-
-def _stream(
-    clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
-) -> Iterator[Descriptors]:
+    unread = iter(clouds)
     empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     running: list[tuple[int, Descriptors]] = []
-    while chunk := list(itertools.islice(clouds, batch)):
+    while chunk := list(itertools.islice(unread, batch)):
         packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
         running.append((len(chunk), describe(packed, network, config)))
         if len(running) > 1:

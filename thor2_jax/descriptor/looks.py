@@ -21,7 +21,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
-from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
+from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
@@ -49,8 +49,7 @@ class LookDescriptors:
     @property
     def first(self) -> Descriptors:
         """The descriptors [B, ...] of the first look, the paper's."""
-        first: Descriptors = jax.tree.map(lambda a: a[:, 0], self.each)
-        return first
+        return jax.tree.map(lambda a: a[:, 0], self.each)
 
     @property
     def overflow(self) -> jax.Array:
@@ -68,10 +67,7 @@ class LookDescriptors:
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
         """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
-        flat: tuple[Descriptors, jax.Array] = jax.tree.map(
-            lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
-        )
-        return flat
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics))
 
     @jax.jit
     def with_balanced(self, clouds: PointClouds) -> "LookDescriptors":
@@ -85,11 +81,6 @@ class LookDescriptors:
         return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
 
-def _check_count(count: int) -> None:
-    if count not in LOOK_COUNTS:
-        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
-
-
 @partial(jax.jit, static_argnums=3)
 def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> tuple[PointClouds, jax.Array]:
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
@@ -97,10 +88,10 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
 
     def placed(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
-        normalization = boxed(cloud, sigma_s)
-        rotation, end_is_occluded = oriented(normalization)
+        normalization = normalization_of(cloud, sigma_s)
+        rotation = normalization.rotation
         # Where the occlusion boundary decides which end comes first, there is no half turn.
-        both = jnp.stack([rotation, jnp.where(end_is_occluded, rotation, half_turn @ rotation)])
+        both = jnp.stack([rotation, jnp.where(normalization.end_is_occluded, rotation, half_turn @ rotation)])
         return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
     masks, colors = [clouds.mask], clouds.colors
@@ -110,7 +101,7 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
         warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
         looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
     # One batch of all masks: tracing takes a fourth longer for a further `vmap` over the masks.
-    masked = [dataclasses.replace(clouds, mask=mask) for mask in masks]
+    masked = [dataclasses.replace(clouds, mask=mask, rim=None) for mask in masks]
     batch = jax.tree.map(lambda *a: jnp.concatenate(a), *masked)
     n_clouds, n_points = clouds.mask.shape
     points, cameras = (a.reshape(len(masks), n_clouds, *a.shape[1:]) for a in jax.vmap(placed)(batch))
@@ -139,7 +130,8 @@ def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
     Raises:
         InputError: `count` is another number.
     """
-    _check_count(count)
+    if count not in LOOK_COUNTS:
+        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
     if count == 1:
         return align(clouds, config), jnp.ones((len(clouds.mask), 1))
     return _looks(clouds, np.float32(config.sigma_s), np.float32(config.alpha), count)
@@ -185,7 +177,6 @@ def describe_looks(
         InputError: `count` is not one of `LOOK_COUNTS`.
     """
     count = config.looks if count is None else count
-    _check_count(count)
 
     def describe_chunk(chunk: PointClouds) -> LookDescriptors:
         aligned, weights = aligned_looks(chunk, config, count)

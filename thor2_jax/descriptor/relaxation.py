@@ -11,6 +11,7 @@ two slices or strips and no colour halfway between two grid colours.
 
 import functools
 import itertools
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,10 @@ from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.bounding_box import HIGHEST
 from thor2_jax.descriptor.cloud_statistics import square_root, to_lab
-from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
+
+if TYPE_CHECKING:
+    from thor2_jax.descriptor.slicing import RegionSets
 
 __all__ = ["hyab", "interval_log_weights", "relaxed_strips", "soft_regions"]
 
@@ -73,7 +76,7 @@ def relaxed_strips(
     points: jax.Array,
     colors: jax.Array,
     mask: jax.Array,
-    sets: RegionSets,
+    sets: "RegionSets",
     config: DescriptorConfig,
     overflow: jax.Array,
     point_weights: jax.Array | None = None,
@@ -134,7 +137,7 @@ def _grid_lab() -> jax.Array:
         return to_lab(jnp.asarray(grid_colors() / 255, jnp.float32))
 
 
-def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax.Array:
+def soft_regions(colors: jax.Array, sets: "RegionSets", temperature: float) -> jax.Array:
     """Return region weights of colours, averaged over nearby grid colours by a softmax over HyAB distances.
 
     The 27 grid colours within one level of the nearest one share the weight in proportion to exp(-HyAB / T), times a

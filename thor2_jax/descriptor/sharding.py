@@ -52,10 +52,10 @@ def shard_clouds(clouds: PointClouds, mesh: Mesh) -> PointClouds:
     return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), clouds)
 
 
-@functools.lru_cache(maxsize=8)
-def _sharded(network: ColorNetwork, config: DescriptorConfig, mesh: Mesh) -> Any:
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _sharded(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, mesh: Mesh) -> Descriptors:
     spec, local = PartitionSpec(BATCH_AXIS), functools.partial(describe, network=network, config=config)
-    return jax.jit(jax.shard_map(local, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    return jax.shard_map(local, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)(clouds)
 
 
 def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
@@ -75,4 +75,4 @@ def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: Descrip
     sharding = getattr(clouds.points, "sharding", None)
     if not isinstance(sharding, NamedSharding) or sharding.mesh.axis_names != (BATCH_AXIS,):
         raise InputError(f"clouds has the sharding {sharding}; expected clouds from shard_clouds")
-    return _sharded(network, config, sharding.mesh)(clouds)
+    return _sharded(clouds, network, config, sharding.mesh)

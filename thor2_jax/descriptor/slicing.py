@@ -3,24 +3,72 @@
 `strips_of_cloud` turns one aligned cloud of any number of points into tables of a fixed size. The paper's rule, and
 that of the authors' released code (`DescriptorConfig.released`), are in this module, and the soft one in `relaxation`.
 
+A colour belongs to one or more regions of the network (paper, "Color network"). The 140,608 colours of the grid have
+only 62 different sets of regions, so a point carries the number of its region set; region weights are applied after
+points have been counted.
+
 The released code rounds x and y to 0.01 and z to 0.1, half to even, in float64. Slices are the levels of z that occur,
 renumbered from 0; a strip is numbered by its upper edge; colour vectors are divided by their strip's number of points.
 """
 
 import dataclasses
-from functools import partial
-from typing import Any
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from colornet import ColorNetwork
+from colornet.grid import GRID_LEVELS, GRID_STEP
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.types import Strips
 
-__all__ = ["slices_and_strips", "strip_births", "strips_of_cloud"]
+__all__ = ["RegionSets", "color_sets", "region_sets", "slices_and_strips", "strip_births", "strips_of_cloud"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RegionSets:
+    """The K different sets of regions that the colours of a network belong to.
+
+    Attributes:
+        of_color: [140608] unsigned integers, region set of each grid colour, in the smallest type so that the table
+            stays in a cache.
+        weights: [K, R] float32, weight 1/m in each of the m regions of a set; rows sum to 1.
+    """
+
+    of_color: jax.Array
+    weights: jax.Array
+
+
+@functools.lru_cache(maxsize=8)
+def region_sets(network: ColorNetwork) -> RegionSets:
+    """Return the region sets of a network as device arrays."""
+    bits, of_color = np.unique(network.region_bits, return_inverse=True)
+    member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
+    weights = member / member.sum(axis=1, keepdims=True)
+    fields = of_color.astype(np.min_scalar_type(len(bits))), weights.astype(np.float32)
+    # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
+    with jax.ensure_compile_time_eval():
+        return RegionSets(*jax.device_put(fields))  # of NumPy arrays: JAX would compile a program for each conversion
+
+
+def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
+    """Return the region set of each colour, that of the nearest grid colour.
+
+    Args:
+        colors: [..., 3] float32 sRGB in [0, 1]; rounded to 8 bits first, halves up.
+        sets: region sets of the network.
+
+    Returns:
+        [...] int32, rows of `sets.weights`.
+    """
+    eight_bit = jnp.floor(colors * 255 + 0.5).astype(jnp.int32)
+    level = (eight_bit + GRID_STEP // 2) // GRID_STEP
+    color = (level[..., 0] * GRID_LEVELS + level[..., 1]) * GRID_LEVELS + level[..., 2]
+    return sets.of_color.at[color].get(mode="clip").astype(jnp.int32)
+
 
 _COORDINATE_LIMIT = 2.0**20
 """Coordinates are clipped to this, far beyond any descriptor, so that hundredths of them fit into int32."""
@@ -48,36 +96,27 @@ def slices_and_strips(
     Returns:
         Two [N] int32 arrays. Numbers may lie outside the descriptor; those of padding are meaningless.
     """
-    if config.convention == "released":
-        return _released_slices_and_strips(x, z, mask, config)
-    return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
+    if config.convention == "paper":
+        return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
+    # Rounded to 0.01, x is k / 100. The first edge j / 40 at or above it has j = ceil(2 k / 5), in integer arithmetic.
+    strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
+    level = _round_scaled(z, 10).astype(jnp.int32)
+    # Levels from twice the number of slices on keep their own number, which is outside the descriptor.
+    n_levels = 2 * config.n_slices
+    ranked = (level >= 0) & (level < n_levels)
+    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")
+    rank = jnp.cumsum(occurs) - 1
+    return jnp.where(ranked, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
     """Return the least and the greatest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
 
-    Points whose segment number is `n_segments` or more are dropped. The gradient of an extreme reaches exactly one
-    point, even if several points tie.
+    Points whose segment number is `n_segments` or more are dropped. Points that tie share the gradient of an extreme.
     """
     keys = jnp.stack([-y, y], axis=-1)
     best = jnp.full((n_segments, 2), -jnp.inf, y.dtype).at[segment].max(keys, mode="drop")
     return -best[:, 0], best[:, 1]
-
-
-@_extremes.defjvp
-def _extremes_jvp(n_segments: int, primals: Any, tangents: Any) -> Any:
-    y, segment = primals
-    extremes = _extremes(y, segment, n_segments)
-    row = jnp.minimum(segment, n_segments - 1)
-    number = jnp.arange(len(y), dtype=jnp.int32)
-
-    def tangent(values: jax.Array) -> jax.Array:
-        candidate = jnp.where(y == values[row], number, -1)
-        index = jnp.full(n_segments, -1, jnp.int32).at[segment].max(candidate, mode="drop")
-        return jnp.where(index >= 0, tangents[0][jnp.maximum(index, 0)], 0)
-
-    return extremes, tuple(tangent(values) for values in extremes)
 
 
 def strips_of_cloud(
@@ -133,21 +172,6 @@ def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, 
     cell = segment * n_sets + region_set
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
     return jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
-
-
-def _released_slices_and_strips(
-    x: jax.Array, z: jax.Array, mask: jax.Array, config: DescriptorConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Return the slice and strip numbers of points; arguments and results as in `slices_and_strips`."""
-    # Rounded to 0.01, x is k / 100. The first edge j / 40 at or above it has j = ceil(2 k / 5), in integer arithmetic.
-    strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
-    level = _round_scaled(z, 10).astype(jnp.int32)
-    # Levels from twice the number of slices on keep their own number, which is outside the descriptor.
-    n_levels = 2 * config.n_slices
-    ranked = (level >= 0) & (level < n_levels)
-    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")
-    rank = jnp.cumsum(occurs) - 1
-    return jnp.where(ranked, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
 
 
 def _released_values(strips: Strips) -> Strips:

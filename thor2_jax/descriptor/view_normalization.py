@@ -21,7 +21,7 @@ from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, 
 from thor2_jax.errors import InputError
 from thor2_jax.types import Parameters, PointClouds
 
-__all__ = ["Normalization", "align", "boxed", "mirror", "oriented", "place_aligned", "turn", "view_normalize"]
+__all__ = ["Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
 OCCLUSION_BIN = 0.01
 """Width of the bins along x in which boundary points are counted, scaled units."""
@@ -48,76 +48,51 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
 
 
 class Normalization(NamedTuple):
-    """Inputs of the orientation of one cloud.
+    """The rotation of the view normalization of one cloud, and the cloud before it.
 
     Attributes:
-        axes: [3, 3], axes of the minimal box as rows, the longest side first.
-        low: [3], least coordinates along the axes.
-        high: [3], largest coordinates along the axes.
+        rotation: [3, 3], axes of the minimal box with their signs as rows, the longest side first.
+        end_is_occluded: [] bool, whether an occluded end decided the half turn about z.
         points: [3, M], scaled units, mean zero; padding is 0.
         mask: [M] bool, False on padding.
-        boundary: [M] bool, points on the occlusion boundary.
         camera: [3], position of the camera relative to the mean.
     """
 
-    axes: jax.Array
-    low: jax.Array
-    high: jax.Array
+    rotation: jax.Array
+    end_is_occluded: jax.Array
     points: jax.Array
     mask: jax.Array
-    boundary: jax.Array
     camera: jax.Array
 
 
-def boxed(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
-    """Scale and centre one cloud and find its minimal box."""
+def normalization_of(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
+    """Scale and centre one cloud, find its minimal box, and choose the signs of the axes."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = fold(jnp.where(mask, scaled, 0), jnp.add).sum(axis=1) / jnp.maximum(mask.sum(dtype=scaled.dtype), 1)
     # Padding moves to the mean, inside the convex hull, where it is never an extreme point.
     centred = jnp.where(mask, scaled - centre[:, None], 0)
     camera = cloud.camera * sigma_s - centre
-
     axes, low, high = minimal_box(centred)
-    boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
-    return Normalization(axes, low, high, centred, mask, boundary, camera)
-
-
-def oriented(normalization: Normalization) -> tuple[jax.Array, jax.Array]:
-    """Return the rotation [3, 3] of the view normalization, and whether an occluded end decided its half turn about z.
-
-    The rows of the rotation are the axes of the box with their signs.
-    """
-    axes, low, high = normalization.axes, normalization.low, normalization.high
     middle = (low + high) / 2
 
     # The mean is the origin: if the middle is positive, the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
     # A half turn about x moves a camera from +z to -z.
-    camera_z = jnp.matmul(axes[2], normalization.camera, precision=HIGHEST) - middle[2]
+    camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
-    bins = jnp.floor(rotate(axes[:1], normalization.points)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
-    last = jnp.where(normalization.mask, bins, -1).max()
+    bins = jnp.floor(rotate(axes[:1], centred)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
+    last = jnp.where(mask, bins, -1).max()
     # A half turn about z moves the occluded end away from the first slice.
-    first_end, last_end = ((normalization.boundary & end).sum() for end in (bins <= 1, bins >= last - 1))
+    boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
+    first_end, last_end = ((boundary & end).sum() for end in (bins <= 1, bins >= last - 1))
     x_sign = jnp.where(first_end > last_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
-    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), first_end != last_end
-
-
-@jax.jit
-def _view_normalize(clouds: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    def one(cloud: PointClouds) -> PointClouds:
-        normalization = boxed(cloud, sigma_s)
-        points, camera = _place(
-            oriented(normalization)[0], normalization.points, normalization.mask, normalization.camera
-        )
-        return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
-
-    return jax.vmap(one)(clouds)
+    rotation = jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
+    return Normalization(rotation, first_end != last_end, centred, mask, camera)
 
 
 def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
@@ -145,7 +120,8 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
     Returns:
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
     """
-    return _view_normalize(clouds, _sigma_s_and_alpha(config, parameters)[0])
+    sigma_s, _ = _sigma_s_and_alpha(config, parameters)
+    return _normalized_and_turned(clouds, sigma_s, jnp.zeros_like(sigma_s))
 
 
 def _about_y(alpha: ArrayLike) -> jax.Array:
@@ -184,20 +160,24 @@ def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: Arra
     return points.T, camera
 
 
+def _normalized_and_turned(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> PointClouds:
+    points, camera = _align(clouds, sigma_s, alpha)
+    return dataclasses.replace(clouds, points=points, camera=camera)  # compiled, it would copy the other fields
+
+
 @jax.jit
 def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        normalization = boxed(cloud, sigma_s)
-        points, camera = place_aligned(oriented(normalization)[0], normalization, alpha)
-        return points[: len(cloud.mask)], camera  # the other fields would be copied
+        normalization = normalization_of(cloud, sigma_s)
+        points, camera = place_aligned(normalization.rotation, normalization, alpha)
+        return points[: len(cloud.mask)], camera
 
     return jax.vmap(one)(clouds)
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing."""
-    points, camera = _align(clouds, *_sigma_s_and_alpha(config, parameters))
-    return dataclasses.replace(clouds, points=points, camera=camera)
+    return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 
 
 @partial(jax.jit, static_argnums=1)

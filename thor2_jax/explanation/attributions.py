@@ -20,9 +20,8 @@ from scipy.spatial import KDTree
 from scipy.stats import spearmanr
 
 from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.descriptor.color_membership import RegionSets, region_sets
 from thor2_jax.descriptor.relaxation import relaxed_strips
-from thor2_jax.descriptor.slicing import slices_and_strips
+from thor2_jax.descriptor.slicing import RegionSets, region_sets, slices_and_strips
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips

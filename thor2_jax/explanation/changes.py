@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks
-from thor2_jax.descriptor.view_normalization import boxed, oriented
+from thor2_jax.descriptor.view_normalization import normalization_of
 from thor2_jax.explanation.class_scores import ClassScores, packed
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds
@@ -66,7 +66,7 @@ class Change:
 def _axes(clouds: PointClouds, config: DescriptorConfig) -> jax.Array:
     """Return the axes [3, 3] of the box of the only cloud of a batch, longest first."""
     cloud = jax.tree.map(lambda a: a[0], clouds)
-    return oriented(boxed(cloud, np.float32(config.sigma_s)))[0]
+    return normalization_of(cloud, np.float32(config.sigma_s)).rotation
 
 
 def _changed(clouds: PointClouds, axes: jax.Array, parameters: jax.Array, kind: Kind) -> PointClouds:

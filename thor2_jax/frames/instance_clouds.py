@@ -243,7 +243,7 @@ class InstanceCloud:
         points: [n, 3] float32, metres, OpenCV camera frame.
         colors: [n, 3] uint8, sRGB.
         n_pixels: number of pixels of its mask.
-        rim: [n] bool, points of pixels within `RIM` of the contour of the mask.
+        rim: [n] bool, points of pixels within `RIM` of the contour of the mask; None if it is not wanted.
         kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
         reason: why the cloud cannot be used; None if it can.
     """
@@ -252,7 +252,7 @@ class InstanceCloud:
     points: NDArray[np.float32]
     colors: NDArray[np.uint8]
     n_pixels: int
-    rim: NDArray[np.bool_]
+    rim: NDArray[np.bool_] | None = None
     kept_by_fallback: bool = False
     reason: str | None = None
 
@@ -262,12 +262,13 @@ def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
     return [instance_cloud(frame, label) for label in frame.instances]
 
 
-def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
+def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> InstanceCloud:
     """Return the cloud of one instance; if it cannot be used, with a `reason`.
 
     Args:
         frame: the frame.
         label: one of `frame.instances`.
+        with_rim: whether to find the rim.
     """
     pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
@@ -278,10 +279,11 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
         trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
     points = pixel_points(valid, depth, frame.depth.shape[1], frame.intrinsics)
-    flags = _near_contour(frame, label, pixels)[trusted] * np.uint8(255)
-    channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), flags])
+    channels = frame.color.reshape(-1, 3).take(valid, axis=0)
+    if with_rim:  # as a further colour channel
+        channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
     points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
-    colors, rim = channels[:, :3], channels[:, 3] > 127
+    colors, rim = channels[:, :3], channels[:, 3] > 127 if with_rim else None
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
@@ -291,8 +293,9 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
             reason += f"; no instance has such depth: {unit_question(frame)}"
         return InstanceCloud(label, points, colors, len(pixels), rim, reason=reason)
     kept, relaxed = remove_outliers(points)
+    rim = None if rim is None else rim.take(kept)
     return InstanceCloud(
-        label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), rim.take(kept), steep or relaxed
+        label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), rim, steep or relaxed
     )
 
 

@@ -153,7 +153,7 @@ class PreparedInstance:
         occluded: another instance hides a part of it, or the image border cuts it.
         kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
         reason: why the instance cannot be used; None if it can.
-        rim: [n] bool, points near the contour of the mask, if less than half of them; None without a mask.
+        rim: [n] bool, points near the contour of the mask, if less than half of them; None if they are unknown.
     """
 
     label: int
@@ -170,25 +170,27 @@ EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 
 """An instance without points, which pads a batch."""
 
 
-def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float) -> PreparedInstance:
+def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: bool = True) -> PreparedInstance:
     """Compute the cloud of one instance and its occlusion boundary, on the descriptors' voxel grid.
 
     Args:
         frame: the frame.
         label: one of `frame.instances`.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
+        with_rim: whether to find the rim, see `DescriptorConfig.uses_rim`.
     """
-    cloud = instance_cloud(frame, label)
+    cloud = instance_cloud(frame, label, with_rim)
     if cloud.reason is not None:
         return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=cloud.reason)
     occlusion = find_occlusion(frame, cloud)
     # Flags are further colour channels: a voxel is on the boundary if any of its points is, on the rim if most are.
-    flags = np.column_stack([cloud.colors, np.stack([occlusion.boundary, cloud.rim], axis=1) * np.uint8(255)])
-    points, channels = downsample_to_fit(cloud.points, flags, DESCRIPTOR_VOXEL / sigma_s)
-    boundary, rim = channels[:, 3] > 0, channels[:, 4] > 127
-    if 2 * rim.sum() > len(rim):  # a narrow object has no inside
+    flags = [occlusion.boundary] if cloud.rim is None else [occlusion.boundary, cloud.rim]
+    channels = np.column_stack([cloud.colors, np.stack(flags, axis=1) * np.uint8(255)])
+    points, channels = downsample_to_fit(cloud.points, channels, DESCRIPTOR_VOXEL / sigma_s)
+    rim = None if cloud.rim is None else channels[:, 4] > 127
+    if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object has no inside
         rim[:] = False
-    colors = channels[:, :3]
+    colors, boundary = channels[:, :3], channels[:, 3] > 0
     return PreparedInstance(label, points, colors, boundary, occlusion.occluded, cloud.kept_by_fallback, rim=rim)
 
 

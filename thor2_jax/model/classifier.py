@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, Literal, Self, TypeVar
 
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -149,9 +148,9 @@ class RunClassifiers(dict[str, Classifier]):
     @classmethod
     def compiled(cls, models: Mapping[Feature, MLP], embedding: Classifier | None) -> Self:
         """Return compiled classifiers of MLPs, and the one of the embedding; None if it does not know the classes."""
-        classifiers = cls()
-        for name, model in models.items():
-            classifiers[name] = compiled(_fused_probabilities, [nnx.split(model)], name)
+        classifiers = cls(
+            (name, compiled(_fused_probabilities, [nnx.split(each)], name)) for name, each in models.items()
+        )
         if embedding is not None:
             classifiers[EMBEDDING] = embedding
         return classifiers
@@ -202,18 +201,15 @@ def _compiled(
     return call
 
 
-def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
+def _variables(model: nnx.Module) -> tuple[Any, dict[str, Any]]:
+    """Return the state of the parameters and batch statistics, and its variables by their paths."""
     state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    return state, dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
-
-
-def _name(path: tuple[Any, ...]) -> str:
-    return "/".join(map(str, path))
+    return state, {"/".join(map(str, path)): variable for path, variable in nnx.to_flat_state(state)}
 
 
 def model_arrays(model: nnx.Module) -> dict[str, NDArray[Any]]:
     """Return the parameters and batch statistics of a model by their paths, for example layers/0/kernel."""
-    return {_name(path): np.asarray(array) for path, array in _state(model)[1].items()}
+    return {name: np.asarray(variable[...]) for name, variable in _variables(model)[1].items()}
 
 
 def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray[Any]]) -> Module:
@@ -227,13 +223,10 @@ def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray
         ValueError: if an array is missing or has another shape.
     """
     model = nnx.eval_shape(create)
-    state, expected = _state(model)
-    loaded = {}
-    for path, like in expected.items():
-        name = _name(path)
-        if name not in arrays or arrays[name].shape != like.shape:
-            raise ValueError(f"{name} is missing or does not have the shape {like.shape}")
-        loaded[path] = jax.device_put(arrays[name])  # `asarray` compiles a program for each shape
-    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
+    state, variables = _variables(model)
+    for name, variable in variables.items():
+        if name not in arrays or arrays[name].shape != variable.shape:
+            raise ValueError(f"{name} is missing or does not have the shape {variable.shape}")
+        variable.set_value(jax.device_put(arrays[name]))  # `asarray` compiles a program for each shape
     nnx.update(model, state)
     return model

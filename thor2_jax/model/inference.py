@@ -162,8 +162,7 @@ def infer_clouds(
 def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
     """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
     if inference.embeddings is None:
-        scores: NDArray[np.float32] | None = inference.scores
-        return scores
+        return inference.scores
     return model.gallery.scores(inference.embeddings, inference.weights)
 
 

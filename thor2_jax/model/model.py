@@ -9,7 +9,7 @@
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,35 @@ from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.classifier import EMBEDDING, RunClassifiers
-from thor2_jax.model.confidence import Calibration
-from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
+from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy, check_answer_by
 from thor2_jax.model.run_directory import TrainedRun
 
 __all__ = ["Model"]
+
+T = TypeVar("T")
+
+
+def _stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: str) -> T | None:
+    """Return a dataclass instance from the record of a run; None if the record does not have it.
+
+    Args:
+        kind: the dataclass; its own checks apply.
+        name: name of the value in the record.
+        record: the record, as JSON holds it; the value is a mapping of field names to values.
+        remedy: advice of the error message.
+
+    Raises:
+        InputError: the value is damaged.
+    """
+    stored = record.get(name)
+    if stored is None:
+        return None
+    try:
+        return kind(**stored)
+    except TypeError:
+        fields = ", ".join(field.name for field in dataclasses.fields(kind))  # type: ignore[arg-type]
+        raise InputError(f"{name} is {stored!r}; expected {fields}; {remedy}") from None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,7 +95,7 @@ class Model:
         """
         wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
         classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
-        transform = ColorTransform.of_record(run.record)
+        transform = _stored_value(ColorTransform, "color_transform", run.record, "adapt the run again")
         return cls(
             run, classifiers, unknown_below=unknown_below, rule=rule, answer_by=wanted, color_transform=transform
         )
@@ -80,7 +103,7 @@ class Model:
     @functools.cached_property
     def calibration(self) -> Calibration | None:
         """Turns fused probabilities into confidences; None in runs without one."""
-        return Calibration.of_record(self.run.record)
+        return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
 
     @functools.cached_property
     def union(self) -> ClassUnion:

@@ -1,15 +1,26 @@
-"""Records of recognition: the described instances of a frame, and the answers."""
+"""Records of recognition: the described instances of a frame, the answers, and where the objects are."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_OVERFLOW", "AnswerBy", "DescribedFrame", "Recognition", "check_answer_by"]
+__all__ = [
+    "MAX_OVERFLOW",
+    "AnswerBy",
+    "Box",
+    "DescribedFrame",
+    "Detection",
+    "Recognition",
+    "check_answer_by",
+    "detections_as_json",
+    "detections_of",
+]
 
 AnswerBy = Literal["classifiers", "gallery", "both"]
 """Sources of answers."""
@@ -28,7 +39,7 @@ class Recognition:
             `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
             confidence is below `unknown_below` (see `inference.answers`): an unknown object.
         confidence: from 0 to 1, also of an unknown object: estimated probability that the name of a known object is
-            correct; low for most unknown objects (see `model.confidence`). Without a calibration, the fused
+            correct; low for most unknown objects (see `model.fusion`). Without a calibration, the fused
             probability of the most probable class or the score of the gallery. None if the instance could not be
             described.
         classifier: the classifier that gives this class the largest probability ("tops", "tops2" or "embedding"), or
@@ -91,3 +102,55 @@ def check_answer_by(value: str | None) -> AnswerBy | None:
     if value not in (None, *get_args(AnswerBy)):
         raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
     return cast(AnswerBy | None, value)
+
+
+class Box(NamedTuple):
+    """The smallest rectangle of whole pixels around an instance."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """The answer for an instance, and where it is.
+
+    Attributes:
+        recognition: the answer.
+        box: its place in the image, pixels.
+        position: mean of its visible points in the OpenCV camera frame (x right, y down, z forward), metres; None if it
+            has no depth.
+    """
+
+    recognition: Recognition
+    box: Box
+    position: tuple[float, float, float] | None
+
+
+def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list[Detection]:
+    """Return the detections of a frame with labels, one for each answer."""
+    width = frame.depth.shape[1]
+    depth = frame.depth_m.ravel()
+    detections = []
+    for recognition in recognitions:
+        pixels = frame.instance_pixels[recognition.label]
+        rows, columns = pixels // width, pixels % width
+        left, top = int(columns.min()), int(rows.min())
+        box = Box(left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
+        valid = pixels[depth[pixels] > 0]
+        position = None
+        if len(valid):
+            x, y, z = (pixel_rays(valid, width, frame.intrinsics) * depth[valid, None]).mean(axis=0).tolist()
+            position = (x, y, z)
+        detections.append(Detection(recognition, box, position))
+    return detections
+
+
+def detections_as_json(detections: Sequence[Detection]) -> list[dict[str, Any]]:
+    """Return the detections as JSON values: those of the answer, `box` and `position`."""
+    return [
+        {**dataclasses.asdict(one.recognition), "box": list(one.box), "position": one.position and list(one.position)}
+        for one in detections
+    ]

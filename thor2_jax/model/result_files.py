@@ -17,8 +17,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import has_json, write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.model.detections import Detection, detections_of
-from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.recognition import Detection, Recognition, detections_of
 
 __all__ = [
     "BOP_HEADER",

@@ -144,12 +144,12 @@ def load_run(path: str | Path) -> TrainedRun:
         classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
     embedding = Embedding.load(file, network) if file.is_file() else None
-    if embedding is None and description.get("embedding") is not None:
-        raise InputError(f"model: {file} is missing; copy the whole run directory")
+    stored = None if embedding is None else embedding.fingerprint
+    if description.get("embedding", stored) != stored:
+        state = "is missing" if embedding is None else "is not the embedding that run.json names"
+        raise InputError(f"model: {file} {state}; copy the whole run directory")
     if embedding is not None and embedding.references is None and description.get("references"):
         raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
-    if embedding is not None and description.get("embedding", embedding.fingerprint) != embedding.fingerprint:
-        raise InputError(f"model: {file} is not the embedding that run.json names; copy the whole run directory")
     run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding)
     if classes and not classifiers and run.embedding_classifier is None:
         state = "is missing" if embedding is None else "does not recognize the classes of run.json"

@@ -1,23 +1,19 @@
-"""The description of a run, run.json, and the values that a training or adaptation stores in its record. No JAX."""
+"""The description of a run, run.json. No JAX."""
 
-import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file
 
-__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "stored_value"]
+__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description"]
 
 RUN_FORMAT = 2
 """Version of the layout, see `run_directory`. Format 1, of versions before 0.2, cannot be read."""
 
 RUN_FILE = "run.json"
-
-T = TypeVar("T")
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -45,25 +41,3 @@ def read_description(path: Path) -> dict[str, Any]:
     if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
         raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
     return description
-
-
-def stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: str) -> T | None:
-    """Return a dataclass instance from the record of a run; None if the record does not have it.
-
-    Args:
-        kind: the dataclass; its own checks apply.
-        name: name of the value in the record.
-        record: the record, as JSON holds it; the value is a mapping of field names to values.
-        remedy: advice of the error message.
-
-    Raises:
-        InputError: the value is damaged.
-    """
-    stored = record.get(name)
-    if stored is None:
-        return None
-    try:
-        return kind(**stored)
-    except TypeError:
-        fields = ", ".join(field.name for field in dataclasses.fields(kind))  # type: ignore[arg-type]
-        raise InputError(f"{name} is {stored!r}; expected {fields}; {remedy}") from None

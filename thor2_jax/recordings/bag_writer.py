@@ -18,7 +18,7 @@ from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import annotate
-from thor2_jax.model.detections import Detection
+from thor2_jax.model.recognition import Detection
 from thor2_jax.recordings.detections import detection_array, ros_time
 
 __all__ = [

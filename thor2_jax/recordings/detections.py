@@ -6,7 +6,7 @@ detection_array(detections, stamp=stamp, frame_id="camera_color_optical_frame")
 from collections.abc import Sequence
 from typing import Any
 
-from thor2_jax.model.detections import Box, Detection
+from thor2_jax.model.recognition import Box, Detection
 
 __all__ = ["detection_array", "ros_time"]
 

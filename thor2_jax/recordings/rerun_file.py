@@ -16,7 +16,7 @@ from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import check_output_file, errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import answer_paints
-from thor2_jax.model.detections import Detection
+from thor2_jax.model.recognition import Detection
 
 __all__ = ["RerunFile"]
 

@@ -22,11 +22,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
-from thor2_jax.hosts import is_allowed_host
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
+from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import RequestCounter
 from thor2_jax.service.pipeline import AdmittedRequest, Service, gallery_errors
 from thor2_jax.service.problem import RequestError, error_responses

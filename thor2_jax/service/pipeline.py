@@ -257,7 +257,7 @@ class Service:
             RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
                 this size are compiled.
         """
-        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config.sigma_s, label, True)
+        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label, True)
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
@@ -297,7 +297,7 @@ class Service:
         with gallery_errors(self.engine.objects.directory, 409, "name"):
             self.engine.objects.refresh()
             self.engine.objects.check(name, **flags)
-        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config.sigma_s, label)
+        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
         except InputError as error:
@@ -331,7 +331,7 @@ class Service:
     async def _recognize_frame(
         self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
     ) -> tuple[PreparedRequest, list[CloudResult], list[Recognition]]:
-        arguments = files, self.engine.run.config.sigma_s, with_label_map, self.settings.segmenter
+        arguments = files, self.engine.run.config, with_label_map, self.settings.segmenter
         prepared = await self._prepare(request, prepare_frame, *arguments)
         corrected = self.engine.correct(prepared.instances, observe=True)
         results = await self._infer(corrected, request)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
@@ -64,7 +65,7 @@ class PreparedRequest:
 
 
 def prepare_frame(
-    files: dict[str, bytes], sigma_s: float, with_label_map: bool, segmenter: str | None
+    files: dict[str, bytes], config: DescriptorConfig, with_label_map: bool, segmenter: str | None
 ) -> PreparedRequest:
     """Decode a frame, segment it if it has no labels, and compute the clouds of its instances.
 
@@ -79,7 +80,7 @@ def prepare_frame(
             frame = _segmented(frame, segmenter)
         with_label_map = True
     with timed(seconds, "clouds"):
-        instances = _prepare_instances(frame, frame.instances, sigma_s)
+        instances = _prepare_instances(frame, frame.instances, config)
         label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, seconds, label_map)
 
@@ -112,7 +113,9 @@ def _warm_up(name: str) -> None:
         segmented(blank, _segmenter(name))
 
 
-def prepare_view(files: dict[str, bytes], sigma_s: float, label: int, with_frame: bool = False) -> PreparedRequest:
+def prepare_view(
+    files: dict[str, bytes], config: DescriptorConfig, label: int, with_frame: bool = False
+) -> PreparedRequest:
     """Decode a frame and compute the cloud of one instance, which is to be enrolled or explained.
 
     Raises:
@@ -126,15 +129,15 @@ def prepare_view(files: dict[str, bytes], sigma_s: float, label: int, with_frame
         more = " ..." if len(frame.instances) > 10 else ""
         raise RequestError(422, "instance", f"instance is {label}; expected a number of labels: {first}{more}.")
     with timed(seconds, "clouds"):
-        (view,) = _prepare_instances(frame, [label], sigma_s)
+        (view,) = _prepare_instances(frame, [label], config)
     if view.reason is not None:
         raise RequestError(422, "instance", f"instance {label} cannot be used: {view.reason}.")
     return PreparedRequest([view], seconds, frame=frame if with_frame else None)
 
 
-def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], sigma_s: float) -> list[PreparedInstance]:
+def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], config: DescriptorConfig) -> list[PreparedInstance]:
     try:
-        return [prepare_instance(frame, label, sigma_s) for label in labels]
+        return [prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in labels]
     except InputError:  # The images and the intrinsics are valid, but their combination exceeds the voxel grid.
         message = "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
         raise RequestError(422, "intrinsics", message) from None

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.hosts import check_host_names
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+from thor2_jax.service.hosts import check_host_names
 
 __all__ = ["MAX_BODY", "MAX_CLOUDS", "MAX_CLOUD_COORDINATE", "MAX_EXPLAINED", "Settings", "default_segmenter"]
 

@@ -17,9 +17,10 @@ would be: a track whose frames all have the same probabilities has the confidenc
 """
 
 import dataclasses
+import itertools
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol, Self
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Self
 
 import jax
 import numpy as np
@@ -30,10 +31,12 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, gallery_scores
-from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
+
+if TYPE_CHECKING:
+    from thor2_jax.recognizer import Recognizer
 
 __all__ = [
     "FusedEvidence",
@@ -183,17 +186,6 @@ class TrackedRecognition(Recognition):
         return dataclasses.replace(self, **{name: getattr(other, name) for name in changed})
 
 
-class FrameRecognizer(Protocol):
-    """The part of a recognizer that a tracker uses, see `Recognizer`."""
-
-    @property
-    def model(self) -> Model: ...
-
-    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]: ...
-
-    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]: ...
-
-
 class _Track:
     """An object that is followed.
 
@@ -223,14 +215,14 @@ class Tracker:
     With poses, each view of an object is described alone and as one cloud with those before it.
     """
 
-    def __init__(self, recognizer: FrameRecognizer) -> None:
+    def __init__(self, recognizer: "Recognizer") -> None:
         """Start without tracks; `Recognizer.track` calls this."""
         self._recognizer = recognizer
         self._tracks: list[_Track] = []
         self._frame = 0
         self._size: tuple[int, ...] = ()
         self._has_poses = False
-        self._last_number = 0
+        self._numbers = itertools.count(1)
 
     def update(self, frame: RGBDFrame, pose: ArrayLike | None = None) -> list[TrackedRecognition]:
         """Recognize the next frame and return its answers, fused with the earlier ones, in the order of the labels.
@@ -301,7 +293,8 @@ class Tracker:
         points = [each.points if world is None else transform(world, each.points) for each in usable]
         voxels = [occupied_voxels(cloud) for cloud in points]
         matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
-        tracks = [matched.get(row) or self._start_track() for row in range(len(usable))]
+        tracks = [matched.get(row) or _Track(next(self._numbers)) for row in range(len(usable))]
+        self._tracks += [track for track in tracks if not track.frames]
         for track, instance, occupied in zip(tracks, usable, voxels, strict=True):
             track.voxels, track.instance = occupied, instance
             track.seen, track.frames = self._frame, track.frames + 1
@@ -313,11 +306,6 @@ class Tracker:
             track.instance = merge_views(track.views, self._recognizer.model.run.config.sigma_s)
         if several:
             self._add_evidence(several, self._recognizer.infer(track.instance for track in several)[1])
-
-    def _start_track(self) -> _Track:
-        self._last_number += 1
-        self._tracks.append(_Track(self._last_number))
-        return self._tracks[-1]
 
     def _add_evidence(self, tracks: Sequence[_Track], inference: Inference) -> None:
         """Add the rows of an inference to those of the tracks, weighted by the clouds that were described."""

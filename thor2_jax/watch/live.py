@@ -16,8 +16,7 @@ from typing import Any
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
-from thor2_jax.model.detections import Detection, detections_of
-from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.recognition import Detection, Recognition, detections_of
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.watch.server import Broadcast
 

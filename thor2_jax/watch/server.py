@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError
-from thor2_jax.hosts import check_host_names, is_allowed_host
+from thor2_jax.service.hosts import check_host_names, is_allowed_host
 
 __all__ = ["Broadcast", "serve_live"]
 

@@ -65,7 +65,7 @@ def recognize(
     """
     from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
     from thor2_jax.model import result_files
-    from thor2_jax.model.detections import detections_of
+    from thor2_jax.model.recognition import detections_of
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import (
         RecognizerArguments,

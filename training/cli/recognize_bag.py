@@ -32,7 +32,7 @@ def recognize_bag(
         InputError: the recording cannot be read from here on, and what was written so far; or frames failed.
     """
     from thor2_jax.files import check_output_directory
-    from thor2_jax.model.detections import detections_as_json, detections_of
+    from thor2_jax.model.recognition import detections_as_json, detections_of
     from thor2_jax.model.result_files import write_recognitions
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile

@@ -19,7 +19,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, class_probabilities
-from thor2_jax.model.confidence import MAX_ODDS, Calibration, answer_features
+from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun

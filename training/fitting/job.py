@@ -29,7 +29,7 @@ from thor2_jax.files import check_output_directory, remove_leftovers, remove_wri
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature
-from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import fit_run_embedding

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import RegionSets, region_sets
 from thor2_jax.descriptor.describe import strips_by_sets
+from thor2_jax.descriptor.slicing import RegionSets, region_sets
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.errors import InputError
 from thor2_jax.types import Strips

@@ -18,9 +18,9 @@ from jax.typing import ArrayLike
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.model.classifier import MLP, Feature, feature_of
 from thor2_jax.types import Descriptors
 from training.fitting.samples import Batch, expand

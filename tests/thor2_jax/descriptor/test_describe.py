@@ -1,14 +1,15 @@
-"""TOPS and TOPS2 of clouds against NumPy in float64, and changes that must not affect them."""
+"""TOPS and TOPS2 of clouds: equal by steps, in chunks of large batches and as a stream; compilations; bad input."""
 
 import dataclasses
 import logging
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, aligned_cloud
+from helpers import SMALL_CONFIG, aligned_cloud, slow
 from scipy.spatial.transform import Rotation
 
 import colornet
@@ -97,3 +98,74 @@ def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
     larger = compiled(513, 2)
     assert larger and len(larger) == len(set(larger))
     assert compiled(1024, 900) == []
+
+
+def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
+    """Return clouds, the k-th of which lies at x = k."""
+    points = np.zeros((count, capacity, 3), np.float32)
+    points[:, :, 0] = np.arange(count)[:, None]
+    return thor2.PointClouds.pack([(cloud, np.zeros((capacity, 3), np.uint8)) for cloud in points], capacity)
+
+
+@pytest.mark.parametrize(("capacity", "size"), [(1, 64), (512, 64), (2048, 64), (4096, 32), (8192, 16), (2**18, 1)])
+def test_chunks_have_few_points_except_on_accelerators(
+    capacity: int, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert describe.chunk_size(clouds_of(2, capacity)) == size
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert describe.chunk_size(clouds_of(300, 1)) == 300
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 63, 64, 65, 127, 128, 150])
+def test_results_of_chunks_are_those_of_the_whole_batch(count: int) -> None:
+    sizes: list[int] = []
+
+    def mean_x(chunk: thor2.PointClouds) -> dict[str, jax.Array]:
+        sizes.append(len(chunk.mask))
+        return {"x": chunk.points[:, :, 0].mean(axis=1), "points": chunk.points}
+
+    clouds = clouds_of(count, 8192)  # chunks of 16
+    results = jax.jit(lambda clouds: describe.map_chunks(mean_x, clouds))(clouds)
+    assert max(sizes) <= 16 and len(sizes) <= 2 * describe.CHUNKS_PER_STEP
+    np.testing.assert_array_equal(results["x"], np.arange(count))
+    np.testing.assert_array_equal(results["points"], clouds.points)
+
+
+def stream(count: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        n = int(rng.integers(1, 300))
+        yield rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("count", [8, *slow(1, 4, 9)])
+def test_a_stream_against_one_batch(count: int) -> None:
+    batches = list(describe.describe_stream(stream(count), NETWORK, CLOSED, capacity=512, batch=4))
+    assert [len(p.overflow) for p in batches] == [4] * (count // 4) + ([count % 4] if count % 4 else [])
+    whole = thor2.describe(thor2.PointClouds.pack(list(stream(count)), 512), NETWORK, CLOSED)
+    np.testing.assert_allclose(np.concatenate([p.tops2 for p in batches]), whole.tops2, atol=1e-5)
+    np.testing.assert_array_equal(np.concatenate([p.overflow for p in batches]), whole.overflow)
+
+
+def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
+    read = 0
+
+    def counted() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        nonlocal read
+        for cloud in stream(40):
+            read += 1
+            yield cloud
+
+    batches = describe.describe_stream(counted(), NETWORK, CLOSED, capacity=512, batch=4)
+    assert read == 0
+    for done in range(1, 6):
+        next(batches)
+        assert read == 4 * (done + 1)
+
+
+def test_bad_input_of_a_stream() -> None:
+    with pytest.raises(thor2.InputError, match="batch is 0"):
+        next(describe.describe_stream(stream(2), NETWORK, CLOSED, batch=0))
+    bad = [*stream(2), (np.full((3, 3), np.nan), np.zeros((3, 3), np.uint8))]
+    with pytest.raises(thor2.InputError, match="2"):
+        list(describe.describe_stream(bad, NETWORK, CLOSED, capacity=512, batch=4))

@@ -5,11 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import aligned_cloud
+from helpers import aligned_cloud, as_8_bit
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import slices_and_strips
+from thor2_jax.descriptor.slicing import color_sets, region_sets, slices_and_strips
 
 NETWORK = colornet.load_default()
 PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
@@ -96,3 +96,26 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     for far, number in ((1.3, 1), (1.4, 14)):
         i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
+
+
+def weights(colors: np.ndarray) -> np.ndarray:
+    sets = region_sets(NETWORK)
+    return np.asarray(sets.weights[jax.jit(color_sets)(colors, sets)])
+
+
+def test_every_level_of_a_channel_and_every_half_between_two() -> None:
+    """Means of two 8-bit colours lie between two levels, where single precision decides the rounding."""
+    halves = (np.arange(511) / 510).astype(np.float32)
+    values = np.concatenate([halves, np.nextafter(halves, np.float32(0)), np.nextafter(halves, np.float32(1))])
+    for axis in range(3):
+        colors = np.full((len(values), 3), 0.5, np.float32)
+        colors[:, axis] = values
+        np.testing.assert_array_equal(weights(colors), NETWORK.membership(as_8_bit(colors)))
+
+
+def test_floating_colours_in_any_shape() -> None:
+    colors = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
+    region_weights = weights(colors)
+    assert region_weights.shape == (4, 5, 22) and region_weights.dtype == np.float32
+    np.testing.assert_array_equal(region_weights, NETWORK.membership(as_8_bit(colors)))
+    np.testing.assert_allclose(region_weights.sum(axis=-1), 1, atol=1e-6)

@@ -13,15 +13,15 @@ from scipy.special import logit
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.looks import LookDescriptors, describe_aligned_looks, describe_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.explanation import attributions, class_scores
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
 

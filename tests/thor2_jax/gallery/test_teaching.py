@@ -14,7 +14,7 @@ from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import answers
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run

@@ -1,13 +1,26 @@
-"""Fusion of the classifiers: the three rules against SciPy and known values."""
+"""Fusion by three rules against SciPy and known values; confidence: its formula and what the recognizer makes of it."""
+
+import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
+from helpers import untrained_embedding_run, untrained_run
 from scipy.stats import gmean
 
-from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
+import thor2_jax as thor2
+from thor2_jax.model.fusion import (
+    FUSION_RULES,
+    Calibration,
+    FusionRule,
+    answer_features,
+    fused_probabilities,
+    with_temperature,
+)
+from thor2_jax.model.model import Model
 
 RNG = np.random.default_rng(0)
 
@@ -55,3 +68,77 @@ def test_jax_arrays_are_fused_as_numpy_arrays(rule: FusionRule, n: int) -> None:
     # Compiled functions get the classifiers in the order of their names.
     expected = fused_probabilities(dict(sorted(rows.items())), rule)
     np.testing.assert_allclose(fused, expected, rtol=1e-5, atol=1e-7)
+
+
+FUSED = np.array([[0.7, 0.2, 0.1], [0.2, 0.2, 0.6]])
+EMBEDDED = np.array([[0.4, 0.5, 0.0], [0.01, 0.0, 0.001]])
+CALIBRATION = Calibration(-1.0, 0.5, 2.0, 0.25, 0.3, 0.6, 1.5)
+RECORD = dataclasses.asdict(CALIBRATION)
+
+
+def test_features_are_log_odds_of_answer_and_classes() -> None:
+    expected = np.log([[0.7 / 0.3, 0.9 / 0.1], [0.6 / 0.4, 0.011 / 0.989]])
+    np.testing.assert_allclose(answer_features(FUSED, EMBEDDED), expected)
+    np.testing.assert_array_equal(answer_features(np.array([[1.0, 0.0]]), np.zeros((1, 2))), [[8, -8]])
+
+
+def test_the_largest_probability_is_the_confidence() -> None:
+    correct = 1 / (1 + np.exp(1 - 0.5 * np.log(0.7 / 0.3)))
+    known = 1 / (1 + np.exp(-2 - 0.25 * np.log(0.9 / 0.1)))
+    score = correct * known
+    confidence = 1 / (1 + np.exp(-0.6) * ((1 - score) / score) ** 1.5)
+    values = CALIBRATION.calibrated(FUSED, EMBEDDED)
+    np.testing.assert_allclose(values[0], np.array([1, 2 / 7, 1 / 7]) * confidence)
+    np.testing.assert_array_equal(values.argmax(axis=1), FUSED.argmax(axis=1))
+    assert values[1, 2] < values[0, 0]
+
+
+def test_the_score_is_below_one() -> None:
+    steep = dataclasses.replace(CALIBRATION, correct_factor=100.0, known_factor=100.0)
+    score = steep.score(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]))
+    assert 0.999 < score[0] < 1
+
+
+def test_records_without_a_third_function_are_read() -> None:
+    record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
+    calibration = Calibration(**record)
+    np.testing.assert_allclose(calibration.confidence(FUSED, EMBEDDED), CALIBRATION.score(FUSED, EMBEDDED))
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"known_bias": 0.0},
+        RECORD | {"unknown_below": 2.0},
+        RECORD | {"known_bias": float("nan")},
+        RECORD | {"known_bias": "0"},
+        [],
+    ],
+)
+def test_damaged_records_are_refused(record: Any) -> None:
+    with pytest.raises(thor2.InputError, match="calibration"):
+        Model.of_run(untrained_run("ab", record={"calibration": record})).calibration  # noqa: B018
+    assert Model.of_run(untrained_run("ab")).calibration is None
+
+
+def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
+    run = untrained_embedding_run(("a", "b", "c"), ("tops", "tops2"))
+    recognizer = thor2.Recognizer(dataclasses.replace(run, record={"calibration": RECORD}))
+    assert recognizer.model.classifiers.default == ("tops", "tops2", "embedding")
+    np.testing.assert_array_equal(recognizer.model.thresholds(), [0.3] * 3)
+    np.testing.assert_array_equal(thor2.Recognizer(recognizer.run, 0.0).model.thresholds(), [0] * 3)
+    np.testing.assert_array_equal(thor2.Recognizer(run).model.thresholds(), [0] * 3)
+    probabilities = {"tops": FUSED, "tops2": FUSED, "embedding": EMBEDDED}
+    np.testing.assert_allclose(recognizer.model.fused(probabilities), CALIBRATION.calibrated(FUSED, EMBEDDED))
+    # The embedding of another run is no classifier.
+    other = thor2.Recognizer(dataclasses.replace(run, classes=("a", "b", "d")))
+    assert other.model.classifiers.default == ("tops", "tops2")
+
+
+@pytest.mark.parametrize("rule", FUSION_RULES)
+def test_an_embedding_alone_answers_alike_under_every_rule(rule: FusionRule) -> None:
+    recognizer = thor2.Recognizer(untrained_embedding_run(("a", "b", "c"), record={"calibration": RECORD}), rule=rule)
+    assert tuple(recognizer.model.classifiers) == recognizer.model.classifiers.default == ("embedding",)
+    conditional = EMBEDDED / EMBEDDED.sum(axis=1, keepdims=True)
+    expected = CALIBRATION.calibrated(conditional, EMBEDDED)
+    np.testing.assert_allclose(recognizer.model.fused({"embedding": EMBEDDED}), expected, rtol=1e-6, atol=1e-12)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -13,15 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
-from flax import nnx
 from helpers import class_probabilities, full_disk, untrained_embedding_run, untrained_run
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
-from thor2_jax.model.classifier import MLP
-from thor2_jax.model.run_directory import TrainedRun, input_size, load_run, save_run
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.recognizer import Recognizer
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
@@ -30,15 +27,7 @@ CONSTANTS = dataclasses.asdict(CONFIG)
 
 
 def make_run(features: tuple[str, ...] = ("tops", "ce")) -> TrainedRun:
-    rng, network = np.random.default_rng(0), colornet.load_default()
-    classifiers = {}
-    for name in features:
-        model = MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(1))
-        for norm in model.norms:  # statistics unlike those of a fresh model
-            norm.mean[...] = jnp.asarray(rng.normal(size=norm.mean.shape), jnp.float32)
-        model.input_scale[...] = jnp.asarray(rng.uniform(1, 2, model.input_scale.shape), jnp.float32)
-        classifiers[name] = model
-    return TrainedRun(CONFIG, network, CLASSES, classifiers, {"epochs": 3, "figures": [0.5, 1]})
+    return untrained_run(CLASSES, features, CONFIG, {"epochs": 3, "figures": [0.5, 1]})
 
 
 @pytest.fixture(scope="module")
@@ -120,18 +109,6 @@ def weights(path: Path, name: str) -> Path:
     return path / "weights" / f"{name}.safetensors"
 
 
-def damage_weights(path: Path) -> None:
-    file = weights(path, "tops")
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
-@pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
-def test_every_constant_is_restored(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
-    config = dataclasses.replace(CONFIG, relaxation=relaxation, persistence_weight=1.5)
-    save_run(dataclasses.replace(make_run(("ce",)), config=config), tmp_path / "run")
-    assert load_run(tmp_path / "run").config == config
-
-
 def test_equal_runs_have_equal_bytes(saved: Path, tmp_path: Path) -> None:
     save_run(make_run(), tmp_path / "run")
     files = sorted(file.relative_to(saved) for file in saved.rglob("*") if file.is_file())
@@ -145,25 +122,15 @@ def flip_a_bit(path: Path) -> None:
     weights(path, "ce").write_bytes(content)
 
 
-def swap_weights(path: Path) -> None:
-    """Store arrays of other shapes, with their own SHA-256 in run.json."""
-    content = weights(path, "ce").read_bytes()
-    weights(path, "tops").write_bytes(content)
-    sha256 = hashlib.sha256(content).hexdigest()
-    edited(weights={"tops": sha256, "ce": sha256})(path)
-
-
 def other_network(path: Path) -> None:
     network = colornet.load_default()
     dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no folder": (shutil.rmtree, "run is not a run directory"),
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
-    "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=3), "run.json has format 3"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
@@ -179,9 +146,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
     "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
-    "cut weights": (damage_weights, "weights/tops.safetensors is damaged"),
     "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
-    "swapped weights": (swap_weights, "weights/tops.safetensors does not fit"),
     "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 

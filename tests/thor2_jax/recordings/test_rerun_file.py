@@ -9,8 +9,7 @@ import pytest
 from recording_files import table_frame
 
 from thor2_jax.errors import InputError
-from thor2_jax.model.detections import detections_of
-from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.recognition import Recognition, detections_of
 from thor2_jax.recordings.rerun_file import RerunFile
 from thor2_jax.segmentation.segmenters import segmented
 

@@ -16,7 +16,7 @@ from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
 from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
-from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine as service_engine

@@ -22,6 +22,7 @@ from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
@@ -85,15 +86,15 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
 def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
     labels = np.random.default_rng(0).integers(0, 3, (240, 320)).astype(np.uint8)  # 51,000 runs
     assert (np.diff(labels.ravel()) != 0).sum() > MAX_LABEL_RUNS
-    label_map = prepare_frame(files | {"labels": encode_image(labels)}, 2.5, True, None).label_map
+    label_map = prepare_frame(files | {"labels": encode_image(labels)}, DescriptorConfig(), True, None).label_map
     assert label_map is not None and len(label_map.labels) <= MAX_LABEL_RUNS
     np.testing.assert_array_equal(decoded(label_map), labels[::2, ::2])
     for shape in ((1, 1), (1, 3)):
         one = files | {name: encode_image(np.ones(shape, kind)) for name, kind in (("labels", "u1"), ("depth", "u2"))}
         one["color"] = encode_image(np.zeros((*shape, 3), np.uint8))
-        small = prepare_frame(one, 2.5, True, None).label_map
+        small = prepare_frame(one, DescriptorConfig(), True, None).label_map
         assert small is not None and (small.labels, small.lengths) == ([1], [shape[1]])
-    assert prepare_frame(files, 2.5, False, None).label_map is None
+    assert prepare_frame(files, DescriptorConfig(), False, None).label_map is None
 
 
 def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray) -> Any:

@@ -13,6 +13,7 @@ from processes import HANG
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.segmentation.table import segment_table
 from thor2_jax.service.preparation import PreparationPool, prepare_frame
@@ -56,7 +57,9 @@ def wrapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def preparation_by(name: str | None) -> Iterator[Callable[[Files], Any]]:
     """Yield a function that prepares a frame in the process of a pool with a segmenter."""
     with contextlib.closing(PreparationPool(1, name)) as pool:
-        yield lambda files: pool.submit(time.monotonic() + HANG, prepare_frame, files, 2.5, False, name).result(HANG)
+        yield lambda files: pool.submit(
+            time.monotonic() + HANG, prepare_frame, files, DescriptorConfig(), False, name
+        ).result(HANG)
 
 
 def test_a_frame_without_labels_is_segmented(

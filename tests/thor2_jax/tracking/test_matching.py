@@ -1,4 +1,4 @@
-"""Matching of clouds by their overlap, and camera poses."""
+"""Matching of clouds by their overlap, camera poses, and clouds of several views, merged in space."""
 
 import itertools
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.tracking.poses import check_pose
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.tracking.poses import check_pose, merge_views
 from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
+from training.rendering.view_sphere import camera_pose
 
 
 def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:
@@ -58,3 +60,20 @@ def test_a_match_has_the_largest_total_overlap() -> None:
 def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
     with pytest.raises(InputError, match="camera_pose"):
         check_pose(pose, "camera_pose")  # type: ignore[arg-type]
+
+
+def test_merged_clouds_coincide_in_space() -> None:
+    rng = np.random.default_rng(0)
+    world = rng.uniform(-0.05, 0.05, (500, 3))
+    colors = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+    poses = [camera_pose(azimuth, 1.0, np.zeros(3), 0.8) for azimuth in (0.3, 2.0)]
+    views = []
+    for pose in poses:
+        points = ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
+        rim = rng.random(500) < 0.2
+        views.append((PreparedInstance(1, points, colors, np.zeros(500, bool), rim=rim), pose))
+    one, both = merge_views(views[1:], 2.5), merge_views(views, 2.5)
+    assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
+    np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)
+    packed = pack_instances([both, one], 2)  # the rim of the last view is not that of the merged cloud
+    assert packed.rim is not None and not packed.rim.any()

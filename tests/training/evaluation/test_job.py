@@ -23,7 +23,7 @@ from PIL import Image
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
-from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.answers import AnswerFile

@@ -14,8 +14,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.classifier import MLP, Feature, class_probabilities
-from thor2_jax.model.confidence import Calibration
-from thor2_jax.model.fusion import with_temperature
+from thor2_jax.model.fusion import Calibration, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
 from thor2_jax.types import Cloud

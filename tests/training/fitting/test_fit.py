@@ -13,7 +13,7 @@ from helpers import assert_refused, input_error, random_clouds
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.model.classifier import MLP, model_arrays
 from training.fitting import loop
 from training.fitting.fit import fit

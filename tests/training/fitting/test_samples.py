@@ -13,7 +13,7 @@ from helpers import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, build_samples, expand, fold_of_views

@@ -3,7 +3,7 @@
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.hosts import check_host_names, is_allowed_host
+from thor2_jax.service.hosts import check_host_names, is_allowed_host
 
 ALLOWED = """
     localhost LOCALHOST:8080 127.0.0.1:80 127.9.9.9 [::1] [::1]:8080 robot.local Robot.Local:1 10.0.0.7:80
