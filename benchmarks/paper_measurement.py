@@ -15,7 +15,7 @@ from thor2_jax.files import json_digest
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.model.recognition import DescribedFrame
-from training.baselines.baseline import baseline_inputs
+from training.baselines.baseline import Predictor, baseline_inputs
 from training.baselines.files import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
@@ -169,8 +169,8 @@ def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
     seconds = {"THOR2": describing + timed(lambda number: classify(described[number]))}
     for name, baseline in run.baselines.items():
 
-        def predict(number: int, model: Any = baseline.model) -> object:
-            return model.probabilities(baseline_inputs(described[number], config, frames[number]))
+        def recognize(number: int, predict: Predictor = baseline.predict) -> object:
+            return predict(baseline_inputs(described[number], config, frames[number]))
 
-        seconds[name] = timed(predict) + (describing if name in CLOUD_BASELINES else 0)
+        seconds[name] = timed(recognize) + (describing if name in CLOUD_BASELINES else 0)
     return seconds

@@ -24,9 +24,9 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
-from training.baselines.baseline import BaselineInputs, FittedBaseline
+from training.baselines.baseline import BaselineInputs
 from training.baselines.files import NETWORKS, TEMPLATES, TITLES, baseline_file
-from training.baselines.job import load_baselines
+from training.baselines.job import TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
@@ -57,7 +57,7 @@ class Run:
     name: str
     digest: str
     recognizer: Recognizer
-    baselines: Mapping[str, FittedBaseline] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, TrainedBaseline] = dataclasses.field(default_factory=dict)
     temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
@@ -110,7 +110,7 @@ class Run:
             column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
-            values |= {name: baseline.model.probabilities(inputs) for name, baseline in self.baselines.items()}
+            values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}
         values = {name: model.union.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
             scores = gallery_scores(model, inference)

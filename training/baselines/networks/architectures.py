@@ -22,7 +22,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import open_file
+from thor2_jax.files import file_digest, open_file
 from training.baselines.networks.densenet import DENSENET_161, ViTCNN
 from training.baselines.networks.resnet import RCFusion
 from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4, RGBDViT
@@ -74,17 +74,21 @@ def weights_file(directory: Path, name: str) -> Path:
     return path
 
 
-def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> list[Path]:
-    """Replace the weights of backbones by those of files in a directory, given without the suffix; return the files.
+def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> dict[str, str]:
+    """Replace the weights of backbones by those of files in a directory, given without the suffix.
+
+    Returns:
+        Name of each file -> its SHA-256.
 
     Raises:
         InputError: a file does not exist, or as `load_backbone`.
     """
-    paths = []
+    digests = {}
     for model, name in backbones:
-        paths.append(weights_file(directory, name))
-        load_backbone(model, paths[-1])
-    return paths
+        path = weights_file(directory, name)
+        load_backbone(model, path)
+        digests[path.name] = file_digest(path)
+    return digests
 
 
 def load_backbone(model: nnx.Module, path: Path) -> None:
@@ -132,8 +136,6 @@ def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) 
 
     Positions of another length D, or of a grid that is not square, are returned as they are.
     """
-    import jax
-
     sides = [round((n - 1) ** 0.5) for n in (positions.shape[1], shape[1])] if positions.ndim == 3 else [0, 0]
     square = positions.ndim == 3 and sides[0] ** 2 + 1 == positions.shape[1]
     if positions.shape == shape or not square or positions.shape[2] != shape[2]:
