@@ -20,7 +20,7 @@ from training.baselines.files import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
 from training.evaluation.results import compute_results, fuse_answers
-from training.evaluation.runs import Run, has_real_views, scratch_networks
+from training.evaluation.runs import Run
 from training.evaluation.scores import find_placements
 from training.readers.labelled import LabelledFrames
 
@@ -76,9 +76,7 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
         evaluate_dataset(runs, part, {"kind": dataset.kind, "path": name}, out)
         prefix = f"{name}/" if len(dataset.parts) > 1 else ""
         frames += [dataclasses.replace(each, frame=prefix + each.frame) for each in read_answers(out / ANSWERS)]
-    report = compute_results(
-        dataset.kind, runs, frames, real_views=has_real_views(runs), scratch=scratch_networks(runs)
-    )
+    report = compute_results(dataset.kind, runs, frames)
     return {
         "objects": len(report["classes"]),
         "frames": len(frames),

@@ -20,7 +20,7 @@ from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
-from training.evaluation.runs import Run, SequenceRun, all_predictors, has_real_views, scratch_networks
+from training.evaluation.runs import Run, all_predictors
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import Progress, locked
 
@@ -93,9 +93,7 @@ def evaluate_dataset(
                 file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
                 rate = (number + 1 - first) / (time.perf_counter() - start)
                 progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
-        conditions = isinstance(runs[0], SequenceRun), has_real_views(runs), scratch_networks(runs)
-        results = compute_results(dataset["kind"], runs, file.frames, *conditions)
-        report = {"dataset": description, "digests": digests, **results}
+        report = {"dataset": description, "digests": digests, **compute_results(dataset["kind"], runs, file.frames)}
         if not report["instances"]["scored"]:
             raise InputError(
                 f"model: no instance of the dataset is of a class of the runs; the dataset has "

@@ -11,7 +11,7 @@ from training.baselines.files import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.published import published_seconds
-from training.evaluation.results import COVERAGE
+from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.answers import Rule
+from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.scores import summarize_runs
 
 __all__ = [
@@ -93,9 +93,6 @@ _SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
 """What the published tables append to the methods that were trained without and with all real images, and what the
 titles of the small networks end with."""
 
-_PAPER_RULE: Rule = "max"
-"""Fusion rule of the THOR2 paper."""
-
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConditions:
@@ -105,7 +102,6 @@ class EvaluationConditions:
         own_objects: whether the classes are the objects of the frame's own sequence.
         models: number of trained models.
         frames: number of frames.
-        rule: fusion rule of the measured accuracies.
         real_views: whether the models were trained on real views, too.
         scratch: titles of the baselines whose networks were trained without pretrained weights.
     """
@@ -113,7 +109,6 @@ class EvaluationConditions:
     own_objects: bool
     models: int
     frames: int
-    rule: Rule
     real_views: bool = False
     scratch: Collection[str] = ()
 
@@ -209,8 +204,6 @@ def _differences(
     models = "models of its own" if table["models"] is None else f"{table['models']} models"
     here = "1 model is" if conditions.models == 1 else f"{conditions.models} models are"
     sentences.append(f"The publication uses {models}; here {here} evaluated, trained on other views and folds.")
-    fuses = any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"])
-    if fuses and conditions.rule != _PAPER_RULE:
-        rules = f"the rule {_PAPER_RULE}, this table by {conditions.rule}"
-        sentences.append(f"The publication fuses classifiers by {rules}.")
+    if any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"]):
+        sentences.append(f"The publication fuses classifiers by the rule max, this table by {DEFAULT_RULE}.")
     return sentences

@@ -1,7 +1,7 @@
 """All values of a report, computed from the answers, as one JSON table."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,14 +20,11 @@ from training.evaluation.answers import (
     main_fusion,
 )
 from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
-from training.evaluation.runs import Run, all_predictors
+from training.evaluation.runs import Run, SequenceRun, all_predictors, has_real_views, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
-__all__ = ["COVERAGE", "compute_results", "fuse_answers", "named_answers"]
-
-COVERAGE = 0.95
-"""Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
+__all__ = ["compute_results", "fuse_answers", "named_answers"]
 
 CURVE = tuple(k / 100 for k in range(101))
 """Shares of the correct answers at which the known/unknown curve is computed."""
@@ -82,25 +79,15 @@ def named_answers(
             yield run, instance, name, float(confidence)
 
 
-def compute_results(
-    kind: str,
-    runs: Sequence[Run],
-    frames: Sequence[FrameAnswers],
-    own_objects: bool = False,
-    real_views: bool = False,
-    scratch: Collection[str] = (),
-) -> dict[str, Any]:
+def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
     """Return accuracy, confidence metrics, confusions and speed.
 
     Args:
         kind: kind of dataset ("uwis", "ocid", "bop", "frames"); selects the tables and the published values.
         runs: evaluated runs, which share their classes.
         frames: the answers.
-        own_objects: whether a frame's classes are the objects of its sequence; selects the published values.
-        real_views: whether the runs were trained on real views, too; selects the published values.
-        scratch: titles of the baselines whose networks were trained without pretrained weights.
     """
-    classes = runs[0].classes
+    classes, scratch = runs[0].classes, scratch_networks(runs)
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = [instance.truth in classes for instance, _ in labelled]
     instances = [instance for instance, _ in labelled if instance.truth in classes]
@@ -125,7 +112,7 @@ def compute_results(
         "fusions": [],
         "worst": [],
         "published_tables": [],
-        "scratch": list(scratch),
+        "scratch": scratch,
     }
     if not instances:
         return results
@@ -156,7 +143,8 @@ def compute_results(
     confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
     for answer in answers[DEFAULT_RULE][main]:
         np.add.at(confusion, (truth, answer), 1)
-    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
+    own_objects = isinstance(runs[0], SequenceRun)
+    conditions = EvaluationConditions(own_objects, len(runs), len(frames), has_real_views(runs), scratch)
 
     def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
         return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
@@ -225,16 +213,16 @@ def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]
 def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
     confidence, correct = np.minimum(known.confidence, 1), known.class_index == truth
     of_unknown = np.minimum(unknown.confidence, 1)
-    accepted = scores.accuracy_at_coverage(confidence, correct, COVERAGE)
+    threshold, accuracy = scores.accuracy_at_coverage(confidence, correct)
     every = np.concatenate([confidence, of_unknown])
     return {
         "expected_calibration_error": scores.expected_calibration_error(confidence, correct),
         "auroc_right": scores.auroc(confidence, correct),
-        "threshold_at_coverage": accepted.threshold,
-        "accuracy_at_coverage": accepted.accuracy,
+        "threshold_at_coverage": threshold,
+        "accuracy_at_coverage": accuracy,
         "auroc_known": scores.auroc(every, np.arange(len(every)) < len(confidence)),
-        "unknown_refused": float((of_unknown < accepted.threshold).mean()) if len(of_unknown) else np.nan,
-        "unknown_named": float(scores.unknown_named(confidence[correct], of_unknown, COVERAGE)),
+        "unknown_refused": float((of_unknown < threshold).mean()) if len(of_unknown) else np.nan,
+        "unknown_named": float(scores.unknown_named(confidence[correct], of_unknown)),
     }
 
 

@@ -18,7 +18,7 @@ from training.evaluation.published import (
 )
 from training.readers.uwis import NOT_SCORED
 
-CONDITIONS = EvaluationConditions(own_objects=True, models=2, frames=10, rule="log-mean")
+CONDITIONS = EvaluationConditions(own_objects=True, models=2, frames=10)
 
 
 def thor2_tables() -> list[dict[str, Any]]:
@@ -82,10 +82,10 @@ def test_measured_values_stand_beside_the_published_ones() -> None:
     text = " ".join(own[0]["differences"])
     assert all(part in text for part in ("OCID", " 10 ", "here: 3", "22 of", "25 rows", "2 models", "5 models", "max"))
 
-    every = EvaluationConditions(own_objects=False, models=1, frames=10, rule="max")
+    every = EvaluationConditions(own_objects=False, models=1, frames=10)
     (table,) = compare_with_published("ocid", every, [where] * 4, ["a"] * 4, correct)
     assert table["number"] == 3
-    assert "26 objects" in " ".join(table["differences"]) and "rule" not in " ".join(table["differences"])
+    assert "26 objects" in " ".join(table["differences"])
     assert compare_with_published("frames", CONDITIONS, [where] * 4, ["a"] * 4, correct) == []
 
 
@@ -129,7 +129,7 @@ def test_networks_stand_beside_their_published_figures() -> None:
     attributes = [{"environment": "lounge", "occlusion": "high", "light": "1", "category": "food"}] * 2
 
     def ours(number: int, real: bool, titles: list[str]) -> tuple[dict[str, str], str]:
-        conditions = EvaluationConditions(False, 1, 1, "max", real, ("RCFusion-small",))
+        conditions = EvaluationConditions(False, 1, 1, real, ("RCFusion-small",))
         correct = dict.fromkeys(titles, marks)
         tables = compare_with_published("uwis", conditions, attributes, ["a", "b"], correct)
         (table,) = [table for table in tables if table["number"] == number]

@@ -1,7 +1,8 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ class ToyRun(NamedTuple):
     temperatures: Mapping[str, float] = {}
     answer_by: str = "classifiers"
     thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
+    baselines: Mapping[str, Any] = {}
+    model: Any = SimpleNamespace(run=SimpleNamespace(record={}))
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
