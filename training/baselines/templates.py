@@ -43,9 +43,7 @@ def create_backbone(source: str) -> ViT:
     """Return a backbone of BACKBONES with random weights."""
     if source == DINOV2:
         return ViT(VIT_DINOV2_SMALL, DINOV2_SIZE, rngs=nnx.Rngs(0))
-    network: Any = ARCHITECTURES[source].build(1, 0)
-    stream: ViT = network.color
-    return stream
+    return ARCHITECTURES[source].create(1, rngs=nnx.Rngs(0)).color
 
 
 def backbone_size(source: str) -> int:

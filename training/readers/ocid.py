@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import parse_json, read_file, read_table
+from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
 
@@ -66,7 +66,7 @@ class OCID(LabelledFrames):
                 self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not self._images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        value = _read_names(Path(names))
+        value = read_table(Path(names), (dict, list))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
             self._names, listed = _names_of_vlg(Path(names), value)
@@ -113,19 +113,6 @@ class OCID(LabelledFrames):
         folder = image.parent.parent
         cloud = folder / "pcd" / f"{image.stem}.pcd"
         return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
-
-
-def _read_names(path: Path) -> dict[Any, Any] | list[Any]:
-    """Return the value of a table of names: a list if it is one of OCID-VLG."""
-    if path.suffix.lower() != ".json":
-        return read_table(path)
-    try:
-        value = parse_json(read_file(path))
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error})") from None
-    if not isinstance(value, (dict, list)):
-        raise InputError(f"{path} holds a {type(value).__name__}; expected a table, or a list of OCID-VLG")
-    return value
 
 
 def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[str]) -> dict[str, dict[int, str]]:

@@ -162,8 +162,7 @@ class Architecture:
 
     def build(self, n_classes: int, seed: int) -> nnx.Module:
         """Return the network with random weights."""
-        network: nnx.Module = self.create(n_classes, rngs=nnx.Rngs(seed))
-        return network
+        return self.create(n_classes, rngs=nnx.Rngs(seed))
 
     def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
         """Return the backbones of a network with their files."""
