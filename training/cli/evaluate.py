@@ -114,18 +114,18 @@ def _evaluate(
     names: Path | None = None,
     given: Sequence[str] = (),
 ) -> None:
-    from training.evaluation.answering import RunArguments, answer_frames_in_pool
+    from training.evaluation.answering import answer_frames_in_pool, load_evaluated
     from training.evaluation.job import evaluate_dataset
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
-    arguments = RunArguments(models, per_sequence)
+    load = models, tuple(frames.identifiers) if per_sequence else None
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
-        loaded = arguments.load(tuple(frames.identifiers))
-        answering = functools.partial(answer_frames_in_pool, arguments, frames, pool) if pool else None
+        loaded = load_evaluated(*load)
+        answering = functools.partial(answer_frames_in_pool, load, frames, pool) if pool else None
         report = evaluate_dataset(loaded, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)
     result = "no report was written (--out)"

@@ -18,10 +18,13 @@ from training.evaluation.runs import Run, all_predictors, load_runs, load_sequen
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.workers import WorkerPool
 
-__all__ = ["NO_PIXELS", "RunArguments", "answer_frames", "answer_frames_in_pool"]
+__all__ = ["NO_PIXELS", "answer_frames", "answer_frames_in_pool", "load_evaluated"]
 
 NO_PIXELS = "no pixels in the label image"
 """Why an instance that the labels name could not be described."""
+
+Load = tuple[tuple[Path, ...], tuple[str, ...] | None]
+"""Arguments of `load_evaluated`."""
 
 FRAMES_PER_CHUNK = 4
 """Frames that a worker answers at a time, and that are answered again if it dies."""
@@ -46,46 +49,44 @@ def answer_frames(
         start = time.perf_counter()
 
 
-@dataclasses.dataclass(frozen=True)
-class RunArguments:
-    """Directories of the runs of an evaluation, which each process loads.
+def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None = None) -> Sequence[Run]:
+    """Load the runs of an evaluation.
 
-    Attributes:
-        models: see `load_runs`; with `per_sequence`, the directory of `load_sequence_runs`.
-        per_sequence: whether there is a run for each sequence.
+    Args:
+        models: see `load_runs`; with `sequences`, the directory of `load_sequence_runs`.
+        sequences: identifiers of the frames if there is a run for each sequence; None otherwise.
+
+    Raises:
+        InputError: as these functions, or for several directories of sequences.
     """
-
-    models: tuple[Path, ...]
-    per_sequence: bool = False
-
-    def load(self, identifiers: tuple[str, ...]) -> Sequence[Run]:
-        """Load the runs for the frames with these identifiers.
-
-        Raises:
-            InputError: as these functions, or for several directories of sequences.
-        """
-        if not self.per_sequence:
-            return load_runs(self.models)
-        if len(self.models) != 1:
-            raise InputError(
-                f"per_sequence: {len(self.models)} models are given; expected one directory with a run per sequence"
-            )
-        return load_sequence_runs(self.models[0], identifiers)
+    if sequences is None:
+        return load_runs(models)
+    if len(models) != 1:
+        raise InputError(
+            f"per_sequence: {len(models)} models are given; expected one directory with a run per sequence"
+        )
+    return load_sequence_runs(models[0], sequences)
 
 
 def answer_frames_in_pool(
-    arguments: RunArguments, frames: LabelledFrames, pool: WorkerPool, numbers: range
+    load: Load, frames: LabelledFrames, pool: WorkerPool, numbers: range
 ) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
     """Yield the frames of these numbers with the answers of `answer_frames`, which workers compute in chunks.
 
     Frames before one that cannot be read are yielded before its error is raised.
+
+    Args:
+        load: arguments of `load_evaluated`, by which each worker process loads the runs.
+        frames: the dataset.
+        pool: the workers.
+        numbers: numbers of the frames.
 
     Raises:
         InputError: as `answer_frames`.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
     starts = range(0, len(numbers), FRAMES_PER_CHUNK)
-    chunks = [(arguments, frames, numbers[start : start + FRAMES_PER_CHUNK]) for start in starts]
+    chunks = [(load, frames, numbers[start : start + FRAMES_PER_CHUNK]) for start in starts]
     with contextlib.closing(pool(_answer_chunk, chunks)) as results:
         for answered, error in results:
             yield from answered
@@ -93,15 +94,15 @@ def answer_frames_in_pool(
                 raise error
 
 
-_loaded = functools.lru_cache(1)(RunArguments.load)
+_loaded = functools.lru_cache(1)(load_evaluated)
 """Loads the runs once in a worker process."""
 
 
 def _answer_chunk(
-    chunk: tuple[RunArguments, LabelledFrames, range],
+    chunk: tuple[Load, LabelledFrames, range],
 ) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
-    arguments, frames, numbers = chunk
-    runs, answered = _loaded(arguments, tuple(frames.identifiers)), []
+    load, frames, numbers = chunk
+    runs, answered = _loaded(*load), []
     try:
         for item, answers in answer_frames(runs, (frames[n] for n in numbers)):
             frame = dataclasses.replace(item.frame)  # without its cached properties

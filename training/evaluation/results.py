@@ -19,8 +19,8 @@ from training.evaluation.answers import (
     fusions,
     main_fusion,
 )
-from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
-from training.evaluation.runs import Run, SequenceRun, all_predictors, has_real_views, scratch_networks
+from training.evaluation.published import compare_with_published, published_means
+from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
@@ -87,7 +87,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         runs: evaluated runs, which share their classes.
         frames: the answers.
     """
-    classes, scratch = runs[0].classes, scratch_networks(runs)
+    classes = runs[0].classes
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = [instance.truth in classes for instance, _ in labelled]
     instances = [instance for instance, _ in labelled if instance.truth in classes]
@@ -112,7 +112,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         "fusions": [],
         "worst": [],
         "published_tables": [],
-        "scratch": scratch,
+        "scratch": scratch_networks(runs),
     }
     if not instances:
         return results
@@ -143,8 +143,6 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
     for answer in answers[DEFAULT_RULE][main]:
         np.add.at(confusion, (truth, answer), 1)
-    own_objects = isinstance(runs[0], SequenceRun)
-    conditions = EvaluationConditions(own_objects, len(runs), len(frames), has_real_views(runs), scratch)
 
     def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
         return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
@@ -152,11 +150,11 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     results |= {
         "fusions": list(by_rule[DEFAULT_RULE]),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, correct[rule], own_objects) for names in tables]
+            rule: [_accuracy(kind, names, attributes, correct[rule], runs[0].own_objects) for names in tables]
             for rule in by_rule
         },
         "published_tables": compare_with_published(
-            kind, conditions, attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
+            kind, runs, len(frames), attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
         ),
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])

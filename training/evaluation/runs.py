@@ -35,7 +35,6 @@ __all__ = [
     "Run",
     "SequenceRun",
     "all_predictors",
-    "has_real_views",
     "load_runs",
     "load_sequence_runs",
     "scratch_networks",
@@ -59,11 +58,17 @@ class Run:
     recognizer: Recognizer
     baselines: Mapping[str, TrainedBaseline] = dataclasses.field(default_factory=dict)
     temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    own_objects = False  # whether the classes of a frame are the objects of its sequence
 
     @property
     def model(self) -> Model:
         """The model of `recognizer`."""
         return self.recognizer.model
+
+    @property
+    def has_real_views(self) -> bool:
+        """Whether the run was trained on labelled real instances, too."""
+        return "frames" in self.model.run.record.get("dataset", {})
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -190,6 +195,7 @@ class SequenceRun(Run):
     """
 
     of_sequence: Mapping[str, Run] = dataclasses.field(default_factory=dict)
+    own_objects = True
 
     @functools.cached_property
     def classes(self) -> tuple[str, ...]:
@@ -255,11 +261,6 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=of_sequence))
     return result
-
-
-def has_real_views(runs: Sequence[Run]) -> bool:
-    """Return whether runs were trained on labelled real instances, too."""
-    return any("frames" in run.model.run.record.get("dataset", {}) for run in runs)
 
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:

@@ -1,7 +1,6 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
 from collections.abc import Mapping
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +25,8 @@ class ToyRun(NamedTuple):
     answer_by: str = "classifiers"
     thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
     baselines: Mapping[str, Any] = {}
-    model: Any = SimpleNamespace(run=SimpleNamespace(record={}))
+    own_objects: bool = False
+    has_real_views: bool = False
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
