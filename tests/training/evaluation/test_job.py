@@ -23,6 +23,7 @@ from PIL import Image
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
+from thor2_jax.frames.overlay import Annotation
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recognizer import Recognizer
@@ -251,7 +252,8 @@ def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
     labels = np.zeros((60, 90), np.uint8)
     labels[20:50, 5:40] = 1
     labels[20:50, 50:85] = 2
-    draw_judged(color, labels, {1: (True, "a"), 2: (False, "b (c)"), 7: (False, "gone")}, tmp_path / "f.jpg")
+    judged = [Annotation(2, INCORRECT, "b (c)"), Annotation(7, INCORRECT, "gone"), Annotation(1, CORRECT, "a")]
+    draw_judged(color, labels, judged, tmp_path / "f.jpg")
     with Image.open(tmp_path / "f.jpg") as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     for row, paint in (((49, 20), CORRECT), ((49, 70), INCORRECT)):
