@@ -47,7 +47,7 @@ SCRATCH_RATE, PRETRAINED_RATE = 1e-3, 1e-4
 WARM_UP = 0.05
 """Fraction of the steps in which the learning rate rises."""
 
-WEIGHT_DECAY = 0.05
+OPTIMIZER = partial(optax.adamw, weight_decay=0.05)
 
 
 def rows_of(crops: ViewCrops, rows: Any) -> ViewCrops:
@@ -103,8 +103,7 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
         return crops.color, crops.normals
 
     model.train()
-    optimizer = partial(optax.adamw, weight_decay=WEIGHT_DECAY)
-    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, optimizer, partial(_learning_rate, rate))
+    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, OPTIMIZER, partial(_learning_rate, rate))
     fitted = fit_network(task, fit, model, label, np.flatnonzero(~held_out), n_views)
     fitted.eval()
     predict = crop_function(compiled(fitted, network_inputs))
