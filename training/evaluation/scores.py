@@ -106,9 +106,15 @@ def accuracy_at_coverage(confidence: Floats, correct: Flags) -> tuple[float, flo
     """
     if not len(confidence):
         return math.nan, math.nan
-    accepted = math.ceil(round(COVERAGE * len(confidence), 9))  # 0.95 * 20 is slightly more than 19 in floating point
-    threshold = np.sort(confidence)[len(confidence) - accepted]
+    threshold = _threshold(confidence, COVERAGE)
     return float(threshold), float(correct[confidence >= threshold].mean())
+
+
+def _threshold(confidence: Floats, kept: ArrayLike) -> NDArray[np.float64]:
+    """Return the largest thresholds that keep shares `kept` [...] of confidences; infinity keeps nothing."""
+    # 0.95 * 20 is slightly more than 19 in floating point.
+    count = np.ceil(np.round(np.asarray(kept) * len(confidence), 9)).astype(np.intp)
+    return np.append(np.sort(confidence), np.inf)[len(confidence) - count]
 
 
 def unknown_named(correct: Floats, unknown: Floats, kept: ArrayLike = COVERAGE) -> NDArray[np.float64]:
@@ -124,13 +130,9 @@ def unknown_named(correct: Floats, unknown: Floats, kept: ArrayLike = COVERAGE) 
     Returns:
         [...] shares; NaN if there is no correct answer or no unknown object.
     """
-    ordered, shares = np.sort(np.asarray(correct, np.float64)), np.asarray(kept)
-    if not len(ordered) or not len(unknown):
-        return np.full(shares.shape, np.nan)
-    # 0.95 * 20 is slightly more than 19 in floating point. Keeping nothing takes a threshold above all confidences.
-    count = np.ceil(np.round(shares * len(ordered), 9)).astype(np.intp)
-    threshold = np.append(ordered, np.inf)[len(ordered) - count]
-    return np.asarray((unknown >= threshold[..., None]).mean(axis=-1))
+    if not len(correct) or not len(unknown):
+        return np.full(np.shape(kept), np.nan)
+    return np.asarray((unknown >= _threshold(correct, kept)[..., None]).mean(axis=-1))
 
 
 _ORDER = {"none": 0, "low": 1, "high": 2}

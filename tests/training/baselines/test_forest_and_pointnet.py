@@ -102,15 +102,12 @@ def test_probabilities_match_numpy() -> None:
         pointnet(6)
 
 
-@pytest.mark.parametrize("sizes", [(1,), (0, 7), (POINTS - 1, POINTS + 1, 900)])
-def test_any_number_of_points(sizes: tuple[int, ...]) -> None:
-    probabilities = pointnet()(inputs(sizes))
-    assert probabilities.shape == (len(sizes), 5)
-    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
-
-
 def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
-    both = inputs((800, 500))
-    first = np.asarray(both.normal.points)[0, :800], np.asarray(both.normal.colors)[0, :800]
-    one = BaselineInputs(thor2.PointClouds.pack([first]), both.tops[:1], None)
-    np.testing.assert_allclose(pointnet()(one)[0], pointnet()(both)[0], atol=1e-6)
+    sizes = (POINTS - 1, POINTS + 1, 900, 1, 0)
+    both = inputs(sizes)
+    probabilities = pointnet()(both)
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
+    for row, size in enumerate(sizes):
+        cloud = np.asarray(both.normal.points)[row, :size], np.asarray(both.normal.colors)[row, :size]
+        one = BaselineInputs(thor2.PointClouds.pack([cloud]), both.tops[:1], None)
+        np.testing.assert_allclose(pointnet()(one)[0], probabilities[row], atol=1e-6)

@@ -1,9 +1,10 @@
 """The published tables, and reports that show them beside measured accuracies."""
 
+import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,16 +19,10 @@ from training.evaluation.published import (
 )
 from training.readers.uwis import NOT_SCORED
 
+toy_run = functools.partial(SimpleNamespace, own_objects=False, has_real_views=False, baselines={})
+"""Returns the attributes of a run that the comparison uses."""
 
-class ToyRun(NamedTuple):
-    """The attributes of a run that the comparison uses."""
-
-    own_objects: bool = False
-    has_real_views: bool = False
-    baselines: dict[str, Any] = {}  # noqa: RUF012
-
-
-OWN: tuple[Any, Any] = [ToyRun(own_objects=True)] * 2, 10
+OWN: tuple[Any, Any] = [toy_run(own_objects=True)] * 2, 10
 
 
 def thor2_tables() -> list[dict[str, Any]]:
@@ -91,7 +86,7 @@ def test_measured_values_stand_beside_the_published_ones() -> None:
     text = " ".join(own[0]["differences"])
     assert all(part in text for part in ("OCID", " 10 ", "here: 3", "22 of", "25 rows", "2 models", "5 models", "max"))
 
-    (table,) = compare_with_published("ocid", [ToyRun()], 10, [where] * 4, ["a"] * 4, correct)
+    (table,) = compare_with_published("ocid", [toy_run()], 10, [where] * 4, ["a"] * 4, correct)
     assert table["number"] == 3
     assert "26 objects" in " ".join(table["differences"])
     assert compare_with_published("frames", *OWN, [where] * 4, ["a"] * 4, correct) == []
@@ -138,7 +133,7 @@ def test_networks_stand_beside_their_published_figures() -> None:
 
     def ours(number: int, real: bool, titles: list[str]) -> tuple[dict[str, str], str]:
         scratch = {"rcfusion-small": SimpleNamespace(weights={})}
-        run = ToyRun(has_real_views=real, baselines=scratch)
+        run = toy_run(has_real_views=real, baselines=scratch)
         correct = dict.fromkeys(titles, marks)
         tables = compare_with_published("uwis", [run], 1, attributes, ["a", "b"], correct)
         (table,) = [table for table in tables if table["number"] == number]

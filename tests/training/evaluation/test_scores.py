@@ -31,13 +31,6 @@ def test_metrics_without_answers_are_nan() -> None:
     assert np.isnan([error, area, *scores.accuracy_at_coverage(nothing, nothing), *unknown]).all()
 
 
-def test_auroc_is_the_fraction_of_ordered_pairs() -> None:
-    rng = np.random.default_rng(2)
-    confidence, positive = rng.integers(0, 6, 40) / 5, rng.random(40) < 0.4
-    pairs = [(0.5 if p == n else float(p > n)) for p in confidence[positive] for n in confidence[~positive]]
-    assert scores.auroc(confidence, positive) == pytest.approx(np.mean(pairs))
-
-
 def test_coverage_matches_hand_calculation() -> None:
     confidence = np.arange(1, 21) / 20
     correct = np.ones(20, bool)
