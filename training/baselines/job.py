@@ -1,6 +1,5 @@
 """Training and loading the baselines of finished runs, RUN/baselines/NAME.safetensors."""
 
-import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -108,14 +107,7 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
 def _train(task: FitTask) -> None:
     file, start = baseline_file(task.directory, task.name), time.perf_counter()
     remove_leftovers(file.parent)
-    task.scratch.mkdir(parents=True, exist_ok=True)
-    try:
-        fitted = _METHODS[task.name][0](task)
-    except InputError:
-        with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
-            task.scratch.rmdir()
-            file.parent.rmdir()
-        raise
+    fitted = _METHODS[task.name][0](task)
     write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
     remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 

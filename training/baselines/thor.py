@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
-from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP, model_arrays, model_from_arrays
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
@@ -168,11 +167,9 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     """Fit the library, each classifier in the same way as the run's own; an interrupted fit resumes.
 
     Raises:
-        InputError: the camera angles of the source are unknown; or as `fit`.
+        InputError: as `fit`.
     """
-    job = task.source.record.get("job")
-    if job is None:
-        raise InputError("baselines: thor needs the camera angles of the views; give a rendered dataset with --dataset")
+    job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # of each view number
     config = dataclasses.replace(task.run.config, homology="closed_form")

@@ -163,10 +163,9 @@ def _print_report(report: Mapping[str, Any]) -> None:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
         more = ", ..." if len(missing) > MAX_LISTED else ""
         console.print(f"labels without pixels in the label image: {', '.join(missing[:MAX_LISTED])}{more}")
-    if speed["frames_per_second"]:
-        console.print(
-            f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
-            f"median {speed['median_seconds']:.2f} s a frame"
-        )
+    console.print(
+        f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
+        f"median {speed['median_seconds']:.2f} s a frame"
+    )
     for text in page.answer_texts(report):
         console.print(escape_characters(text))

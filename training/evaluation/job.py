@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,6 @@ Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None
 """Yields the frames of these numbers with their answers, such as `answering.answer_frames_in_pool`."""
 
 ANSWERS = "answers.jsonl"
-
-MAX_LISTED = 20
-"""Names that an error message shows."""
 
 
 def evaluate_dataset(
@@ -94,12 +91,6 @@ def evaluate_dataset(
                 rate = (number + 1 - first) / (time.perf_counter() - start)
                 progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
         report = {"dataset": description, "digests": digests, **compute_results(dataset["kind"], runs, file.frames)}
-        if not report["instances"]["scored"]:
-            raise InputError(
-                f"model: no instance of the dataset is of a class of the runs; the dataset has "
-                f"{_listed(report['instances']['no_class'])}, the runs know {_listed(runs[0].classes)}; check the "
-                "names, or give other runs"
-            )
         report["no_pixels"] = [
             {"frame": answers.frame, "label": instance.label, "truth": instance.truth}
             for answers in file.frames
@@ -110,11 +101,6 @@ def evaluate_dataset(
         write_report_page(report, pictures, out)
         write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
         return report
-
-
-def _listed(names: Iterable[str]) -> str:
-    first = sorted(names)[:MAX_LISTED]
-    return ", ".join(first) + (", ..." if len(first) == MAX_LISTED else "") if first else "no names"
 
 
 def _file_digests(files: Sequence[Path]) -> dict[str, str]:

@@ -146,11 +146,9 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
         paths: run directories, or directories with the folds of a training.
 
     Raises:
-        InputError: no run is given, one cannot be read or is given twice, or the runs differ in what they must share.
+        InputError: a run cannot be read or is given twice, or the runs differ in what they must share.
     """
     directories = find_run_directories(paths)
-    if not directories:
-        raise InputError("model: no run directory is given")
     runs = [_load(directory) for directory in directories]
     by_digest: dict[str, Path] = {}
     for directory, run in zip(directories, runs, strict=True):
@@ -242,10 +240,10 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
     }
     missing = [sequence for sequence, path in paths.items() if path is None]
     loaded = {path: load_runs([path]) for path in dict.fromkeys(paths.values()) if path is not None}
-    if missing or not loaded:
+    if missing:
         raise InputError(
-            f"model: {directory} has no run for {', '.join(missing) or 'any sequence'}; "
-            "train the missing ones with `thor2 train --sequences`"
+            f"model: {directory} has no run for {', '.join(missing)}; train the missing ones with "
+            "`thor2 train --sequences`"
         )
     (first_path, first), *others = loaded.items()
     for path, runs in others:

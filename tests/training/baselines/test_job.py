@@ -113,9 +113,6 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: C
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run", "--baselines", "forest, tree")
     assert refused(*command).startswith("error: baselines is forest, tree; ")
     assert not (tmp_path / "run").exists()
-    without_angles = MemoryViews(clouds(), CONFIG)
-    assert without_angles.digest == SOURCE.digest
-    assert_refused("^baselines: thor", train_baselines, write_run(tmp_path / "run"), without_angles, ["thor"])
 
 
 def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
