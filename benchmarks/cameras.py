@@ -37,8 +37,8 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import COLORS, Annotation, draw_instances
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
-from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers, Rule, main_fusion
+from training.evaluation.job import answer_frames
 from training.evaluation.results import fuse_answers
 from training.evaluation.runs import Run, load_runs
 from training.evaluation.scores import (

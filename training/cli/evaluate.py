@@ -114,8 +114,7 @@ def _evaluate(
     names: Path | None = None,
     given: Sequence[str] = (),
 ) -> None:
-    from training.evaluation.answering import answer_frames_in_pool, load_evaluated
-    from training.evaluation.job import evaluate_dataset
+    from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_evaluated
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
     load = models, tuple(frames.identifiers) if per_sequence else None

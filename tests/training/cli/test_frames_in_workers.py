@@ -14,7 +14,7 @@ from recording_files import table_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-from training.evaluation.answering import answer_frames, answer_frames_in_pool, load_evaluated
+from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import FRAMES_PER_CHUNK, RecognizerArguments, recognize_frames, recognize_frames_in_pool
 from training.readers.frame_files import find_frames, segmented_source
 from training.readers.frames import FrameFolder

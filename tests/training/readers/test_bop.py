@@ -82,7 +82,7 @@ def test_names(tmp_path: Path, name: str) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """There are two scenes of three objects; in the second, the first object is almost hidden."""
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
-    monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
+    monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
     objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
     write_bop(tmp_path / "test" / "000048", objects=objects, visible=[1, 1, 1])
     write_bop(tmp_path / "test" / "000049", objects=objects, visible=[0.05, 1, 1])

@@ -22,9 +22,8 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import file_digest, open_file
-from training.baselines.networks.densenet import DENSENET_161, ViTCNN
-from training.baselines.networks.resnet import RCFusion
+from thor2_jax.files import file_digest
+from training.baselines.networks.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4, RGBDViT
 
 __all__ = [
@@ -103,7 +102,6 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     prefix = getattr(model, "PREFIX", "")
     loaded = {}
     try:
-        open_file(path).close()
         with safetensors.safe_open(path, "numpy") as file:
             names = set(file.keys())
             for keys, value in values.items():
