@@ -1,4 +1,4 @@
-"""Evaluations with stand-ins for recognizers: interrupted, resumed and refused ones; answers, the page, its pictures."""
+"""Evaluations with stand-ins for recognizers: interrupted, resumed, refused; answers, the page and its pictures."""
 
 import dataclasses
 import json
