@@ -53,7 +53,6 @@ class BOP(LabelledFrames):
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
-        self._table = functools.lru_cache(maxsize=3)(read_table)  # frames are read scene by scene
         self._names_file = names
         self._names = None if names is None else read_object_names(Path(names))
 
@@ -86,7 +85,8 @@ class BOP(LabelledFrames):
     def _entry(self, scene: Path, name: str, image: Path) -> Iterator[Any]:
         """Yield the entry of an image in a table of its scene; errors name the table."""
         path, number = scene / f"scene_{name}.json", str(int(image.stem))
-        table = self._table(path)
+        status = path.stat()
+        table = _read_table(path, status.st_mtime_ns, status.st_size)
         with with_context(str(path)):
             if number not in table:
                 raise InputError(f"it has no image {number}")
@@ -105,6 +105,11 @@ class BOP(LabelledFrames):
         if obj_id not in self._names:
             raise InputError(f"{self._names_file} lacks the obj_id {obj_id}")
         return self._names[obj_id]
+
+
+@functools.lru_cache(maxsize=3)  # frames are read scene by scene
+def _read_table(path: Path, modified: int, size: int) -> dict[Any, Any]:
+    return read_table(path)
 
 
 def _mask(path: Path, depth: NDArray[Any]) -> NDArray[np.bool_]:
