@@ -13,7 +13,6 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.baseline import FitTask, Predictor
 from training.baselines.files import (
     BASELINES,
-    CLOUD_BASELINES,
     NETWORKS,
     TEMPLATES,
     StoredBaseline,
@@ -57,7 +56,7 @@ class TrainedBaseline(NamedTuple):
 def train_baselines(
     path: str | Path,
     source: ViewSource,
-    names: Sequence[str] = CLOUD_BASELINES,
+    names: Sequence[str],
     progress: Progress = lambda stage, done, total, note: None,
     weights: Path | None = None,
 ) -> None:
