@@ -108,7 +108,7 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: Command) -> None:
-    assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG))
+    assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG), ["forest"])
     assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run", "--baselines", "forest, tree")
     assert refused(*command).startswith("error: baselines is forest, tree; ")
