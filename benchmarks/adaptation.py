@@ -26,8 +26,8 @@ from thor2_jax.files import write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import prepare_instance
 from training.augmentation.simulated_cameras import SimulatedCamera, through_camera
-from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers
+from training.evaluation.job import answer_frames
 from training.evaluation.runs import Run, load_runs
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import check_same_job

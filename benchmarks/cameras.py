@@ -37,9 +37,9 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import COLORS, Annotation, draw_instances
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
-from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers, Rule, main_fusion
-from training.evaluation.results import COVERAGE, fuse_answers
+from training.evaluation.job import answer_frames
+from training.evaluation.results import fuse_answers
 from training.evaluation.runs import Run, load_runs
 from training.evaluation.scores import (
     auroc,
@@ -199,7 +199,7 @@ def _measure(
                 "steadiness": steadiness(placement, answer),
                 "calibration_error": expected_calibration_error(confidence, correct[described]),
                 "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
-                "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown, COVERAGE)),
+                "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown)),
                 **at_threshold(float(np.median(runs[run].thresholds)), confidence, correct[described], of_unknown),
                 **{
                     f"accuracy in {name}": placement_accuracy(placement[group == name], correct[group == name])

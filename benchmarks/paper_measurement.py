@@ -15,12 +15,12 @@ from thor2_jax.files import json_digest
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.model.recognition import DescribedFrame
-from training.baselines.baseline import baseline_inputs
+from training.baselines.baseline import Predictor, baseline_inputs
 from training.baselines.files import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
 from training.evaluation.results import compute_results, fuse_answers
-from training.evaluation.runs import Run, has_real_views, scratch_networks
+from training.evaluation.runs import Run
 from training.evaluation.scores import find_placements
 from training.readers.labelled import LabelledFrames
 
@@ -76,9 +76,7 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
         evaluate_dataset(runs, part, {"kind": dataset.kind, "path": name}, out)
         prefix = f"{name}/" if len(dataset.parts) > 1 else ""
         frames += [dataclasses.replace(each, frame=prefix + each.frame) for each in read_answers(out / ANSWERS)]
-    report = compute_results(
-        dataset.kind, runs, frames, real_views=has_real_views(runs), scratch=scratch_networks(runs)
-    )
+    report = compute_results(dataset.kind, runs, frames)
     return {
         "objects": len(report["classes"]),
         "frames": len(frames),
@@ -169,8 +167,8 @@ def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
     seconds = {"THOR2": describing + timed(lambda number: classify(described[number]))}
     for name, baseline in run.baselines.items():
 
-        def predict(number: int, model: Any = baseline.model) -> object:
-            return model.probabilities(baseline_inputs(described[number], config, frames[number]))
+        def recognize(number: int, predict: Predictor = baseline.predict) -> object:
+            return predict(baseline_inputs(described[number], config, frames[number]))
 
-        seconds[name] = timed(predict) + (describing if name in CLOUD_BASELINES else 0)
+        seconds[name] = timed(recognize) + (describing if name in CLOUD_BASELINES else 0)
     return seconds

@@ -36,8 +36,8 @@ from thor2_jax.files import check_output_directory
 from thor2_jax.model.classifier import MLP, feature_of
 from thor2_jax.model.run_directory import TrainedRun, input_size, save_run
 from thor2_jax.recognizer import THOR2
-from training.evaluation.answering import answer_frames
 from training.evaluation.answers import fusions
+from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
 from training.fitting.fit import FitOptions

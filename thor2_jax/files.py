@@ -291,8 +291,12 @@ def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
     return sizes[id(value)]
 
 
-def read_table(path: Path) -> dict[Any, Any]:
+def read_table(path: Path, kinds: tuple[type, ...] = (dict,)) -> Any:
     """Read a file that holds one table: JSON if its name ends in .json, YAML otherwise.
+
+    Args:
+        path: the file.
+        kinds: types of a table; with `list`, a list counts as one.
 
     Raises:
         InputError: if the file is damaged or holds something else; the message names the file.
@@ -303,6 +307,7 @@ def read_table(path: Path) -> dict[Any, Any]:
         table = parse_json(content) if path.suffix.lower() == ".json" else parse_yaml(content)
     except ValueError as error:
         raise InputError(f"{path} is damaged ({error})") from None
-    if not isinstance(table, dict):
-        raise InputError(f"{path} holds a {type(table).__name__}; expected a table")
+    if not isinstance(table, kinds):
+        expected = "a table or a list" if list in kinds else "a table"
+        raise InputError(f"{path} holds a {type(table).__name__}; expected {expected}")
     return table

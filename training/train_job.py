@@ -14,8 +14,8 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.files import check_baselines, crop_size
-from training.baselines.job import check_weights, pretrained_files, train_baselines
+from training.baselines.files import check_baselines
+from training.baselines.job import check_weights, crop_size, pretrained_files, train_baselines
 from training.enrollment import labelled_views
 from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol

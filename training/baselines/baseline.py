@@ -2,10 +2,9 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
@@ -25,24 +23,21 @@ from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, 
 from training.fitting.samples import fold_of_views
 from training.fitting.steps import FitState
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
-from training.views.normalized_views import ViewSource
+from training.views.normalized_views import NormalizedViews, ViewSource
 
 __all__ = [
-    "Baseline",
     "BaselineInputs",
     "FitTask",
-    "FittedBaseline",
     "NetworkFit",
+    "Predictor",
+    "as_given",
     "baseline_inputs",
+    "compiled",
     "fit_network",
     "in_batches",
 ]
 
 Integers = NDArray[np.integer[Any]]
-
-
-def _no_crops(size: int) -> ViewCrops:
-    raise InputError("frame is missing; expected the frame of the instances: image networks read crops of it")
 
 
 class BaselineInputs(NamedTuple):
@@ -57,7 +52,7 @@ class BaselineInputs(NamedTuple):
 
     normal: PointClouds
     tops: NDArray[np.float32]
-    crops: Callable[[int], ViewCrops] = _no_crops
+    crops: Callable[[int], ViewCrops]
 
     def predicted(
         self, size: int, n_classes: int, predict: Callable[[ViewCrops], NDArray[np.float32]]
@@ -80,14 +75,8 @@ def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: 
     return BaselineInputs(view_normalize(described.packed, config), np.asarray(described.descriptors.tops), crops)
 
 
-class Baseline(Protocol):
-    """A trained baseline."""
-
-    def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
-        """Return class probabilities, [B, C]."""
-
-    def arrays(self) -> Mapping[str, NDArray[Any]]:
-        """Return all fitted parameters by name."""
+Predictor = Callable[[BaselineInputs], NDArray[np.float32]]
+"""A trained baseline: function of the inputs that returns class probabilities [B, C]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +87,6 @@ class FitTask:
         name: name of the baseline.
         source: views of the run.
         run: the run. Its fold is held out; nothing is if it is the only one.
-        options: options of the fit.
         directory: directory of the run.
         weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
@@ -107,10 +95,15 @@ class FitTask:
     name: str
     source: ViewSource
     run: TrainedRun
-    options: FitOptions
     directory: Path
     weights: Path | None
     progress: Callable[[str, int, int, str], object]
+
+    @property
+    def options(self) -> FitOptions:
+        """Options of the fit, those of the run."""
+        record, rates = self.run.record, tuple(self.run.record["learning_rates"])
+        return FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
 
     @property
     def scratch(self) -> Path:
@@ -130,11 +123,11 @@ class FitTask:
         """Return the temperature for the probabilities of the held-out clouds, from `predict`; None without any."""
         return fit_temperature(predict(), label[held_out]) if held_out.any() else None
 
-    def shards(self, stage: str, unit: str) -> Iterator[tuple[int, slice, int]]:
-        """Yield index, rows among all clouds, and class index of each shard, and show the progress of a stage."""
+    def shards(self, stage: str, unit: str) -> Iterator[tuple[int, slice, NormalizedViews]]:
+        """Yield index, rows among all clouds, and views of each shard, and show the progress of a stage."""
         done, total = 0, self.n_clouds
         for index, shard in enumerate(self.source.shards):
-            yield index, slice(done, done + shard.views), shard.label
+            yield index, slice(done, done + shard.views), self.source.read(index)
             done += shard.views
             self.progress(stage, done, total, unit)
 
@@ -144,12 +137,17 @@ class FitTask:
         return sum(shard.views for shard in self.source.shards)
 
 
-class FittedBaseline(NamedTuple):
-    """A baseline, its temperature (None without a held-out set), and its files of pretrained weights -> SHA-256."""
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
+def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
+    def loss_of(params: Any) -> Any:
+        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
+        logits = model(*inputs(*batch))
+        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
+        return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
 
-    model: Baseline
-    temperature: float | None
-    weights: Mapping[str, str] = MappingProxyType({})
+    (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
+    return FitState(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
 
 
 class NetworkFit(NamedTuple):
@@ -172,17 +170,9 @@ class NetworkFit(NamedTuple):
     rate: Callable[[int, int], float]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
-def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
-    def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
-        logits = model(*inputs(*batch))
-        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
-        return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
-
-    (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
-    updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
-    return FitState(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
+def as_given(*arrays: Any) -> tuple[Any, ...]:
+    """Return the arrays of a batch as the arguments of a network."""
+    return arrays
 
 
 def fit_network(
@@ -217,6 +207,19 @@ def fit_network(
         leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
     state = jax.tree.unflatten(structure, leaves)
     return nnx.merge(graph, state.params, state.rest)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+def _apply(graph: Any, state: Any, inputs: Any, output: Any, *arrays: Any) -> jax.Array:
+    return output(nnx.merge(graph, state)(*inputs(*arrays)))
+
+
+def compiled(
+    model: nnx.Module, inputs: Callable[..., tuple[Any, ...]], output: Callable[[Any], Any] = jax.nn.softmax
+) -> Callable[..., jax.Array]:
+    """Return a compiled function of arrays: `output` of a network that is applied to `inputs` of them."""
+    graph, state = nnx.split(model)
+    return functools.partial(_apply, graph, state, inputs, output)
 
 
 def in_batches(function: Callable[..., Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:

@@ -27,7 +27,6 @@ __all__ = [
     "TITLES",
     "baseline_file",
     "check_baselines",
-    "crop_size",
     "read_baseline",
     "write_baseline",
 ]
@@ -58,22 +57,6 @@ TITLES = {
 }
 """Column titles of the baselines, in the order of the columns."""
 
-LARGE_CROP, SMALL_CROP = 224, 96
-"""Side of the crops of the networks and of their small variants, pixels."""
-
-
-def crop_size(names: Sequence[str], weights: bool) -> int | None:
-    """Return the side of the crops in pixels that baselines are trained on, the largest one; None if they need none.
-
-    Args:
-        names: names of the baselines.
-        weights: whether there are pretrained weights: DINOv2, by which templates are compared then, reads large crops.
-    """
-    sizes = [SMALL_CROP if name.endswith("-small") else LARGE_CROP for name in names if name in NETWORKS]
-    if TEMPLATES in names:
-        sizes.append(LARGE_CROP if weights else SMALL_CROP)
-    return max(sizes, default=None)
-
 
 def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
     """Return `names` in the order of BASELINES.
@@ -103,13 +86,11 @@ class StoredBaseline:
     Attributes:
         arrays: learned arrays by name.
         temperature: temperature fitted on the held-out set; None without one.
-        seconds: training time.
         weights: files of pretrained weights it was fitted from -> SHA-256; empty if it was trained from scratch.
     """
 
     arrays: Mapping[str, NDArray[Any]]
     temperature: float | None
-    seconds: float
     weights: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -120,8 +101,8 @@ def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str
     return content_digest(parts)
 
 
-def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str]) -> None:
-    """Write a baseline file atomically, and create its directory if it is missing.
+def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], seconds: float) -> None:
+    """Write a baseline file and its training time atomically, and create its directory if it is missing.
 
     Raises:
         OSError: if the file cannot be written.
@@ -130,7 +111,7 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str]) -
         "format": BASELINE_FORMAT,
         "classes": list(classes),
         "temperature": stored.temperature,
-        "seconds": round(stored.seconds, 1),
+        "seconds": round(seconds, 1),
     }
     if stored.weights:
         about["weights"] = dict(stored.weights)
@@ -163,7 +144,7 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
             raise ValueError("its digest does not match")
         if about["classes"] != list(classes):
             raise InputError(f"model: {path} has other classes than its run; train the baseline again")
-        return StoredBaseline(arrays, about["temperature"], about["seconds"], about.get("weights", {}))
+        return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:

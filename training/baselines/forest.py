@@ -14,12 +14,14 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import mirror, turn
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds, Strips
-from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline
+from training.baselines.baseline import FitTask, Predictor
+from training.baselines.files import StoredBaseline
 from training.fitting.samples import MIRRORS, VIEWS_PER_BATCH
 from training.views.normalized_views import padded_batches
 
-__all__ = ["Forest", "fit_forest", "forest_features", "tree_arrays"]
+__all__ = ["fit_forest", "forest_features", "load_forest", "predict", "tree_arrays"]
 
 
 @partial(jax.jit, static_argnums=2)
@@ -47,43 +49,26 @@ def forest_features(normal: PointClouds, network: ColorNetwork, config: Descript
     return np.asarray(_measure(normal, strips(turn(normal, config), network, config), config))
 
 
-class Forest:
-    """A random forest stored as arrays.
+NODES = ("left", "right", "feature", "threshold", "shares", "root")
+"""Arrays of all trees' nodes, concatenated: `left` and `right` [n] int32, child indices (-1 in leaves); `feature` [n]
+int16; `threshold` [n] float64; `shares` [n, C] float32, class probabilities; and `root` [T] int32, the first node of
+each tree."""
 
-    Attributes:
-        arrays of all trees' nodes, concatenated: `left` and `right` [n] int32, child indices (-1 in leaves); `feature`
-        [n] int16; `threshold` [n] float64; `shares` [n, C] float32, class probabilities; and `root` [T] int32, the
-        first node of each tree.
-    """
 
-    def __init__(self, nodes: Mapping[str, NDArray[Any]], network: ColorNetwork, config: DescriptorConfig) -> None:
-        """Store the trees, and what `forest_features` needs.
+def load_forest(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+    """Return a forest of the arrays `NODES`; raises KeyError if one is missing."""
+    nodes = {name: arrays[name] for name in NODES}
+    return lambda inputs: predict(nodes, forest_features(inputs.normal, run.network, run.config))
 
-        Raises:
-            ValueError: an array is missing.
-        """
-        missing = {"left", "right", "feature", "threshold", "shares", "root"} - set(nodes)
-        if missing:
-            raise ValueError(f"{', '.join(sorted(missing))} is missing")
-        self._nodes, self._network, self._config = dict(nodes), network, config
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the trees."""
-        return self._nodes
-
-    def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
-        """Return class probabilities [B, C], the mean over the trees."""
-        return self.predict(forest_features(inputs.normal, self._network, self._config))
-
-    def predict(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return class probabilities [B, C] for `forest_features`."""
-        nodes = self._nodes
-        rows = np.arange(len(features))[:, None]
-        at = np.tile(nodes["root"], (len(features), 1))  # [B, T]
-        while (inner := nodes["left"][at] >= 0).any():
-            below = features[rows, nodes["feature"][at]] <= nodes["threshold"][at]
-            at = np.where(inner, np.where(below, nodes["left"][at], nodes["right"][at]), at)
-        return np.stack([nodes["shares"][leaves].mean(axis=0) for leaves in at]).astype(np.float32)
+def predict(nodes: Mapping[str, NDArray[Any]], features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return class probabilities [B, C] for `forest_features`, the mean over the trees."""
+    rows = np.arange(len(features))[:, None]
+    at = np.tile(nodes["root"], (len(features), 1))  # [B, T]
+    while (inner := nodes["left"][at] >= 0).any():
+        below = features[rows, nodes["feature"][at]] <= nodes["threshold"][at]
+        at = np.where(inner, np.where(below, nodes["left"][at], nodes["right"][at]), at)
+    return np.stack([nodes["shares"][leaves].mean(axis=0) for leaves in at]).astype(np.float32)
 
 
 TREES = 200
@@ -91,7 +76,7 @@ MIN_LEAF_SAMPLES = 2
 
 
 def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
-    """Return the trees of a fitted scikit-learn forest as the arrays of `Forest`."""
+    """Return the trees of a fitted scikit-learn forest as the arrays `NODES`."""
     trees = [estimator.tree_ for estimator in forest.estimators_]
     root = np.concatenate([[0], np.cumsum([tree.node_count for tree in trees])[:-1]]).astype(np.int32)
 
@@ -110,7 +95,7 @@ def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
     }
 
 
-def fit_forest(task: FitTask) -> FittedBaseline:
+def fit_forest(task: FitTask) -> StoredBaseline:
     """Fit a random forest on the features of every view and its mirror images."""
     x, y, view = _features_of_views(task)
     held_out = task.held_out(y, view)
@@ -119,19 +104,19 @@ def fit_forest(task: FitTask) -> FittedBaseline:
     )
     forest.fit(x[~held_out], y[~held_out])
     task.progress("grow forest", 1, 1, f"{TREES} trees")
-    model = Forest(tree_arrays(forest), task.run.network, task.run.config)
-    return FittedBaseline(model, task.temperature(y, held_out, lambda: model.predict(x[held_out])))
+    nodes = tree_arrays(forest)
+    return StoredBaseline(nodes, task.temperature(y, held_out, lambda: predict(nodes, x[held_out])))
 
 
 def _features_of_views(task: FitTask) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
     """Return features, class index and view number of every view in every mirror."""
     features, label, view, run = [], [], [], task.run
-    for index, _, of_shard in task.shards("measure for forest", "views"):
-        views, first = task.source.read(index), 0
+    for _, _, views in task.shards("measure for forest", "views"):
+        first = 0
         for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
             for axes in MIRRORS:
                 features.append(forest_features(mirror(normal, axes), run.network, run.config)[:count])
-                label.append(np.full(count, of_shard))
+                label.append(np.full(count, views.label))
                 view.append(views.view[first : first + count])
             first += count
     return np.concatenate(features), np.concatenate(label), np.concatenate(view)

@@ -1,20 +1,18 @@
 """Training and loading the baselines of finished runs, RUN/baselines/NAME.safetensors."""
 
-import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flax import nnx
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_leftovers, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.baseline import Baseline, FitTask, FittedBaseline
+from training.baselines.baseline import FitTask, Predictor
 from training.baselines.files import (
     BASELINES,
-    CLOUD_BASELINES,
     NETWORKS,
     TEMPLATES,
     StoredBaseline,
@@ -22,42 +20,44 @@ from training.baselines.files import (
     read_baseline,
     write_baseline,
 )
-from training.baselines.forest import Forest, fit_forest
-from training.baselines.image_network import ImageNetwork, fit_image_network
+from training.baselines.forest import fit_forest, load_forest
+from training.baselines.image_network import fit_image_network, load_image_network
 from training.baselines.networks.architectures import ARCHITECTURES, load_weights, weights_file
-from training.baselines.pointnet import ColoredPointNet, fit_pointnet
-from training.baselines.templates import DINOV2, Templates, create_backbone, fit_templates
-from training.baselines.thor import THOR, fit_thor
-from training.fitting.loop import FitOptions, find_run_directories
+from training.baselines.pointnet import fit_pointnet, load_pointnet
+from training.baselines.templates import DINOV2, DINOV2_SIZE, create_backbone, fit_templates, load_templates
+from training.baselines.thor import fit_thor, load_thor
+from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = ["check_weights", "load_baselines", "pretrained_files", "train_baselines"]
+__all__ = ["TrainedBaseline", "check_weights", "crop_size", "load_baselines", "pretrained_files", "train_baselines"]
 
-_FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
-    "thor": fit_thor,
-    "forest": fit_forest,
-    "pointnet": fit_pointnet,
-    **dict.fromkeys(NETWORKS, fit_image_network),
-    TEMPLATES: fit_templates,
-}
+Load = Callable[[str, Mapping[str, Any], TrainedRun], Predictor]
 
-_BUILD: dict[str, Callable[[str, Mapping[str, Any], TrainedRun], Baseline]] = {
-    "thor": lambda _, arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
-    "forest": lambda _, arrays, run: Forest(arrays, run.network, run.config),
-    "pointnet": lambda _, arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
-    **dict.fromkeys(NETWORKS, lambda name, arrays, run: ImageNetwork.with_arrays(name, arrays, len(run.classes))),
-    TEMPLATES: lambda _, arrays, run: Templates.with_arrays(arrays, len(run.classes)),
+_METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
+    "thor": (fit_thor, load_thor),
+    "forest": (fit_forest, load_forest),
+    "pointnet": (fit_pointnet, load_pointnet),
+    **dict.fromkeys(NETWORKS, (fit_image_network, load_image_network)),
+    TEMPLATES: (fit_templates, load_templates),
 }
-"""Functions of a name, arrays and the run that build a trained baseline; they raise ValueError for unfit arrays."""
+"""Name -> functions that fit a baseline and that build it from its name, arrays and run; the second raises KeyError or
+ValueError for unfit arrays."""
+
+
+class TrainedBaseline(NamedTuple):
+    """A baseline of a run: its function, its temperature (None without a held-out set), and its pretrained weights."""
+
+    predict: Predictor
+    temperature: float | None
+    weights: Mapping[str, str]
 
 
 def train_baselines(
     path: str | Path,
     source: ViewSource,
-    names: Sequence[str] = CLOUD_BASELINES,
+    names: Sequence[str],
     progress: Progress = lambda stage, done, total, note: None,
-    options: FitOptions | None = None,
     weights: Path | None = None,
 ) -> None:
     """Train the baselines that a run lacks.
@@ -69,7 +69,6 @@ def train_baselines(
         source: the views that the run was trained on; those that its fold holds out are held out here too.
         names: any of BASELINES, in their order.
         progress: called with (stage, done, total, note).
-        options: options of the fits; by default those of the run.
         weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
@@ -88,14 +87,9 @@ def train_baselines(
             )
         for name in names:
             if not baseline_file(directory, name).is_file():
-                _train(FitTask(name, source, run, options or _options_of(run), directory, weights, progress))
+                _train(FitTask(name, source, run, directory, weights, progress))
             elif weights is not None and pretrained_files(name):
                 _check_pretrained(directory, run, name, weights)
-
-
-def _options_of(run: TrainedRun) -> FitOptions:
-    record, rates = run.record, tuple(run.record["learning_rates"])
-    return FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
 
 
 def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path) -> None:
@@ -112,21 +106,12 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
 def _train(task: FitTask) -> None:
     file, start = baseline_file(task.directory, task.name), time.perf_counter()
     remove_leftovers(file.parent)
-    task.scratch.mkdir(parents=True, exist_ok=True)
-    try:
-        fitted = _FIT[task.name](task)
-    except InputError:
-        with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
-            task.scratch.rmdir()
-            file.parent.rmdir()
-        raise
-    seconds = time.perf_counter() - start
-    stored = StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights)
-    write_baseline(file, stored, task.run.classes)
+    fitted = _METHODS[task.name][0](task)
+    write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
     remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 
 
-def load_baselines(path: Path, run: TrainedRun) -> dict[str, FittedBaseline]:
+def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
     """Return name -> baseline of a run directory.
 
     Raises:
@@ -138,12 +123,12 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, FittedBaseline]:
             continue
         stored = read_baseline(file, run.classes)
         try:
-            model = _BUILD[name](name, stored.arrays, run)
-        except ValueError as error:
+            predict = _METHODS[name][1](name, stored.arrays, run)
+        except (KeyError, ValueError) as error:
             raise InputError(
                 f"model: {file} does not match its run ({error}); delete it and train the baseline again"
             ) from None
-        loaded[name] = FittedBaseline(model, stored.temperature, stored.weights)
+        loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
     return loaded
 
 
@@ -152,6 +137,19 @@ def pretrained_files(name: str) -> list[str]:
     if name == TEMPLATES:
         return [DINOV2]
     return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def crop_size(names: Sequence[str], weights: bool) -> int | None:
+    """Return the side of the crops in pixels that baselines are trained on, the largest one; None if they need none.
+
+    Args:
+        names: names of the baselines.
+        weights: whether there are pretrained weights: DINOv2, by which templates are compared then, reads large crops.
+    """
+    sizes = [ARCHITECTURES[name].size for name in names if name in ARCHITECTURES]
+    if TEMPLATES in names:
+        sizes.append(DINOV2_SIZE if weights else ARCHITECTURES["rgbd-vit-small"].size)
+    return max(sizes, default=None)
 
 
 def check_weights(directory: Path, name: str) -> None:

@@ -1,8 +1,7 @@
 """A PointNet (Qi et al., CVPR 2017) on the points and colours of view-normalized clouds."""
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +11,20 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
-from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
+from thor2_jax.model.run_directory import TrainedRun
+from training.baselines.baseline import (
+    BaselineInputs,
+    FitTask,
+    NetworkFit,
+    Predictor,
+    as_given,
+    compiled,
+    fit_network,
+    in_batches,
+)
+from training.baselines.files import StoredBaseline
 
-__all__ = ["ColoredPointNet", "POINTS", "PointNet", "fit_pointnet"]
+__all__ = ["POINTS", "PointNet", "fit_pointnet", "load_pointnet"]
 
 POINTS = 384
 """Points sampled from each cloud."""
@@ -42,15 +52,15 @@ class PointNet(nnx.Module):
         return self.head(nnx.relu(self.hidden(x.max(axis=1))))
 
 
-def point_features(xyz: Any, rgb: Any, box: Any) -> jax.Array:
-    """Return [B, P, 6] inputs: points relative to the centre of their box, scaled units, and colours minus 0.5.
+def point_features(xyz: Any, rgb: Any, box: Any) -> tuple[jax.Array]:
+    """Return the [B, P, 6] input: points relative to the centre of their box, scaled units, and colours minus 0.5.
 
     Args:
         xyz: [B, P, 3] points.
         rgb: [B, P, 3] colours from 0 to 255.
         box: [B, 3] side lengths of the bounding boxes.
     """
-    return jnp.concatenate([xyz - box[:, None] / 2, rgb.astype(jnp.float32) / 255 - 0.5], axis=2)
+    return (jnp.concatenate([xyz - box[:, None] / 2, rgb.astype(jnp.float32) / 255 - 0.5], axis=2),)
 
 
 def random_indices(count: int, points: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -58,33 +68,16 @@ def random_indices(count: int, points: int, rng: np.random.Generator) -> NDArray
     return np.resize(rng.permutation(count), points)
 
 
-@partial(jax.jit, static_argnums=0)
-def _probabilities(graph: Any, params: Any, xyz: Any, rgb: Any, box: Any) -> jax.Array:
-    return jax.nn.softmax(nnx.merge(graph, params)(point_features(xyz, rgb, box)))
+def load_pointnet(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+    """Return a PointNet of its weights; which points are sampled depends only on the number of points.
 
+    Raises:
+        ValueError: an array is missing or has another shape.
+    """
+    model = model_from_arrays(lambda: PointNet(len(run.classes), rngs=nnx.Rngs(0)), arrays)
+    predict = compiled(model, point_features)
 
-class ColoredPointNet:
-    """A trained PointNet with its point sampling."""
-
-    def __init__(self, model: PointNet) -> None:
-        """Store the network."""
-        self._model, self._probabilities = model, partial(_probabilities, *nnx.split(model))
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the weights by their paths."""
-        return model_arrays(self._model)
-
-    @classmethod
-    def with_arrays(cls, arrays: Mapping[str, NDArray[Any]], n_classes: int) -> "ColoredPointNet":
-        """Build the network from `arrays`.
-
-        Raises:
-            ValueError: an array is missing or has another shape.
-        """
-        return cls(model_from_arrays(lambda: PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
-
-    def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
-        """Return class probabilities [B, C]; which points are sampled depends only on the number of points."""
+    def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
         points, colors = np.asarray(inputs.normal.points), np.asarray(inputs.normal.colors)
         counts = np.asarray(inputs.normal.mask).sum(axis=1)
         xyz = np.zeros((len(points), POINTS, 3), np.float32)
@@ -94,11 +87,9 @@ class ColoredPointNet:
                 sample = random_indices(count, POINTS, np.random.default_rng(SAMPLING_SEED))
                 xyz[row], rgb[row] = points[row, sample], colors[row, sample] * 255
                 box[row] = points[row, :count].max(axis=0)
-        return np.asarray(self._probabilities(xyz, rgb, box))
+        return np.asarray(predict(xyz, rgb, box))
 
-    def predict(self, xyz: NDArray[Any], rgb: NDArray[Any], box: NDArray[Any]) -> NDArray[np.float32]:
-        """Return class probabilities [V, C] for sampled points [V, POINTS, 3], their colours and boxes [V, 3]."""
-        return in_batches(self._probabilities, INFERENCE_BATCH, xyz.astype(np.float32), rgb, box)
+    return probabilities
 
 
 STORED_POINTS = 2 * POINTS
@@ -110,48 +101,11 @@ RATES = 2e-3, 2e-5
 BATCH_SIZE = 64
 
 
-class _Views(NamedTuple):
-    """V views: [V, STORED_POINTS, 3] points and colours in random order, [V, 3] boxes, [V] labels and view numbers."""
-
-    xyz: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    box: NDArray[np.float32]
-    label: NDArray[np.int32]
-    view: NDArray[np.int32]
-
-    def draw(self, rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.float32]]:
-        """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
-        first = int(rng.integers(STORED_POINTS - POINTS + 1))
-        window = slice(first, first + POINTS)
-        x = np.array(point_features(self.xyz[rows, window].astype(np.float32), self.rgb[rows, window], self.box[rows]))
-        x[..., :2] *= rng.choice(np.array([-1, 1], np.float32), (len(rows), 1, 2))
-        return (x,)
-
-
-def _read_views(task: FitTask) -> _Views:
-    total = task.n_clouds
-    xyz, rgb = (np.zeros((total, STORED_POINTS, 3), kind) for kind in (np.float16, np.uint8))
-    of_class, view = np.zeros((2, total), np.int32)
-    views = _Views(xyz, rgb, np.zeros((total, 3), np.float32), of_class, view)
-    rng = np.random.default_rng(task.options.seed)
-    for index, rows, label in task.shards("read for pointnet", "views"):
-        normalized = task.source.read(index)
-        views.label[rows], views.view[rows] = label, normalized.view
-        for row, (xyz, rgb) in enumerate(normalized.clouds(), rows.start):
-            sample = random_indices(len(xyz), STORED_POINTS, rng)
-            views.xyz[row], views.rgb[row], views.box[row] = xyz[sample], rgb[sample], xyz.max(axis=0)
-    return views
-
-
 def _learning_rate(number: int, n_steps: int) -> float:
     return float(RATES[1] + (RATES[0] - RATES[1]) * (1 + np.cos(np.pi * number / n_steps)) / 2)
 
 
-def _inputs(x: jax.Array) -> tuple[jax.Array]:
-    return (x,)
-
-
-def fit_pointnet(task: FitTask) -> FittedBaseline:
+def fit_pointnet(task: FitTask) -> StoredBaseline:
     """Fit a PointNet; an interrupted fit resumes after its last epoch.
 
     Each epoch uses every view once, with a random sample of points and random mirroring.
@@ -159,11 +113,30 @@ def fit_pointnet(task: FitTask) -> FittedBaseline:
     Raises:
         InputError: the loss is not finite.
     """
-    views = _read_views(task)
-    held_out = task.held_out(views.label, views.view)
-    rows = np.flatnonzero(~held_out)
-    fit = NetworkFit("fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
+    total, sampling = task.n_clouds, np.random.default_rng(task.options.seed)
+    # Points and colours of each view in random order.
+    xyz, rgb = (np.zeros((total, STORED_POINTS, 3), kind) for kind in (np.float16, np.uint8))
+    box, (label, view) = np.zeros((total, 3), np.float32), np.zeros((2, total), np.int32)
+    for _, rows, views in task.shards("read for pointnet", "views"):
+        label[rows], view[rows] = views.label, views.view
+        for row, (points, colors) in enumerate(views.clouds(), rows.start):
+            sample = random_indices(len(points), STORED_POINTS, sampling)
+            xyz[row], rgb[row], box[row] = points[sample], colors[sample], points.max(axis=0)
+
+    def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.float32]]:
+        """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
+        first = int(rng.integers(STORED_POINTS - POINTS + 1))
+        window = slice(first, first + POINTS)
+        x = np.array(*point_features(xyz[rows, window].astype(np.float32), rgb[rows, window], box[rows]))
+        x[..., :2] *= rng.choice(np.array([-1, 1], np.float32), (len(rows), 1, 2))
+        return (x,)
+
+    held_out = task.held_out(label, view)
+    fitted_rows = np.flatnonzero(~held_out)
+    fit = NetworkFit("fit", draw, as_given, BATCH_SIZE, optax.adam, _learning_rate)
     network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
-    model = ColoredPointNet(fit_network(task, fit, network, views.label, rows, len(rows)))
-    inputs = views.xyz[held_out, :POINTS], views.rgb[held_out, :POINTS], views.box[held_out]
-    return FittedBaseline(model, task.temperature(views.label, held_out, lambda: model.predict(*inputs)))
+    model = fit_network(task, fit, network, label, fitted_rows, len(fitted_rows))
+    stored = xyz[held_out, :POINTS].astype(np.float32), rgb[held_out, :POINTS], box[held_out]
+    predict = compiled(model, point_features)
+    temperature = task.temperature(label, held_out, lambda: in_batches(predict, INFERENCE_BATCH, *stored))
+    return StoredBaseline(model_arrays(model), temperature)

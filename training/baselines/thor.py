@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -26,10 +25,11 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
-from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP, model_arrays, model_from_arrays
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
-from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled
+from training.baselines.files import StoredBaseline
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import fit
 from training.fitting.loop import Checkpoints, EpochMetrics
@@ -37,7 +37,7 @@ from training.fitting.samples import build_samples
 from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
-__all__ = ["THOR", "VIEW_TYPES", "camera_types", "fit_thor", "view_types"]
+__all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
 
 ViewType = Literal["front", "side", "top"]
 VIEW_TYPES: tuple[ViewType, ...] = ("front", "side", "top")
@@ -72,11 +72,6 @@ def view_types(facing: float, second: float, third: float) -> tuple[ViewType, ..
     return ("side", "top") if facing < min(second, third) else ("front", "side")
 
 
-@partial(jax.jit, static_argnums=0)
-def _forward(graph: Any, state: Any, tops: jax.Array) -> jax.Array:
-    return jax.nn.softmax(nnx.merge(graph, state)(tops))
-
-
 def _face_areas(normal: PointClouds) -> NDArray[np.float64]:
     """Return [B, 3] areas of the visible faces, first the one facing the camera."""
     points = np.where(np.asarray(normal.mask)[..., None], np.asarray(normal.points), 0).astype(np.float64)
@@ -108,23 +103,37 @@ def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
     return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
 
 
-class THOR:
-    """A library of classifiers and the rules that select from it."""
+def load_thor(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+    """Return the library of its weights, `<type>-<slices>/<path>`.
 
-    def __init__(self, library: Library, config: DescriptorConfig) -> None:
-        """Store the library, which has a classifier for every view type and number of slices of `config`."""
-        self._library, self._config = library, config
-        self._split: dict[tuple[ViewType, int], Any] = {key: nnx.split(model) for key, model in library.items()}
+    Raises:
+        ValueError: an array is missing or has another shape.
+    """
+    config, library = run.config, {}
+    for name in VIEW_TYPES:
+        for k in range(1, config.n_slices + 1):
+            prefix = f"{name}-{k}/"
+            weights = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
+            create = partial(_create_mlp, k * config.image_size**2, len(run.classes))
+            library[name, k] = model_from_arrays(create, weights)
+    return predictor(library, config)
 
-    def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
-        """Return class probabilities [B, C], those of the most confident classifier selected for each cloud."""
-        config, normal = self._config, inputs.normal
+
+def predictor(library: Library, config: DescriptorConfig) -> Predictor:
+    """Return the rules that select from a library, with a classifier for every view type and number of slices.
+
+    The class probabilities of a cloud are those of the most confident classifier that is selected for it.
+    """
+    predict = {key: compiled(model, as_given) for key, model in library.items()}
+    size = config.image_size**2
+
+    def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
+        normal = inputs.normal
         slices = np.where(_far_end_occluded(normal), _slice_counts(normal, config), config.n_slices).tolist()
         types = [view_types(*areas) for areas in _face_areas(normal).tolist()]
         selected = [[(name, k) for name in names] for names, k in zip(types, slices, strict=True)]
-        size = config.image_size**2
         values = {
-            key: np.asarray(_forward(*self._split[key], jnp.asarray(inputs.tops[:, : key[1] * size])))
+            key: np.asarray(predict[key](jnp.asarray(inputs.tops[:, : key[1] * size])))
             for key in sorted({key for keys in selected for key in keys})
         }
         rows = [
@@ -133,28 +142,16 @@ class THOR:
         ]
         return np.stack(rows).astype(np.float32)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the weights as `<type>-<slices>/<path>`."""
-        return {
-            f"{name}-{k}/{path}": array
-            for (name, k), model in self._library.items()
-            for path, array in model_arrays(model).items()
-        }
+    return probabilities
 
-    @classmethod
-    def with_arrays(cls, arrays: Mapping[str, NDArray[Any]], config: DescriptorConfig, n_classes: int) -> "THOR":
-        """Build the library from `arrays`.
 
-        Raises:
-            ValueError: an array is missing or has another shape.
-        """
-        library = {}
-        for name in VIEW_TYPES:
-            for k in range(1, config.n_slices + 1):
-                prefix = f"{name}-{k}/"
-                weights = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
-                library[name, k] = model_from_arrays(partial(_create_mlp, k * config.image_size**2, n_classes), weights)
-        return cls(library, config)
+def library_arrays(library: Library) -> dict[str, NDArray[Any]]:
+    """Return the weights of a library, as `load_thor` reads them."""
+    return {
+        f"{name}-{k}/{path}": array
+        for (name, k), model in library.items()
+        for path, array in model_arrays(model).items()
+    }
 
 
 def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:
@@ -166,15 +163,13 @@ def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:
     return tuple(name for name in VIEW_TYPES if fits[name])
 
 
-def fit_thor(task: FitTask) -> FittedBaseline:
+def fit_thor(task: FitTask) -> StoredBaseline:
     """Fit the library, each classifier in the same way as the run's own; an interrupted fit resumes.
 
     Raises:
-        InputError: the camera angles of the source are unknown; or as `fit`.
+        InputError: as `fit`.
     """
-    job = task.source.record.get("job")
-    if job is None:
-        raise InputError("baselines: thor needs the camera angles of the views; give a rendered dataset with --dataset")
+    job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # of each view number
     config = dataclasses.replace(task.run.config, homology="closed_form")
@@ -206,4 +201,4 @@ def fit_thor(task: FitTask) -> FittedBaseline:
         better = values.max(axis=1) > best[held_rows].max(axis=1)
         best[held_rows[better]] = values[better]
     temperature = task.temperature(samples.label, held_out, lambda: best[held_out])
-    return FittedBaseline(THOR(library, task.run.config), temperature)
+    return StoredBaseline(library_arrays(library), temperature)

@@ -114,18 +114,17 @@ def _evaluate(
     names: Path | None = None,
     given: Sequence[str] = (),
 ) -> None:
-    from training.evaluation.answering import RunArguments, answer_frames_in_pool
-    from training.evaluation.job import evaluate_dataset
+    from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_evaluated
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
-    arguments = RunArguments(models, per_sequence)
+    load = models, tuple(frames.identifiers) if per_sequence else None
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
-        loaded = arguments.load(tuple(frames.identifiers))
-        answering = functools.partial(answer_frames_in_pool, arguments, frames, pool) if pool else None
+        loaded = load_evaluated(*load)
+        answering = functools.partial(answer_frames_in_pool, load, frames, pool) if pool else None
         report = evaluate_dataset(loaded, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)
     result = "no report was written (--out)"
@@ -163,10 +162,9 @@ def _print_report(report: Mapping[str, Any]) -> None:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
         more = ", ..." if len(missing) > MAX_LISTED else ""
         console.print(f"labels without pixels in the label image: {', '.join(missing[:MAX_LISTED])}{more}")
-    if speed["frames_per_second"]:
-        console.print(
-            f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
-            f"median {speed['median_seconds']:.2f} s a frame"
-        )
+    console.print(
+        f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
+        f"median {speed['median_seconds']:.2f} s a frame"
+    )
     for text in page.answer_texts(report):
         console.print(escape_characters(text))

@@ -60,7 +60,7 @@ class InstancePrediction:
     occluded: bool = False
     reason: str | None = None
     probabilities: NDArray[np.float32] | None = None
-    position: tuple[float, float, float] | None = None
+    position: Sequence[float] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,15 +133,8 @@ class AnswerFile:
 
 
 def read_answers(path: Path) -> list[FrameAnswers]:
-    """Read the answers of a finished evaluation.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
-    try:
-        return [_decode(line) for line in path.read_bytes().splitlines()[1:]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); expected the answers of a finished evaluation") from None
+    """Read the answers of a finished evaluation."""
+    return [_decode(line) for line in path.read_bytes().splitlines()[1:]]
 
 
 def _encode(answers: FrameAnswers) -> str:
@@ -168,9 +161,6 @@ def _decode(line: str | bytes) -> FrameAnswers:
             instance["probabilities"] = np.array(instance["probabilities"], np.float32)
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
-        if instance.get("position") is not None:
-            x, y, z = map(float, instance["position"])
-            instance["position"] = x, y, z
         instances.append(InstancePrediction(**instance))
     files = dict(values.get("files", {}))
     return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)

@@ -1,7 +1,7 @@
 """Pictures of an evaluation, drawn while the frames are in memory: judged frames, and crops of instances."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +59,7 @@ class FramePictures:
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        for _ in self._most_confident(answers):  # iterating records the confidences
-            pass
+        list(self._most_confident(answers))  # records the confidences
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
@@ -84,16 +83,17 @@ class FramePictures:
             self._highest[instance.truth, str(name)] = confidence
             yield instance, str(name)
 
-    def _judge(self, answers: FrameAnswers) -> dict[int, tuple[bool, str]]:
-        """Return label -> (correct, text) of what the first run answers; an unknown object should have no name."""
+    def _judge(self, answers: FrameAnswers) -> list[Annotation]:
+        """Return what the first run answers, incorrect answers first; an unknown object should have no name."""
         names = {i.label: name for run, i, name, _ in named_answers(answers.instances, self._runs) if run == 0}
-        judged = {}
+        judged = []
         for instance in answers.instances:
-            name = names.get(instance.label)
-            correct = name == (instance.truth if instance.truth in self._runs[0].classes else None)
+            name, is_known = names.get(instance.label), instance.truth in self._runs[0].classes
+            color = CORRECT if name == (instance.truth if is_known else None) else INCORRECT
             text = name or ("unknown" if instance.label in names else "none")
-            judged[instance.label] = correct, text if name == instance.truth else f"{text} ({instance.truth})"
-        return judged
+            text = text if name == instance.truth else f"{text} ({instance.truth})"
+            judged.append(Annotation(instance.label, color, text))
+        return sorted(judged, key=lambda each: each.paint == CORRECT)
 
 
 CORRECT, INCORRECT = COLORS[2], UNRECOGNIZED
@@ -112,15 +112,14 @@ def _save(picture: Image.Image, path: Path) -> None:
         picture.save(temporary, format="JPEG", quality=85, subsampling=0)
 
 
-def draw_judged(
-    color: NDArray[np.uint8], labels: NDArray[Any], judged: Mapping[int, tuple[bool, str]], path: Path
-) -> None:
-    """Draw the outline and the text of every judged instance, green if correct, red if incorrect (JPEG).
+def draw_judged(color: NDArray[np.uint8], labels: NDArray[Any], judged: Sequence[Annotation], path: Path) -> None:
+    """Draw the outline and the text of every judged instance (JPEG).
 
     Args:
         color: [H, W, 3] uint8, sRGB.
         labels: [H, W] integers.
-        judged: label -> (correct, text); labels without a pixel are skipped.
+        judged: instances, green if correct, red if incorrect; the first ones choose the places of their texts. Labels
+            without a pixel are skipped.
         path: path of the picture.
 
     Raises:
@@ -128,13 +127,7 @@ def draw_judged(
     """
     step = max(1, math.ceil(labels.shape[1] / _LARGEST_WIDTH))
     color, labels = color[::step, ::step], labels[::step, ::step]
-    # Incorrect answers first: they choose the places of their labels.
-    annotations = [
-        Annotation(label, CORRECT if correct else INCORRECT, text)
-        for label, (correct, text) in sorted(judged.items(), key=lambda item: item[1][0])
-        if (labels == label).any()
-    ]
-    _save(draw_instances(color, labels, annotations), path)
+    _save(draw_instances(color, labels, [each for each in judged if (labels == each.label).any()]), path)
 
 
 def draw_crop(color: NDArray[np.uint8], mask: NDArray[np.bool_], path: Path) -> None:

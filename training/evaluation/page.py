@@ -11,7 +11,7 @@ from training.baselines.files import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.published import published_seconds
-from training.evaluation.results import COVERAGE
+from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
@@ -362,10 +362,8 @@ def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path
 def _measurement_section(report: Mapping[str, Any]) -> Section:
     speed, counts = report["speed"], report["instances"]
     text = f"Models: {', '.join(report['runs'])}. "
-    if speed["frames_per_second"]:
-        text += f"Speed: {speed['frames_per_second']:.2f} frames per second, from reading the files to the answers of "
-        text += "all models, compilation included"
-        text += f"; median {speed['median_seconds']:.2f} s per frame." if speed["median_seconds"] else "."
+    text += f"Speed: {speed['frames_per_second']:.2f} frames per second, from reading the files to the answers of all "
+    text += f"models, compilation included; median {speed['median_seconds']:.2f} s per frame."
     published_speed = [f"{name} {seconds} s" for name, seconds in published_seconds().items()]
     text += f" Published times per frame: {', '.join(published_speed)}."
     rows = [

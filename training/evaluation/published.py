@@ -1,6 +1,5 @@
 """Published accuracies (sources: `published.json`), the measured ones beside them, and how their data differ."""
 
-import dataclasses
 import functools
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -10,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.answers import Rule
+from thor2_jax.model.fusion import DEFAULT_RULE
+from training.evaluation.runs import Run, scratch_networks
 from training.evaluation.scores import summarize_runs
 
 __all__ = [
-    "EvaluationConditions",
     "compare_with_published",
     "published_attributes",
     "published_means",
@@ -93,34 +92,10 @@ _SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
 """What the published tables append to the methods that were trained without and with all real images, and what the
 titles of the small networks end with."""
 
-_PAPER_RULE: Rule = "max"
-"""Fusion rule of the THOR2 paper."""
 
-
-@dataclasses.dataclass(frozen=True)
-class EvaluationConditions:
-    """Facts that an evaluation states beside published figures.
-
-    Attributes:
-        own_objects: whether the classes are the objects of the frame's own sequence.
-        models: number of trained models.
-        frames: number of frames.
-        rule: fusion rule of the measured accuracies.
-        real_views: whether the models were trained on real views, too.
-        scratch: titles of the baselines whose networks were trained without pretrained weights.
-    """
-
-    own_objects: bool
-    models: int
-    frames: int
-    rule: Rule
-    real_views: bool = False
-    scratch: Collection[str] = ()
-
-
-def _measured_column(method: str, conditions: EvaluationConditions, titles: Collection[str]) -> str | None:
+def _measured_column(method: str, real_views: bool, titles: Collection[str]) -> str | None:
     """Return the title of the measured column of a published method, that of a small network if it stands for it."""
-    other, own = (_SYNTHETIC, _REAL) if conditions.real_views else (_REAL, _SYNTHETIC)
+    other, own = (_SYNTHETIC, _REAL) if real_views else (_REAL, _SYNTHETIC)
     if method.endswith(other):
         return None
     name = method.removesuffix(own)
@@ -129,7 +104,8 @@ def _measured_column(method: str, conditions: EvaluationConditions, titles: Coll
 
 def compare_with_published(
     kind: str,
-    conditions: EvaluationConditions,
+    runs: Sequence[Run],
+    n_frames: int,
     attributes: Sequence[Mapping[str, str]],
     objects: Sequence[str],
     correct: Mapping[str, Sequence[NDArray[np.bool_]]],
@@ -138,7 +114,8 @@ def compare_with_published(
 
     Args:
         kind: kind of dataset ("uwis", "ocid", ...).
-        conditions: conditions of the evaluation.
+        runs: evaluated runs.
+        n_frames: number of frames.
         attributes: [N] attributes of the scored instances.
         objects: [N] names of their objects.
         correct: column title -> for each run, [N] whether the instance is recognized correctly.
@@ -150,8 +127,8 @@ def compare_with_published(
         instance are left out.
     """
     values = [published_attributes(kind, each) for each in attributes]
-    comparisons = []
-    for table in _comparable_tables(kind, conditions.own_objects):
+    comparisons, real_views = [], any(run.has_real_views for run in runs)
+    for table in _comparable_tables(kind, runs[0].own_objects):
         cells, shown = [], np.zeros(len(values), bool)
         for cell in table["cells"]:
             rows = np.array([cell["where"].items() <= each.items() for each in values], bool)
@@ -166,39 +143,39 @@ def compare_with_published(
                 cells.append({"where": cell["where"], **counts, "published": published, "accuracy": accuracy})
         if cells:
             methods = dict.fromkeys(method for cell in table["cells"] for method in cell["accuracy"])
-            columns = {method: _measured_column(method, conditions, correct) for method in methods}
+            columns = {method: _measured_column(method, real_views, correct) for method in methods}
             ours = {method: title for method, title in columns.items() if title is not None}
             n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
-            differences = _differences(kind, table, conditions, n_objects, len(cells))
-            differences += _network_differences(ours.values(), conditions)
+            differences = _differences(kind, table, n_frames, n_objects, len(cells), len(runs))
+            differences += _network_differences(ours.values(), scratch_networks(runs))
             kept = {name: table[name] for name in ("number", "title", "source", "notes")}
             comparisons.append({**kept, "differences": differences, "ours": ours, "cells": cells})
     return comparisons
 
 
-def _network_differences(titles: Iterable[str], conditions: EvaluationConditions) -> list[str]:
+def _network_differences(titles: Iterable[str], scratch: Collection[str]) -> list[str]:
     """Return the limits of the measured image networks."""
-    scratch = (
-        "was trained from scratch, without pretrained weights: its accuracy is no claim about the published network"
-    )
     sentences = []
     for title in dict.fromkeys(titles):
         if title.endswith(_SMALL):
             sentences.append(f"{title} is a smaller network than the published one.")
-        if title in conditions.scratch:
-            sentences.append(f"{title} {scratch}.")
+        if title in scratch:
+            sentences.append(
+                f"{title} was trained from scratch, without pretrained weights: its accuracy is no claim about the "
+                "published network."
+            )
     return sentences
 
 
 def _differences(
-    kind: str, table: Mapping[str, Any], conditions: EvaluationConditions, n_objects: int, n_rows: int
+    kind: str, table: Mapping[str, Any], n_frames: int, n_objects: int, n_rows: int, n_models: int
 ) -> list[str]:
     """Return one sentence for each known difference between the data of the table and of the evaluation."""
     data = _read()["datasets"][kind]
     size = ""
     if data["frames"] and data["instances"]:
         size = f" ({data['frames']:,} frames, {data['instances']:,} instances)"
-    frames, rows = f"{conditions.frames:,} frames", len(table["cells"])
+    frames, rows = f"{n_frames:,} frames", len(table["cells"])
     sentences = [f"The published figures concern {data['concerns']}{size}; here {frames} are evaluated."]
     if table["objects"] is None:
         sentences.append(f"Number of objects that are scored here: {n_objects}.")
@@ -207,10 +184,8 @@ def _differences(
     if n_rows < rows:
         sentences.append(f"{rows - n_rows} of the table's {rows} rows have no instance here.")
     models = "models of its own" if table["models"] is None else f"{table['models']} models"
-    here = "1 model is" if conditions.models == 1 else f"{conditions.models} models are"
+    here = "1 model is" if n_models == 1 else f"{n_models} models are"
     sentences.append(f"The publication uses {models}; here {here} evaluated, trained on other views and folds.")
-    fuses = any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"])
-    if fuses and conditions.rule != _PAPER_RULE:
-        rules = f"the rule {_PAPER_RULE}, this table by {conditions.rule}"
-        sentences.append(f"The publication fuses classifiers by {rules}.")
+    if any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"]):
+        sentences.append(f"The publication fuses classifiers by the rule max, this table by {DEFAULT_RULE}.")
     return sentences

@@ -1,12 +1,13 @@
 """All values of a report, computed from the answers, as one JSON table."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.errors import InputError
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation import scores
 from training.evaluation.answers import (
@@ -19,21 +20,21 @@ from training.evaluation.answers import (
     fusions,
     main_fusion,
 )
-from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
-from training.evaluation.runs import Run, all_predictors
+from training.evaluation.published import compare_with_published, published_means
+from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
-__all__ = ["COVERAGE", "compute_results", "fuse_answers", "named_answers"]
-
-COVERAGE = 0.95
-"""Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
+__all__ = ["compute_results", "fuse_answers", "named_answers"]
 
 CURVE = tuple(k / 100 for k in range(101))
 """Shares of the correct answers at which the known/unknown curve is computed."""
 
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
+
+MAX_LISTED = 20
+"""Names that an error message shows."""
 
 MOST_FREQUENT = 12
 """Pairs of object and wrong name listed in a report, of known and of unknown objects."""
@@ -82,53 +83,29 @@ def named_answers(
             yield run, instance, name, float(confidence)
 
 
-def compute_results(
-    kind: str,
-    runs: Sequence[Run],
-    frames: Sequence[FrameAnswers],
-    own_objects: bool = False,
-    real_views: bool = False,
-    scratch: Collection[str] = (),
-) -> dict[str, Any]:
+def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
     """Return accuracy, confidence metrics, confusions and speed.
 
     Args:
         kind: kind of dataset ("uwis", "ocid", "bop", "frames"); selects the tables and the published values.
         runs: evaluated runs, which share their classes.
         frames: the answers.
-        own_objects: whether a frame's classes are the objects of its sequence; selects the published values.
-        real_views: whether the runs were trained on real views, too; selects the published values.
-        scratch: titles of the baselines whose networks were trained without pretrained weights.
+
+    Raises:
+        InputError: no instance is of a class of the runs.
     """
     classes = runs[0].classes
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = [instance.truth in classes for instance, _ in labelled]
     instances = [instance for instance, _ in labelled if instance.truth in classes]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
-    seconds = [frame.seconds for frame in frames]
-    results: dict[str, Any] = {
-        "runs": [run.name for run in runs],
-        "classes": list(classes),
-        "rule": DEFAULT_RULE,
-        "instances": {
-            "labelled": len(labelled),
-            "scored": len(instances),
-            "not_described": dict(Counter(i.reason for i in instances if i.probabilities is None)),
-            "no_class": dict(Counter(i.truth for i in unknown)),
-        },
-        "speed": {
-            "frames": len(seconds),
-            "seconds": sum(seconds),
-            "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
-            "median_seconds": float(np.median(seconds)) if seconds else None,
-        },
-        "fusions": [],
-        "worst": [],
-        "published_tables": [],
-        "scratch": list(scratch),
-    }
     if not instances:
-        return results
+        raise InputError(
+            f"model: no instance of the dataset is of a class of the runs; the dataset has "
+            f"{_listed({i.truth for i in unknown})}, the runs know {_listed(classes)}; check the names, or give other "
+            "runs"
+        )
+    seconds = [frame.seconds for frame in frames]
     # OCID has a table by sequence, which is the directory of the frame.
     attributes = [
         {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
@@ -156,20 +133,37 @@ def compute_results(
     confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
     for answer in answers[DEFAULT_RULE][main]:
         np.add.at(confusion, (truth, answer), 1)
-    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
 
     def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
         return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
 
-    results |= {
+    counts, worst = _answers([*instances, *unknown], runs)
+    return {
+        "runs": [run.name for run in runs],
+        "classes": list(classes),
+        "rule": DEFAULT_RULE,
+        "instances": {
+            "labelled": len(labelled),
+            "scored": len(instances),
+            "not_described": dict(Counter(i.reason for i in instances if i.probabilities is None)),
+            "no_class": dict(Counter(i.truth for i in unknown)),
+        },
+        "speed": {
+            "frames": len(seconds),
+            "seconds": sum(seconds),
+            "frames_per_second": len(seconds) / sum(seconds),
+            "median_seconds": float(np.median(seconds)),
+        },
         "fusions": list(by_rule[DEFAULT_RULE]),
+        "worst": worst,
+        "published_tables": compare_with_published(
+            kind, runs, len(frames), attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
+        ),
+        "scratch": scratch_networks(runs),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, correct[rule], own_objects) for names in tables]
+            rule: [_accuracy(kind, names, attributes, correct[rule], runs[0].own_objects) for names in tables]
             for rule in by_rule
         },
-        "published_tables": compare_with_published(
-            kind, conditions, attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
-        ),
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
@@ -186,8 +180,13 @@ def compute_results(
         "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth[described]),
         "reliability": _reliability(list(by_run.values()), truth[described]),
         "confusion": confusion.tolist(),
+        "answers": counts,
     }
-    return results | _answers([*instances, *unknown], runs)
+
+
+def _listed(names: Iterable[str]) -> str:
+    first = sorted(names)[:MAX_LISTED]
+    return ", ".join(first) + (", ..." if len(first) == MAX_LISTED else "") if first else "no names"
 
 
 def _of_all(predictions: Predictions, described: Flags) -> Integers:
@@ -225,16 +224,16 @@ def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]
 def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
     confidence, correct = np.minimum(known.confidence, 1), known.class_index == truth
     of_unknown = np.minimum(unknown.confidence, 1)
-    accepted = scores.accuracy_at_coverage(confidence, correct, COVERAGE)
+    threshold, accuracy = scores.accuracy_at_coverage(confidence, correct)
     every = np.concatenate([confidence, of_unknown])
     return {
         "expected_calibration_error": scores.expected_calibration_error(confidence, correct),
         "auroc_right": scores.auroc(confidence, correct),
-        "threshold_at_coverage": accepted.threshold,
-        "accuracy_at_coverage": accepted.accuracy,
+        "threshold_at_coverage": threshold,
+        "accuracy_at_coverage": accuracy,
         "auroc_known": scores.auroc(every, np.arange(len(every)) < len(confidence)),
-        "unknown_refused": float((of_unknown < accepted.threshold).mean()) if len(of_unknown) else np.nan,
-        "unknown_named": float(scores.unknown_named(confidence[correct], of_unknown, COVERAGE)),
+        "unknown_refused": float((of_unknown < threshold).mean()) if len(of_unknown) else np.nan,
+        "unknown_named": float(scores.unknown_named(confidence[correct], of_unknown)),
     }
 
 
@@ -283,7 +282,9 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     }
 
 
-def _answers(instances: Sequence[InstancePrediction], runs: Sequence[Run]) -> dict[str, Any]:
+def _answers(
+    instances: Sequence[InstancePrediction], runs: Sequence[Run]
+) -> tuple[dict[str, int], list[dict[str, Any]]]:
     """Return the numbers of answers over all runs, and the most frequent wrong names, of unknown objects first."""
     classes, count, wrong = runs[0].classes, Counter[str](), Counter[tuple[str, str]]()
     for _, instance, name, _ in named_answers(instances, runs):
@@ -298,11 +299,6 @@ def _answers(instances: Sequence[InstancePrediction], runs: Sequence[Run]) -> di
         for (truth, name), n in wrong.most_common()
     ]
     of_unknown, of_known = ([pair for pair in worst if pair["known"] is of_class] for of_class in (False, True))
-    return {
-        "answers": {
-            "known": known,
-            "unknown": total.total() - known,
-            **{key: count[key] for key in ("correct", "wrong", "unknown_named")},
-        },
-        "worst": of_unknown[:MOST_FREQUENT] + of_known[:MOST_FREQUENT],
-    }
+    counts = {"known": known, "unknown": total.total() - known}
+    counts |= {key: count[key] for key in ("correct", "wrong", "unknown_named")}
+    return counts, of_unknown[:MOST_FREQUENT] + of_known[:MOST_FREQUENT]

@@ -24,9 +24,9 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
-from training.baselines.baseline import BaselineInputs, FittedBaseline
+from training.baselines.baseline import BaselineInputs
 from training.baselines.files import NETWORKS, TEMPLATES, TITLES, baseline_file
-from training.baselines.job import load_baselines
+from training.baselines.job import TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
@@ -35,7 +35,6 @@ __all__ = [
     "Run",
     "SequenceRun",
     "all_predictors",
-    "has_real_views",
     "load_runs",
     "load_sequence_runs",
     "scratch_networks",
@@ -57,13 +56,19 @@ class Run:
     name: str
     digest: str
     recognizer: Recognizer
-    baselines: Mapping[str, FittedBaseline] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, TrainedBaseline] = dataclasses.field(default_factory=dict)
     temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    own_objects = False  # whether the classes of a frame are the objects of its sequence
 
     @property
     def model(self) -> Model:
         """The model of `recognizer`."""
         return self.recognizer.model
+
+    @property
+    def has_real_views(self) -> bool:
+        """Whether the run was trained on labelled real instances, too."""
+        return "frames" in self.model.run.record.get("dataset", {})
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -110,7 +115,7 @@ class Run:
             column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
-            values |= {name: baseline.model.probabilities(inputs) for name, baseline in self.baselines.items()}
+            values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}
         values = {name: model.union.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
             scores = gallery_scores(model, inference)
@@ -141,11 +146,9 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
         paths: run directories, or directories with the folds of a training.
 
     Raises:
-        InputError: no run is given, one cannot be read or is given twice, or the runs differ in what they must share.
+        InputError: a run cannot be read or is given twice, or the runs differ in what they must share.
     """
     directories = find_run_directories(paths)
-    if not directories:
-        raise InputError("model: no run directory is given")
     runs = [_load(directory) for directory in directories]
     by_digest: dict[str, Path] = {}
     for directory, run in zip(directories, runs, strict=True):
@@ -190,6 +193,7 @@ class SequenceRun(Run):
     """
 
     of_sequence: Mapping[str, Run] = dataclasses.field(default_factory=dict)
+    own_objects = True
 
     @functools.cached_property
     def classes(self) -> tuple[str, ...]:
@@ -236,10 +240,10 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
     }
     missing = [sequence for sequence, path in paths.items() if path is None]
     loaded = {path: load_runs([path]) for path in dict.fromkeys(paths.values()) if path is not None}
-    if missing or not loaded:
+    if missing:
         raise InputError(
-            f"model: {directory} has no run for {', '.join(missing) or 'any sequence'}; "
-            "train the missing ones with `thor2 train --sequences`"
+            f"model: {directory} has no run for {', '.join(missing)}; train the missing ones with "
+            "`thor2 train --sequences`"
         )
     (first_path, first), *others = loaded.items()
     for path, runs in others:
@@ -255,11 +259,6 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=of_sequence))
     return result
-
-
-def has_real_views(runs: Sequence[Run]) -> bool:
-    """Return whether runs were trained on labelled real instances, too."""
-    return any("frames" in run.model.run.record.get("dataset", {}) for run in runs)
 
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.metrics import roc_auc_score
 
-from thor2_jax.errors import InputError
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.readers.labelled import sequence_of
 
 __all__ = [
+    "COVERAGE",
     "accuracy_at_coverage",
     "attribute_tables",
     "auroc",
@@ -32,8 +32,15 @@ __all__ = [
     "unknown_named",
 ]
 
+COVERAGE = 0.95
+"""Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
+
 BINS = 15
 """Number of confidence bins of equal width, the usual value in the literature."""
+
+
+Floats = NDArray[np.floating[Any]]
+Flags = NDArray[np.bool_]
 
 
 class Reliability(NamedTuple):
@@ -50,40 +57,26 @@ class Reliability(NamedTuple):
     confidence: NDArray[np.float64]
 
 
-def _check(confidence: ArrayLike, flags: ArrayLike, name: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    values, marks = np.asarray(confidence, np.float64), np.asarray(flags)
-    if values.ndim != 1 or values.shape != marks.shape:
-        raise InputError(f"confidence and {name} have shapes {values.shape} and {marks.shape}; expected [N] and [N]")
-    if not np.all((values >= 0) & (values <= 1 + 1e-6)):
-        raise InputError(f"confidence has values from {values.min()} to {values.max()}; expected 0 to 1")
-    return values, marks.astype(bool)
-
-
-def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> Reliability:
-    """Return accuracy and mean confidence of each bin; bin k holds k/bins < confidence <= (k+1)/bins, the first also 0.
+def reliability(confidence: Floats, correct: Flags) -> Reliability:
+    """Return accuracy and mean confidence of each bin; bin k holds k/15 < confidence <= (k+1)/15, the first also 0.
 
     Args:
         confidence: [N], from 0 to 1.
         correct: [N], whether the answer is correct.
-        bins: number of bins.
-
-    Raises:
-        InputError: the shapes do not match, or a confidence is outside 0 to 1.
     """
-    values, marks = _check(confidence, correct, "correct")
-    number = np.clip(np.ceil(values * bins).astype(np.intp) - 1, 0, bins - 1)
-    count = np.bincount(number, minlength=bins)
+    values = np.asarray(confidence, np.float64)
+    number = np.clip(np.ceil(values * BINS).astype(np.intp) - 1, 0, BINS - 1)
+    count = np.bincount(number, minlength=BINS)
     with np.errstate(invalid="ignore"):
-        accuracy = np.bincount(number, marks, bins) / count
-        mean = np.bincount(number, values, bins) / count
+        accuracy = np.bincount(number, correct, BINS) / count
+        mean = np.bincount(number, values, BINS) / count
     return Reliability(count, accuracy, mean)
 
 
-def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
+def expected_calibration_error(confidence: Floats, correct: Flags) -> float:
     """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
 
-    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments and errors are those of
-    `reliability`.
+    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments are those of `reliability`.
     """
     values = reliability(confidence, correct)
     used = values.answers > 0
@@ -92,7 +85,7 @@ def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> flo
     return float(np.average(np.abs(values.accuracy - values.confidence)[used], weights=values.answers[used]))
 
 
-def auroc(confidence: ArrayLike, positive: ArrayLike) -> float:
+def auroc(confidence: Floats, positive: Flags) -> float:
     """Return the area under the ROC curve, the probability that a positive has a higher confidence than a negative.
 
     Args:
@@ -101,46 +94,30 @@ def auroc(confidence: ArrayLike, positive: ArrayLike) -> float:
 
     Returns:
         The area; NaN if all are positive or all are negative.
-
-    Raises:
-        InputError: the shapes do not match, or a confidence is outside 0 to 1.
     """
-    values, marks = _check(confidence, positive, "positive")
-    return float(roc_auc_score(marks, values)) if 0 < marks.sum() < len(marks) else math.nan
+    return float(roc_auc_score(positive, confidence)) if 0 < positive.sum() < len(positive) else math.nan
 
 
-class Coverage(NamedTuple):
-    """The most confident answers; the others are rejected as unknown objects.
+def accuracy_at_coverage(confidence: Floats, correct: Flags) -> tuple[float, float]:
+    """Return the accuracy of the most confident answers, a fraction `COVERAGE` of all.
 
-    Attributes:
-        threshold: smallest confidence that is accepted.
-        kept: fraction of the answers that is accepted; more than the requested coverage where confidences are equal.
-        accuracy: accuracy of the accepted answers.
+    Returns:
+        The smallest confidence that is accepted, and the accuracy of the accepted answers; NaN without answers.
     """
-
-    threshold: float
-    kept: float
-    accuracy: float
-
-
-def accuracy_at_coverage(confidence: ArrayLike, correct: ArrayLike, coverage: float = 0.95) -> Coverage:
-    """Return the accuracy if at least a fraction `coverage` of the answers is accepted; NaN without answers.
-
-    Raises:
-        InputError: the shapes do not match, a confidence is outside 0 to 1, or `coverage` is not in (0, 1].
-    """
-    values, marks = _check(confidence, correct, "correct")
-    if not 0 < coverage <= 1:
-        raise InputError(f"coverage is {coverage}; expected a number above 0 and at most 1")
-    if not len(values):
-        return Coverage(math.nan, math.nan, math.nan)
-    accepted = math.ceil(round(coverage * len(values), 9))  # 0.95 * 20 is slightly more than 19 in floating point
-    threshold = np.sort(values)[len(values) - accepted]
-    kept = values >= threshold
-    return Coverage(float(threshold), float(kept.mean()), float(marks[kept].mean()))
+    if not len(confidence):
+        return math.nan, math.nan
+    threshold = _threshold(confidence, COVERAGE)
+    return float(threshold), float(correct[confidence >= threshold].mean())
 
 
-def unknown_named(correct: ArrayLike, unknown: ArrayLike, kept: ArrayLike = 0.95) -> NDArray[np.float64]:
+def _threshold(confidence: Floats, kept: ArrayLike) -> NDArray[np.float64]:
+    """Return the largest thresholds that keep shares `kept` [...] of confidences; infinity keeps nothing."""
+    # 0.95 * 20 is slightly more than 19 in floating point.
+    count = np.ceil(np.round(np.asarray(kept) * len(confidence), 9)).astype(np.intp)
+    return np.append(np.sort(confidence), np.inf)[len(confidence) - count]
+
+
+def unknown_named(correct: Floats, unknown: Floats, kept: ArrayLike = COVERAGE) -> NDArray[np.float64]:
     """Return the share of unknown objects that are named where a share `kept` of the correct answers is kept.
 
     The threshold is the largest confidence that keeps at least this share; an answer with this confidence is kept.
@@ -152,19 +129,10 @@ def unknown_named(correct: ArrayLike, unknown: ArrayLike, kept: ArrayLike = 0.95
 
     Returns:
         [...] shares; NaN if there is no correct answer or no unknown object.
-
-    Raises:
-        InputError: `kept` is not from 0 to 1.
     """
-    ordered, others, shares = np.sort(np.asarray(correct, np.float64)), np.asarray(unknown), np.asarray(kept)
-    if not np.all((shares >= 0) & (shares <= 1)):
-        raise InputError(f"kept has values from {shares.min()} to {shares.max()}; expected 0 to 1")
-    if not len(ordered) or not len(others):
-        return np.full(shares.shape, np.nan)
-    # 0.95 * 20 is slightly more than 19 in floating point. Keeping nothing takes a threshold above all confidences.
-    count = np.ceil(np.round(shares * len(ordered), 9)).astype(np.intp)
-    threshold = np.append(ordered, np.inf)[len(ordered) - count]
-    return np.asarray((others >= threshold[..., None]).mean(axis=-1))
+    if not len(correct) or not len(unknown):
+        return np.full(np.shape(kept), np.nan)
+    return np.asarray((unknown >= _threshold(correct, kept)[..., None]).mean(axis=-1))
 
 
 _ORDER = {"none": 0, "low": 1, "high": 2}
@@ -266,20 +234,18 @@ def _unmoved(before: Sequence[InstancePrediction], now: Sequence[InstancePredict
     return pairs
 
 
-def placement_accuracy(placement: ArrayLike, correct: ArrayLike) -> float:
+def placement_accuracy(placement: NDArray[np.intp], correct: Flags) -> float:
     """Return the mean over the placements of the share of their instances that are correct; NaN without instances.
 
     Args:
         placement: [N] int, the placement of each instance.
         correct: [N], whether the answer is correct.
     """
-    numbers = np.unique(np.asarray(placement), return_inverse=True)[1]
-    if not len(numbers):
-        return float("nan")
-    return float((np.bincount(numbers, np.asarray(correct, float)) / np.bincount(numbers)).mean())
+    numbers = np.unique(placement, return_inverse=True)[1]
+    return float((np.bincount(numbers, correct) / np.bincount(numbers)).mean()) if len(numbers) else math.nan
 
 
-def steadiness(placement: ArrayLike, answer: ArrayLike) -> float:
+def steadiness(placement: NDArray[np.intp], answer: NDArray[np.intp]) -> float:
     """Return the share of instances with the most frequent answer of their placement.
 
     Args:
@@ -289,10 +255,10 @@ def steadiness(placement: ArrayLike, answer: ArrayLike) -> float:
     Returns:
         The share; NaN if no placement has two instances.
     """
-    numbers = np.unique(np.asarray(placement), return_inverse=True)[1]
+    numbers = np.unique(placement, return_inverse=True)[1]
     sizes = np.bincount(numbers)
-    pairs, counts = np.unique(np.stack([numbers, np.asarray(answer, np.intp)]), axis=1, return_counts=True)
+    pairs, counts = np.unique(np.stack([numbers, answer]), axis=1, return_counts=True)
     agreeing = np.zeros_like(sizes)
     np.maximum.at(agreeing, pairs[0], counts)
     several = sizes > 1
-    return float(agreeing[several].sum() / sizes[several].sum()) if several.any() else float("nan")
+    return float(agreeing[several].sum() / sizes[several].sum()) if several.any() else math.nan

@@ -5,8 +5,9 @@ and, optionally `scene_gt_info.json`; see docs/bop_datasets_format.md of github.
 numbers its objects; a YAML or JSON file names them, obj_id -> name.
 """
 
+import contextlib
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,20 +53,44 @@ class BOP(LabelledFrames):
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
-        # Frames are read scene by scene, so the tables of one scene are kept.
-        self._scene = functools.lru_cache(maxsize=1)(_Scene)
         self._names_file = names
         self._names = None if names is None else read_object_names(Path(names))
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also raises InputError for an image or object that a table lacks."""
-        folder, image = self._images[number]
-        with with_context(folder.name):
-            scene = self._scene(folder)
+        scene, image = self._images[number]
         with with_context(self.identifiers[number]):
-            frame, objects = scene.read(image)
-            truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
-        return LabelledFrame(self.identifiers[number], frame, truth, {"scene": folder.name})
+            with self._entry(scene, "camera", image) as entry:
+                intrinsics = _intrinsics(entry)
+            with self._entry(scene, "gt", image) as entry:
+                objects = _values(entry, "obj_id", int)
+            visible: list[float] = [1.0] * len(objects)
+            if (scene / "scene_gt_info.json").exists():
+                with self._entry(scene, "gt_info", image) as entry:
+                    visible = _values(entry, "visib_fract", (int, float))
+                    if len(visible) != len(objects):
+                        raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
+            depth = read_depth(scene / "depth" / f"{image.stem}.png")
+            masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
+            sizes = [int(mask.sum()) for mask in masks]
+            labels = np.zeros(depth.shape, np.int32)
+            for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
+                labels[masks[k]] = k + 1
+            scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
+            truth = {k + 1: self._name(objects[k]) for k in scored}
+            frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
+        return LabelledFrame(self.identifiers[number], frame, truth, {"scene": scene.name})
+
+    @contextlib.contextmanager
+    def _entry(self, scene: Path, name: str, image: Path) -> Iterator[Any]:
+        """Yield the entry of an image in a table of its scene; errors name the table."""
+        path, number = scene / f"scene_{name}.json", str(int(image.stem))
+        status = path.stat()
+        table = _read_table(path, status.st_mtime_ns, status.st_size)
+        with with_context(str(path)):
+            if number not in table:
+                raise InputError(f"it has no image {number}")
+            yield table[number]
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame: its images, its masks and the tables of its scene."""
@@ -82,44 +107,16 @@ class BOP(LabelledFrames):
         return self._names[obj_id]
 
 
-class _Scene:
-    """The tables of a scene and its images."""
+@functools.lru_cache(maxsize=3)  # frames are read scene by scene
+def _read_table(path: Path, modified: int, size: int) -> dict[Any, Any]:
+    return read_table(path)
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._cameras = read_table(folder / "scene_camera.json")
-        self._objects = read_table(folder / "scene_gt.json")
-        info = folder / "scene_gt_info.json"
-        self._visible = read_table(info) if info.exists() else None
 
-    def read(self, image: Path) -> tuple[RGBDFrame, dict[int, int]]:
-        """Read the frame of a colour image, and label -> obj_id of the instances that are scored."""
-        number = str(int(image.stem))
-        with with_context(str(self._folder / "scene_camera.json")):
-            intrinsics = _intrinsics(_entry(self._cameras, number))
-        with with_context(str(self._folder / "scene_gt.json")):
-            objects = _values(_entry(self._objects, number), "obj_id", int)
-        visible: list[float] = [1.0] * len(objects)
-        if self._visible is not None:
-            with with_context(str(self._folder / "scene_gt_info.json")):
-                visible = _values(_entry(self._visible, number), "visib_fract", (int, float))
-                if len(visible) != len(objects):
-                    raise InputError(f"it has {len(visible)} instances in image {number}, scene_gt.json {len(objects)}")
-        depth = read_depth(self._folder / "depth" / f"{image.stem}.png")
-        masks = [self._mask(f"{image.stem}_{k:06d}.png", depth.shape) for k in range(len(objects))]
-        sizes = [int(mask.sum()) for mask in masks]
-        labels = np.zeros(depth.shape, np.int32)
-        for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
-            labels[masks[k]] = k + 1
-        scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
-        return RGBDFrame(read_color(image), depth, labels, intrinsics), {k + 1: objects[k] for k in scored}
-
-    def _mask(self, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        path = self._folder / "mask_visib" / name
-        mask = read_labels(path) > 0
-        if mask.shape != shape:
-            raise InputError(f"{path} has shape {mask.shape}; depth has {shape}")
-        return mask
+def _mask(path: Path, depth: NDArray[Any]) -> NDArray[np.bool_]:
+    mask = read_labels(path) > 0
+    if mask.shape != depth.shape:
+        raise InputError(f"{path} has shape {mask.shape}; depth has {depth.shape}")
+    return mask
 
 
 def _images(folder: Path) -> list[Path]:
@@ -141,12 +138,6 @@ def read_object_names(path: Path) -> dict[int, str]:
             raise InputError(f"{path}: {obj_id!r} is {name!r}; expected an obj_id and a name")
         names[int(obj_id)] = name
     return names
-
-
-def _entry(table: Mapping[Any, Any], number: str) -> Any:
-    if number not in table:
-        raise InputError(f"it has no image {number}")
-    return table[number]
 
 
 def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any]:

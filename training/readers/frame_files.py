@@ -139,7 +139,9 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
             names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
             images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
             of_path = [
-                frame_files(folder).source(_name(folder, path), depth_scale)
+                frame_files(folder).source(
+                    folder.name if folder == path else folder.relative_to(path).as_posix(), depth_scale
+                )
                 for folder in sorted({file.parent for file in images})
             ]
         if not of_path:
@@ -169,11 +171,6 @@ def _read_segmented(source: FrameSource, segmenter: Segmenter) -> RGBDFrame:
 
 def _read_bop(dataset: BOP, number: int) -> RGBDFrame:
     return dataset[number].frame
-
-
-def _name(folder: Path, path: Path) -> str:
-    """Return the name of a frame: that of its folder, after those between `path` and it."""
-    return folder.name if folder == path else folder.relative_to(path).as_posix()
 
 
 def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:

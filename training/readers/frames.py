@@ -10,7 +10,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
 from training.readers.frame_files import FILE_NAMES, FrameFiles, FrameSource, find_frames
-from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames, named_labels
 
 __all__ = ["FrameFolder", "read_names"]
 
@@ -95,11 +95,4 @@ def read_names(path: Path) -> dict[int, str]:
         entries = [(int(label), name) for label, name in json.loads(read_file(path))["labels"].items()]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f'{path} is invalid; expected {{"labels": {{"<number>": "<name>", ...}}}}') from None
-    truth: dict[int, str] = {}
-    for label, name in entries:
-        if not isinstance(name, str):
-            raise InputError(f"{path}: label {label} has the name {name!r}; expected a string")
-        if label in truth:
-            raise InputError(f"{path}: label {label} has the names {truth[label]!r} and {name!r}; expected one")
-        truth[label] = name
-    return truth
+    return named_labels(path, entries)

@@ -2,13 +2,22 @@
 
 import abc
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = ["LabelledFrame", "LabelledFrames", "dataset_folder", "named_path", "path_ends", "sequence_of"]
+__all__ = [
+    "LabelledFrame",
+    "LabelledFrames",
+    "dataset_folder",
+    "named_labels",
+    "named_path",
+    "path_ends",
+    "sequence_of",
+]
 
 
 def sequence_of(identifier: str) -> str:
@@ -34,6 +43,18 @@ def path_ends(sequence: str) -> list[str]:
     """Return the names that a sequence a/b/c may be given, longest first: a/b/c, b/c, c."""
     parts = sequence.split("/")
     return ["/".join(parts[start:]) for start in range(len(parts))]
+
+
+def named_labels(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
+    """Return label -> name; raises InputError with the path unless they are integers and texts, and a label has one."""
+    names: dict[int, str] = {}
+    for label, name in entries:
+        if type(label) is not int or not isinstance(name, str):
+            raise InputError(f"{path}: label {label!r} has the name {name!r}; expected an integer and a string")
+        if label in names:
+            raise InputError(f"{path}: label {label} has the names {names[label]!r} and {name!r}; expected one")
+        names[label] = name
+    return names
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

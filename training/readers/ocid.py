@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import parse_json, read_file, read_table
+from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
 
@@ -66,7 +66,7 @@ class OCID(LabelledFrames):
                 self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not self._images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        value = _read_names(Path(names))
+        value = read_table(Path(names), (dict, list))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
             self._names, listed = _names_of_vlg(Path(names), value)
@@ -83,11 +83,27 @@ class OCID(LabelledFrames):
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
-        sequence, _ = self._images[number]
+        sequence, image = self._images[number]
+        _, depth_file, label_file, cloud_file = self.files(number)
         place, camera, kind, _ = sequence.split("/")
+        first_object = _FIRST_OBJECT[place]
         with with_context(self.identifiers[number]):
             names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
-            frame, truth = _read(self.files(number), _FIRST_OBJECT[place], names, self._is_complete)
+            color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
+            with with_context(str(cloud_file)):
+                if points.shape[:2] != color.shape[:2]:
+                    raise InputError(
+                        f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
+                    )
+                intrinsics = fit_intrinsics(points)
+            frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
+            unnamed = [label for label in frame.instances if label not in names]
+            if unnamed and self._is_complete:
+                raise InputError(
+                    f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels "
+                    f"from {first_object} on"
+                )
+        truth = {label: names[label] for label in frame.instances if label in names}
         attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
         return LabelledFrame(self.identifiers[number], frame, truth, attributes)
 
@@ -97,19 +113,6 @@ class OCID(LabelledFrames):
         folder = image.parent.parent
         cloud = folder / "pcd" / f"{image.stem}.pcd"
         return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
-
-
-def _read_names(path: Path) -> dict[Any, Any] | list[Any]:
-    """Return the value of a table of names: a list if it is one of OCID-VLG."""
-    if path.suffix.lower() != ".json":
-        return read_table(path)
-    try:
-        value = parse_json(read_file(path))
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error})") from None
-    if not isinstance(value, (dict, list)):
-        raise InputError(f"{path} holds a {type(value).__name__}; expected a table, or a list of OCID-VLG")
-    return value
 
 
 def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[str]) -> dict[str, dict[int, str]]:
@@ -157,29 +160,6 @@ def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int,
             )
         images.setdefault(sequence, set()).add(Path(image.strip()).stem)
     return names, images
-
-
-def _read(
-    files: Iterable[Path], first_object: int, names: Mapping[int, str], is_complete: bool
-) -> tuple[RGBDFrame, dict[int, str]]:
-    """Read a frame and the names of its labels; with `is_complete`, each must have one."""
-    image, depth_file, label_file, cloud_file = files
-    color = read_color(image)
-    labels = read_labels(label_file)
-    points = read_organized_points(cloud_file)
-    with with_context(str(cloud_file)):
-        if points.shape[:2] != color.shape[:2]:
-            raise InputError(f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)")
-        intrinsics = fit_intrinsics(points)
-    depth = read_depth(depth_file)
-    frame = RGBDFrame(color, depth, labels * (labels >= first_object), intrinsics)
-    unnamed = [label for label in frame.instances if label not in names]
-    if unnamed and is_complete:
-        raise InputError(
-            f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels from "
-            f"{first_object} on"
-        )
-    return frame, {label: names[label] for label in frame.instances if label in names}
 
 
 def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
@@ -255,17 +235,12 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
 
 def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     """Return the lines of the header (first word -> other words) and the offset of the data."""
-    header: dict[str, list[str]] = {}
-    start = 0
-    while "DATA" not in header:
-        end = content.find(b"\n", start)
-        if end < 0:
-            raise InputError(f"{path} is not a PCD file; expected a line DATA")
-        words = content[start:end].decode("ascii", errors="replace").split()
-        if words:
-            header[words[0]] = words[1:]
-        start = end + 1
-    return header, start
+    end = content.find(b"\n", content.find(b"\nDATA") + 1)
+    lines = [line.split() for line in content[: max(end, 0)].decode("ascii", errors="replace").splitlines()]
+    header = {words[0]: words[1:] for words in lines if words}
+    if "DATA" not in header:
+        raise InputError(f"{path} is not a PCD file; expected a line DATA")
+    return header, end + 1
 
 
 def _binary(data: bytes, record: np.dtype[Any], n: int, axes: list[int], path: Path) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder
+from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_labels
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
@@ -20,36 +20,24 @@ NOT_SCORED = frozenset({"ice_cream", "hot_sauce", "chips_can"})
 
 _FIRST_LOUNGE = 167
 
-
 _VIDEOS = {
-    ("kitchen", "none", "1"): (41, 42, 176, 177),
-    ("food", "none", "1"): (32, 33, 167, 168),
-    ("tools", "none", "1"): (50, 51, 185, 186),
-    ("kitchen", "low", "1"): (44, 45, 179, 180),
-    ("food", "low", "1"): (35, 36, 170, 171),
-    ("tools", "low", "1"): (53, 54, 188, 189),
-    ("kitchen", "high", "1"): (46, 48, 182, 183),
-    ("food", "high", "1"): (38, 39, 173, 174),
-    ("tools", "high", "1"): (56, 57, 191, 192),
-    ("kitchen", "none", "2"): (68, 69, 203, 204),
-    ("food", "none", "2"): (77, 78, 212, 213),
-    ("tools", "none", "2"): (59, 60, 194, 195),
-    ("kitchen", "low", "2"): (71, 72, 206, 207),
-    ("food", "low", "2"): (80, 81, 215, 216),
-    ("tools", "low", "2"): (62, 63, 197, 198),
-    ("kitchen", "high", "2"): (74, 75, 209, 210),
-    ("food", "high", "2"): (83, 84, 218, 219),
-    ("tools", "high", "2"): (65, 66, 200, 201),
+    ("kitchen", "1"): ((41, 42, 176, 177), (44, 45, 179, 180), (46, 48, 182, 183)),
+    ("food", "1"): ((32, 33, 167, 168), (35, 36, 170, 171), (38, 39, 173, 174)),
+    ("tools", "1"): ((50, 51, 185, 186), (53, 54, 188, 189), (56, 57, 191, 192)),
+    ("kitchen", "2"): ((68, 69, 203, 204), (71, 72, 206, 207), (74, 75, 209, 210)),
+    ("food", "2"): ((77, 78, 212, 213), (80, 81, 215, 216), (83, 84, 218, 219)),
+    ("tools", "2"): ((59, 60, 194, 195), (62, 63, 197, 198), (65, 66, 200, 201)),
 }
-"""Category of the objects, occlusion and light -> numbers of the videos, as in the dataset's table."""
+"""The dataset's table: category of the objects and light -> videos without occlusion, with low and with high one."""
 
 
 def video_attributes(number: int) -> dict[str, str]:
     """Return the environment of a video and, if the dataset's table lists it, object category, occlusion and light."""
     attributes = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
-    for (category, occlusion, light), numbers in _VIDEOS.items():
-        if number in numbers:
-            attributes |= {"category": category, "occlusion": occlusion, "light": light}
+    for (category, light), columns in _VIDEOS.items():
+        for occlusion, numbers in zip(("none", "low", "high"), columns, strict=True):
+            if number in numbers:
+                attributes |= {"category": category, "occlusion": occlusion, "light": light}
     return attributes
 
 
@@ -96,11 +84,4 @@ def _truth(path: Path) -> dict[int, str]:
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
-    truth: dict[int, str] = {}
-    for label, name in entries:
-        if type(label) is not int or type(name) is not str:
-            raise InputError(f"{path}: {name!r} has the label {label!r}; expected a name and an integer")
-        if label in truth:
-            raise InputError(f"{path}: {truth[label]!r} and {name!r} have the label {label}")
-        truth[label] = name
-    return truth
+    return named_labels(path, entries)

@@ -1,5 +1,8 @@
 """The random forest against NumPy and scikit-learn, and PointNet against a NumPy reference."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from flax import nnx
@@ -8,9 +11,10 @@ from sklearn.ensemble import RandomForestClassifier
 
 import colornet
 import thor2_jax as thor2
-from training.baselines.baseline import BaselineInputs
-from training.baselines.forest import Forest, forest_features, tree_arrays
-from training.baselines.pointnet import POINTS, ColoredPointNet, PointNet
+from thor2_jax.model.classifier import model_arrays
+from training.baselines.baseline import BaselineInputs, Predictor
+from training.baselines.forest import forest_features, load_forest, predict, tree_arrays
+from training.baselines.pointnet import POINTS, PointNet, load_pointnet
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -52,33 +56,38 @@ def test_predictions_match_scikit_learn(depth: int | None) -> None:
     x = rng.random((300, 5)).astype(np.float32)
     y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
     grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
-    forest = Forest(tree_arrays(grown), NETWORK, CONFIG)
     features = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
-    np.testing.assert_allclose(forest.predict(features), grown.predict_proba(features), atol=1e-6)
+    np.testing.assert_allclose(predict(tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6)
 
 
 def test_single_leaf_trees_and_missing_arrays() -> None:
     grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
     nodes = tree_arrays(grown)
-    forest = Forest(nodes, NETWORK, CONFIG)
-    inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32))
-    np.testing.assert_allclose(forest.probabilities(inputs), grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
-    with pytest.raises(ValueError, match="root"):
-        Forest({name: nodes[name] for name in nodes if name != "root"}, NETWORK, CONFIG)
+    run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
+    inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32), None)
+    probabilities = load_forest("forest", nodes, run)(inputs)
+    np.testing.assert_allclose(probabilities, grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
+    with pytest.raises(KeyError, match="root"):
+        load_forest("forest", {name: nodes[name] for name in nodes if name != "root"}, run)
 
 
-def model() -> ColoredPointNet:
-    return ColoredPointNet(PointNet(5, rngs=nnx.Rngs(3)))
+ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
+
+
+def pointnet(classes: int = 5) -> Predictor:
+    run: Any = SimpleNamespace(classes=("",) * classes)
+    return load_pointnet("pointnet", ARRAYS, run)
 
 
 def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
-    return BaselineInputs(thor2.PointClouds.pack(random_clouds(seed, sizes)), np.zeros((len(sizes), 1), np.float32))
+    packed = thor2.PointClouds.pack(random_clouds(seed, sizes))
+    return BaselineInputs(packed, np.zeros((len(sizes), 1), np.float32), None)
 
 
 def test_probabilities_match_numpy() -> None:
     """The cloud has as many points as are sampled, so all of them are used."""
-    cloud, net = inputs((POINTS,)), model()
-    arrays = {name: array.astype(np.float64) for name, array in net.arrays().items()}
+    cloud = inputs((POINTS,))
+    arrays = {name: array.astype(np.float64) for name, array in ARRAYS.items()}
     xyz = np.asarray(cloud.normal.points, np.float64)[0, :POINTS]
     rgb = np.asarray(cloud.normal.colors, np.float64)[0, :POINTS]
     x = np.concatenate([xyz - xyz.max(axis=0) / 2, rgb - 0.5], axis=1)
@@ -88,26 +97,17 @@ def test_probabilities_match_numpy() -> None:
     x = np.maximum(x.max(axis=0) @ arrays["hidden/kernel"] + arrays["hidden/bias"], 0)
     logits = x @ arrays["head/kernel"] + arrays["head/bias"]
     expected = np.exp(logits) / np.exp(logits).sum()
-    np.testing.assert_allclose(net.probabilities(cloud)[0], expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("sizes", [(1,), (0, 7), (POINTS - 1, POINTS + 1, 900)])
-def test_any_number_of_points(sizes: tuple[int, ...]) -> None:
-    probabilities = model().probabilities(inputs(sizes))
-    assert probabilities.shape == (len(sizes), 5)
-    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(pointnet()(cloud)[0], expected, atol=1e-5)
+    with pytest.raises(ValueError, match="head/bias"):
+        pointnet(6)
 
 
 def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
-    net, both = model(), inputs((800, 500))
-    first = np.asarray(both.normal.points)[0, :800], np.asarray(both.normal.colors)[0, :800]
-    one = BaselineInputs(thor2.PointClouds.pack([first]), both.tops[:1])
-    np.testing.assert_allclose(net.probabilities(one)[0], net.probabilities(both)[0], atol=1e-6)
-
-
-def test_network_round_trips_through_arrays() -> None:
-    net, cloud = model(), inputs((500,))
-    again = ColoredPointNet.with_arrays(net.arrays(), 5)
-    np.testing.assert_array_equal(again.probabilities(cloud), net.probabilities(cloud))
-    with pytest.raises(ValueError, match="head/bias"):
-        ColoredPointNet.with_arrays(net.arrays(), 6)
+    sizes = (POINTS - 1, POINTS + 1, 900, 1, 0)
+    both = inputs(sizes)
+    probabilities = pointnet()(both)
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
+    for row, size in enumerate(sizes):
+        cloud = np.asarray(both.normal.points)[row, :size], np.asarray(both.normal.colors)[row, :size]
+        one = BaselineInputs(thor2.PointClouds.pack([cloud]), both.tops[:1], None)
+        np.testing.assert_allclose(pointnet()(one)[0], probabilities[row], atol=1e-6)

@@ -18,12 +18,11 @@ from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import templates
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import NETWORKS, crop_size, read_baseline
-from training.baselines.job import load_baselines, pretrained_files, train_baselines
+from training.baselines.files import read_baseline
+from training.baselines.job import crop_size, load_baselines, pretrained_files, train_baselines
 from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
-from training.baselines.templates import BACKBONES, Templates, create_backbone
-from training.fitting.loop import FitOptions
+from training.baselines.templates import compare
 from training.fitting.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
@@ -33,7 +32,6 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")
-OPTIONS = FitOptions(epochs=3, batch_size=8)
 N_VIEWS = 20
 SMALL = "rgbd-vit-small"
 
@@ -58,9 +56,9 @@ CLOUDS = random_clouds(0, [40] * N_VIEWS)
 SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 
-def write_run(folder: Path, folds: int = 4) -> Path:
+def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
     record = {
-        "dataset": dict(SOURCE.record), "epochs": 3, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
+        "dataset": dict(SOURCE.record), "epochs": epochs, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
         "folds": folds, "fold": 0, "temperatures": {},
     }  # fmt: skip
     save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
@@ -92,13 +90,13 @@ def quick_network() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_run(tmp_path_factory.mktemp("networks") / "run")
-    train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
+    train_baselines(folder, SOURCE, [SMALL])
     return folder
 
 
 def check_baseline(folder: Path, name: str) -> None:
     loaded = load_baselines(folder, load_run(folder))[name]
-    probabilities = loaded.model.probabilities(frame_inputs(5))
+    probabilities = loaded.predict(frame_inputs(5))
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     assert probabilities[:2].argmax(axis=1).tolist() == [0, 1] and (probabilities[2:] == 0.5).all()
     assert loaded.weights == {} and loaded.temperature is not None and loaded.temperature > 0
@@ -106,14 +104,14 @@ def check_baseline(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", [SMALL, pytest.param("templates", marks=pytest.mark.slow)])
 def test_network_and_templates_learn(trained: Path, name: str) -> None:
-    train_baselines(trained, SOURCE, [name], options=OPTIONS)
+    train_baselines(trained, SOURCE, [name])
     check_baseline(trained, name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
 def test_other_networks_learn(tmp_path: Path, name: str) -> None:
-    train_baselines(write_run(tmp_path / "run"), SOURCE, [name], options=dataclasses.replace(OPTIONS, epochs=12))
+    train_baselines(write_run(tmp_path / "run", epochs=12), SOURCE, [name])
     check_baseline(tmp_path / "run", name)
 
 
@@ -131,9 +129,9 @@ def test_interrupted_fit_resumes_to_the_same_weights(
 
     monkeypatch.setattr(module, "_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
+        train_baselines(folder, SOURCE, [SMALL])
     assert not list((folder / "baselines").glob("*.safetensors"))
-    train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
+    train_baselines(folder, SOURCE, [SMALL])
     assert len(steps) == 4  # one step in each of three epochs, one of them interrupted
     resumed, expected = (load_file(run / "baselines" / f"{SMALL}.safetensors") for run in (folder, trained))
     for path in expected:
@@ -155,18 +153,17 @@ def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
 def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "weights")
     (file,) = pretrained_files(SMALL)
-    folder = write_run(tmp_path / "run", folds=1)
-    options = dataclasses.replace(OPTIONS, epochs=1)
-    train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+    folder = write_run(tmp_path / "run", folds=1, epochs=1)
+    train_baselines(folder, SOURCE, [SMALL], weights=weights)
     stored = read_baseline(folder / "baselines" / f"{SMALL}.safetensors", NAMES)
     assert list(stored.weights) == [f"{file}.safetensors"] and stored.temperature is None
     given = load_file(weights / f"{file}.safetensors")["blocks.0.mlp.fc1.weight"].T
     moved = stored.arrays["color/blocks/0/mlp/fc1/kernel"] - given
     assert 0 < np.abs(moved).max() < 1e-3  # a step of the small learning rate away
-    train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+    train_baselines(folder, SOURCE, [SMALL], weights=weights)
     write_weights(weights, seed=1)
     with pytest.raises(InputError, match="^weights is .*was trained without these files"):
-        train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+        train_baselines(folder, SOURCE, [SMALL], weights=weights)
 
 
 def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
@@ -185,16 +182,14 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     for damage, message in cases:
         damage()
         with pytest.raises(InputError, match=f"^weights: .*{message}"):
-            train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
+            train_baselines(folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()
 
 
 def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:
     folder, source = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
     assert_refused("^baselines: templates needs a backbone", train_baselines, folder, SOURCE, ["templates"])
-    assert_refused("no crops", train_baselines, folder, source, [SMALL], options=OPTIONS)
-    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1]), np.zeros((1, 1), np.float32))
-    assert_refused("^frame is missing", inputs.crops, 96)
+    assert_refused("no crops", train_baselines, folder, source, [SMALL])
 
 
 def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
@@ -212,10 +207,13 @@ def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
 def test_nearest_template_has_the_largest_cosine() -> None:
     """Against the formula, with two classes and features by hand."""
     features = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float16)
-    library = Templates(2, create_backbone(BACKBONES[2]), features, np.array([0, 1, 1], np.int16), 2)
     similarity = np.array([[0.8, 0.96], [-1.0, -0.6]])
     expected = np.exp(20 * similarity) / np.exp(20 * similarity).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(library.compare(np.array([[0.8, 0.6], [-1, 0]], np.float32)), expected, atol=1e-3)
+    np.testing.assert_allclose(
+        compare(np.array([[0.8, 0.6], [-1, 0]], np.float32), features, np.array([0, 1, 1], np.int16), 2),
+        expected,
+        atol=1e-3,
+    )
 
 
 def test_inputs_are_scaled_and_the_background_is_zero() -> None:
@@ -231,7 +229,5 @@ def test_inputs_are_scaled_and_the_background_is_zero() -> None:
 
 def test_crop_size_is_that_of_the_largest_reader() -> None:
     assert crop_size(["forest", "thor"], True) is None
-    assert crop_size([SMALL, "templates"], False) == 96 and crop_size([SMALL, "templates"], True) == 224
+    assert crop_size([SMALL, "templates"], False) == 32 and crop_size(["templates"], True) == 224
     assert crop_size([SMALL, "rcfusion"], False) == 224
-    others = set(NETWORKS) - {SMALL}
-    assert all(crop_size([name], False) == ARCHITECTURES[name].size for name in others)

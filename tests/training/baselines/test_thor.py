@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from helpers import random_classifier
 import thor2_jax as thor2
 from thor2_jax.model.classifier import MLP
 from training.baselines.baseline import BaselineInputs
-from training.baselines.thor import THOR, VIEW_TYPES, camera_types, view_types
+from training.baselines.thor import VIEW_TYPES, camera_types, library_arrays, load_thor, predictor, view_types
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -59,7 +60,7 @@ def inputs(*boxes: tuple[Any, Any, Any]) -> BaselineInputs:
     cameras = np.array([camera for _, camera, _ in boxes])
     normal = thor2.PointClouds.pack(clouds, camera=cameras, boundary=[edge for *_, edge in boxes])
     tops = np.random.default_rng(0).random((len(boxes), 48)).astype(np.float32)
-    return BaselineInputs(normal, tops)
+    return BaselineInputs(normal, tops, None)
 
 
 def test_most_confident_selected_classifier_decides() -> None:
@@ -74,26 +75,20 @@ def test_most_confident_selected_classifier_decides() -> None:
     )
     models = library()
     selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
-    probabilities = THOR(models, CONFIG).probabilities(clouds)
+    arrays, run = library_arrays(models), SimpleNamespace(config=CONFIG, classes=("",) * 4)
+    probabilities = load_thor("thor", arrays, run)(clouds)
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (names, k) in enumerate(selected):
         tops = clouds.tops[row : row + 1, : 16 * k]
         rows = [np.asarray(apply(models[name, k], tops))[0] for name in names.split()]
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
+    del arrays["side-2/head/bias"]
+    with pytest.raises(ValueError, match="head/bias"):
+        load_thor("thor", arrays, run)
 
 
 def test_empty_clouds_give_finite_probabilities() -> None:
     empty = np.zeros((0, 3), np.float32)
     normal = thor2.PointClouds.pack([(empty, empty)])
-    probabilities = THOR(library(), CONFIG).probabilities(BaselineInputs(normal, np.zeros((1, 48), np.float32)))
+    probabilities = predictor(library(), CONFIG)(BaselineInputs(normal, np.zeros((1, 48), np.float32), None))
     assert probabilities.shape == (1, 4) and np.isfinite(probabilities).all()
-
-
-def test_library_round_trips_through_arrays() -> None:
-    thor, clouds = THOR(library(), CONFIG), inputs(box((0.2, 0.1, 0.05), (0.1, 0.05, -3.0)))
-    arrays = thor.arrays()
-    again = THOR.with_arrays(arrays, CONFIG, 4)
-    np.testing.assert_array_equal(again.probabilities(clouds), thor.probabilities(clouds))
-    del arrays["side-2/head/bias"]
-    with pytest.raises(ValueError, match="head/bias"):
-        THOR.with_arrays(arrays, CONFIG, 4)

@@ -14,7 +14,7 @@ from recording_files import table_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
+from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import FRAMES_PER_CHUNK, RecognizerArguments, recognize_frames, recognize_frames_in_pool
 from training.readers.frame_files import find_frames, segmented_source
 from training.readers.frames import FrameFolder
@@ -55,8 +55,8 @@ def test_chunks_of_segmented_frames_have_the_same_answers(model: Path, tmp_path:
 def test_answers_before_an_unreadable_frame_are_kept(
     model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames, arguments = FrameFolder(folder), RunArguments((model,))
-    expected = list(answer_frames(arguments.load(tuple(frames.identifiers)), frames))
+    frames, arguments = FrameFolder(folder), ((model,), None)
+    expected = list(answer_frames(load_evaluated(*arguments), frames))
     broken, read = FRAMES_PER_CHUNK + 2, FrameFolder.__getitem__
 
     def damaged(self: FrameFolder, number: int) -> Any:

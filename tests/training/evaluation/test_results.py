@@ -1,7 +1,7 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,6 +24,9 @@ class ToyRun(NamedTuple):
     temperatures: Mapping[str, float] = {}
     answer_by: str = "classifiers"
     thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
+    baselines: Mapping[str, Any] = {}
+    own_objects: bool = False
+    has_real_views: bool = False
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
@@ -215,21 +218,18 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
 
 
-def test_results_of_no_or_one_instance() -> None:
+def test_results_of_one_instance() -> None:
     incorrect = InstancePrediction(1, "mug", probabilities=np.eye(2, 3, dtype=np.float32))
-    for instances in ([], [incorrect], [InstancePrediction(1, "mug", reason="too few points")]):
-        report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
-        assert report["instances"]["scored"] == len(instances) and report["published_tables"] == []
-        assert report["speed"]["frames_per_second"] is None
-        assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
-        if instances:
-            assert report["known_unknown"] is None
-            accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
-            assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
-            assert report["confusion"][2][3] == (instances[0].reason is not None)
-            assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
-            assert report["rejection"]["threshold"]["runs"] == 0
-            assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
+    for instance in (incorrect, InstancePrediction(1, "mug", reason="too few points")):
+        report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 1.0, [instance])])
+        assert report["instances"]["scored"] == 1 and report["published_tables"] == []
+        assert report["fusions"] == ["TOPS", "TOPS2", "THOR2"] and report["known_unknown"] is None
+        accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
+        assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
+        assert report["confusion"][2][3] == (instance.reason is not None)
+        assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
+        assert report["rejection"]["threshold"]["runs"] == 0
+        assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 def test_grouping_by_attributes() -> None:

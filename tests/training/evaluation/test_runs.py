@@ -61,7 +61,6 @@ def test_incompatible_runs_are_refused(make: Maker, tmp_path: Path) -> None:
     for message, other in cases.items():
         with input_error(message, other, match="^model: "):
             load_runs([first, other])
-    assert_refused("^model: ", load_runs, [])
 
 
 def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> None:
@@ -96,7 +95,6 @@ def test_incompatible_sequence_runs_are_refused(make: Maker, tmp_path: Path) -> 
         ("s1", "s3"): "different descriptors or colour networks",
         ("s1", "s4"): "s4",
         ("s1", "s5"): "has no run for s5",
-        (): "has no run for any sequence",
     }
     for sequences, message in cases.items():
         frames = [f"{sequence}/frame" for sequence in sequences]

@@ -1,6 +1,7 @@
 """The BOP reader on small datasets; images against OpenCV."""
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
     (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
     (tmp_path / "models").mkdir()
-    items = list(BOP(tmp_path))
+    items = list(pickle.loads(pickle.dumps(BOP(tmp_path))))  # as worker processes get the dataset
     assert [item.identifier for item in items] == ["000048/1000000", "000050/000002", "000050/000010"]
     for item, seed in zip(items[1:], (2, 10), strict=True):
         np.testing.assert_array_equal(item.frame.color, color_and_depth(seed)[0])
@@ -82,7 +83,7 @@ def test_names(tmp_path: Path, name: str) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """There are two scenes of three objects; in the second, the first object is almost hidden."""
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
-    monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
+    monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
     objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
     write_bop(tmp_path / "test" / "000048", objects=objects, visible=[1, 1, 1])
     write_bop(tmp_path / "test" / "000049", objects=objects, visible=[0.05, 1, 1])

@@ -143,7 +143,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     write_ocid(tmp_path / "YCB10", "floor/top/mixed/seq08")
     names = write_names(tmp_path, {"seq36": ["mug", "bowl"], "seq08": ["bowl", "bowl", "banana"]})
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
-    monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
+    monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
     command = ("evaluate", "ocid", tmp_path, "--model", tmp_path / "run", "--names", names)
     output = printed(*command, "--out", tmp_path / "report")
     assert "4 instances scored" in output

@@ -22,9 +22,8 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import open_file
-from training.baselines.networks.densenet import DENSENET_161, ViTCNN
-from training.baselines.networks.resnet import RCFusion
+from thor2_jax.files import file_digest
+from training.baselines.networks.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4, RGBDViT
 
 __all__ = [
@@ -74,17 +73,21 @@ def weights_file(directory: Path, name: str) -> Path:
     return path
 
 
-def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> list[Path]:
-    """Replace the weights of backbones by those of files in a directory, given without the suffix; return the files.
+def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> dict[str, str]:
+    """Replace the weights of backbones by those of files in a directory, given without the suffix.
+
+    Returns:
+        Name of each file -> its SHA-256.
 
     Raises:
         InputError: a file does not exist, or as `load_backbone`.
     """
-    paths = []
+    digests = {}
     for model, name in backbones:
-        paths.append(weights_file(directory, name))
-        load_backbone(model, paths[-1])
-    return paths
+        path = weights_file(directory, name)
+        load_backbone(model, path)
+        digests[path.name] = file_digest(path)
+    return digests
 
 
 def load_backbone(model: nnx.Module, path: Path) -> None:
@@ -99,7 +102,6 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     prefix = getattr(model, "PREFIX", "")
     loaded = {}
     try:
-        open_file(path).close()
         with safetensors.safe_open(path, "numpy") as file:
             names = set(file.keys())
             for keys, value in values.items():
@@ -132,8 +134,6 @@ def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) 
 
     Positions of another length D, or of a grid that is not square, are returned as they are.
     """
-    import jax
-
     sides = [round((n - 1) ** 0.5) for n in (positions.shape[1], shape[1])] if positions.ndim == 3 else [0, 0]
     square = positions.ndim == 3 and sides[0] ** 2 + 1 == positions.shape[1]
     if positions.shape == shape or not square or positions.shape[2] != shape[2]:
@@ -160,8 +160,7 @@ class Architecture:
 
     def build(self, n_classes: int, seed: int) -> nnx.Module:
         """Return the network with random weights."""
-        network: nnx.Module = self.create(n_classes, rngs=nnx.Rngs(seed))
-        return network
+        return self.create(n_classes, rngs=nnx.Rngs(seed))
 
     def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
         """Return the backbones of a network with their files."""

@@ -103,16 +103,12 @@ class Block(nnx.Module):
         self.attn = Attention(config, rngs=rngs)
         self.norm2 = nnx.LayerNorm(config.width, epsilon=EPSILON, rngs=rngs)
         self.mlp = MLP(config.width, rngs=rngs)
-        self.layer_scale = config.layer_scale
-        if config.layer_scale:
-            self.ls1, self.ls2 = LayerScale(config.width), LayerScale(config.width)
+        self.ls1, self.ls2 = (LayerScale(config.width) if config.layer_scale else nnx.identity for _ in range(2))
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Return tokens [B, T, width] for tokens [B, T, width]."""
-        y = self.attn(self.norm1(x))
-        x = x + (self.ls1(y) if self.layer_scale else y)
-        y = self.mlp(self.norm2(x))
-        return x + (self.ls2(y) if self.layer_scale else y)
+        x = x + self.ls1(self.attn(self.norm1(x)))
+        return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class ViT(nnx.Module):

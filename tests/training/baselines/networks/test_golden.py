@@ -12,8 +12,7 @@ from flax import nnx
 from safetensors.numpy import save_file
 
 from training.baselines.networks.architectures import load_backbone, resampled_positions, tensor_shapes
-from training.baselines.networks.densenet import DENSENET_161, DenseNet
-from training.baselines.networks.resnet import GRU, ResNet18
+from training.baselines.networks.cnn import DENSENET_161, GRU, DenseNet, ResNet18
 from training.baselines.networks.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT, ViTConfig
 
 GOLDEN = Path(__file__).parents[3] / "golden"
