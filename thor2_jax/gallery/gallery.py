@@ -58,12 +58,14 @@ class GalleryObject:
         clouds: the views as they were enrolled.
         source: where the views come from: "mesh", "frames" or "mesh and frames".
         date: date of the last enrolment, ISO 8601.
+        file: name of its file in the gallery on disk; None until it is written.
     """
 
     embeddings: NDArray[np.float16]
     clouds: CompactClouds
     source: str
     date: str
+    file: str | None = None
 
     def __add__(self, other: "GalleryObject") -> "GalleryObject":
         return GalleryObject(
@@ -86,6 +88,8 @@ class Gallery:
         version: version of the embedding, see `EmbeddingSizes`.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
+        generation: number of changes on disk so far.
+        stamp: `store.gallery_stamp` of this state; None if it is not on disk.
     """
 
     embedding: str
@@ -94,6 +98,8 @@ class Gallery:
     search: str = "exact"
     references: References | None = None
     version: int = 0
+    generation: int = 0
+    stamp: tuple[int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.search not in ("exact", "usearch"):
@@ -123,7 +129,7 @@ class Gallery:
             raise InputError(f"name: {name!r} is enrolled already; add views to it (extend) or replace it (replace)")
         if name in self.objects and extend:
             views = self.objects[name] + views
-        return dataclasses.replace(self, objects={**self.objects, name: views})
+        return dataclasses.replace(self, objects={**self.objects, name: dataclasses.replace(views, file=None)})
 
     def without(self, name: str, *, hide: bool = False) -> "Gallery":
         """Return the gallery without an object; with `hide`, a trained class of this name is not answered any more.
@@ -132,7 +138,8 @@ class Gallery:
             InputError: no object has the name, and `hide` is not given.
         """
         if name not in self.objects and not hide:
-            raise InputError(f"name: {name!r} is not enrolled; expected one of {shown_names(self.names)}")
+            known = ", ".join(map(repr, self.names))
+            raise InputError(f"name: {name!r} is not enrolled; expected one of {known or 'none'}")
         objects = {other: views for other, views in self.objects.items() if other != name}
         hidden = (*self.hidden, name) if hide and name not in self.hidden else self.hidden
         return dataclasses.replace(self, objects=objects, hidden=hidden)
@@ -145,7 +152,7 @@ class Gallery:
             embed: function of an object's clouds and their source that returns embeddings [E, D].
         """
         objects = {
-            name: dataclasses.replace(views, embeddings=embed(views.clouds, views.source))
+            name: dataclasses.replace(views, embeddings=embed(views.clouds, views.source), file=None)
             for name, views in self.objects.items()
         }
         return dataclasses.replace(self, embedding=embedding, objects=objects)
@@ -227,9 +234,3 @@ class Gallery:
 def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
     """Return the odds of scores against everything that is not enrolled."""
     return np.asarray((scores / EVEN) ** STEEPNESS)
-
-
-def shown_names(names: tuple[str, ...]) -> str:
-    """Return the first names for an error message."""
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return (", ".join(map(repr, names[:5])) or "none") + more
