@@ -114,7 +114,7 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = read_header[version](stream)
-    if math.prod(shape) * dtype.itemsize > max_bytes:
+    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # values without bytes, type V0, are refused as well
         raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
@@ -132,7 +132,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
         check_size(*(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]
+    names = [*channels] if len(channels) == 1 else [name for name in _EXR_CHANNELS if name in channels]
     if not names:
         raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")
-    return channels[min(names, key=lambda name: _EXR_CHANNELS.index(name) if name in _EXR_CHANNELS else -1)]
+    return channels[names[0]]
