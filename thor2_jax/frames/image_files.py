@@ -1,8 +1,6 @@
 """Reading of files whose content is not trusted: PNG, JPEG and TIFF, and depth also as NPY and EXR."""
 
-import contextlib
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -10,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import InputError, decoding, needs_extra
 from thor2_jax.files import open_file
 
-__all__ = ["MAX_IMAGE_PIXELS", "check_size", "decoding", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
+__all__ = ["MAX_IMAGE_PIXELS", "check_size", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
 """Image formats that are read. For some of its other formats, Pillow runs external programs."""
@@ -25,16 +23,6 @@ _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metre
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 """Names of the channel of an EXR file that holds depth, if it has several."""
-
-
-@contextlib.contextmanager
-def decoding(message: str, expected: str) -> Iterator[None]:
-    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
-    try:
-        yield
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{message} ({reason}); expected {expected}") from None
 
 
 def check_size(width: int, height: int) -> None:

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, decoding, with_context
 from thor2_jax.files import parse_json, parse_yaml, read_file
-from thor2_jax.frames.image_files import decoding, read_npy
+from thor2_jax.frames.image_files import read_npy
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
 

@@ -31,7 +31,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import compiled, model_arrays, model_from_arrays
@@ -71,9 +71,6 @@ class EmbeddingSizes:
         shape: whether it has the persistence images; False in embeddings of earlier versions.
         nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
             embeddings of earlier versions, where each counts with its own.
-
-    Raises:
-        InputError: a size is not a positive integer (`color` may be 0).
     """
 
     cell: int = 20
@@ -83,12 +80,6 @@ class EmbeddingSizes:
     balanced: bool = True
     shape: bool = True
     nearest: bool = True
-
-    def __post_init__(self) -> None:
-        values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        flags = self.balanced, self.shape, self.nearest
-        if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
-            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
     @property
     def version(self) -> int:
@@ -179,10 +170,6 @@ class EmbeddingNetwork(nnx.Module):
             blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
         weights = jnp.sqrt(self.block_weights[...])
         return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
-
-
-def _embedding_size(sizes: EmbeddingSizes, network: colornet.ColorNetwork) -> int:
-    return sizes.learned + sizes.color + (0 if sizes.balanced else network.n_regions)
 
 
 def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
@@ -283,17 +270,18 @@ class Embedding:
             distractors: number of objects that are none of the classes.
 
         Raises:
-            InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers, or more colour components than
-                there are colour embeddings.
+            InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers.
         """
         config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
         network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
-        size = _embedding_size(sizes, network)
-        if size > MAX_EMBEDDING_SIZE:
-            raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
         n_proxies = len(classes) + distractors
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
-        return cls(config, network, sizes, model, classes, distractors)
+        embedding = cls(config, network, sizes, model, classes, distractors)
+        if embedding.size > MAX_EMBEDDING_SIZE:
+            raise InputError(
+                f"sizes give embeddings of {embedding.size} numbers; expected at most {MAX_EMBEDDING_SIZE}"
+            )
+        return embedding
 
     def create_further(self, seed: int = 0) -> EmbeddingNetwork:
         """Return a network for `further` with random weights; without a colour block, since it does not embed.
@@ -317,7 +305,7 @@ class Embedding:
     @property
     def size(self) -> int:
         """Length D of an embedding."""
-        return _embedding_size(self.sizes, self.network)
+        return self.sizes.learned + self.sizes.color + (0 if self.sizes.balanced else self.network.n_regions)
 
     @functools.cached_property
     def _embedder(self) -> tuple[Any, Any]:
@@ -409,7 +397,7 @@ class Embedding:
                 one. The message names the file.
         """
         path, network = Path(path), network or colornet.load_default()
-        try:
+        with decoding(f"embedding: {path} cannot be used", "an embedding of this version; train the run again"):
             content = read_file(path)
             about = json.loads(safetensors_metadata(content)[_METADATA])
             arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
@@ -418,7 +406,7 @@ class Embedding:
             current = (version, DESCRIPTOR_VERSION, network.fingerprint)
             for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
                 if about[field] != expected:
-                    raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
+                    raise ValueError(f"{field} is {about[field]!r}; expected {expected!r}")
             config = DescriptorConfig.of_record(about["descriptor_config"])
             earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest"), False)
             sizes = EmbeddingSizes(**earlier | about["sizes"] | {"hidden": tuple(about["sizes"]["hidden"])})
@@ -429,10 +417,6 @@ class Embedding:
             for prefix in map(_FURTHER.format, range(count)):
                 own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
                 further.append(model_from_arrays(embedding.create_further, own))
-        except InputError as error:
-            raise InputError(f"embedding: {path}: {error}") from None
-        except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
         file, references = path.with_name(REFERENCES_FILE), None
         if file.is_file():
             references = References.load(file, content_digest([content]), embedding.size)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -119,19 +118,6 @@ class ObjectGallery:
         """Keep a gallery, with what the embedding and the options add to it; references only once it has objects."""
         references, version = self.embedding.references if gallery.objects else None, self.embedding.sizes.version
         self.gallery = dataclasses.replace(gallery, search=self._search, references=references, version=version)
-
-    def check_writable(self) -> None:
-        """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
-        if self.directory is None:
-            return
-        try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.directory):
-                pass
-        except OSError as error:
-            raise InputError(
-                f"gallery: {self.directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
-            ) from None
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
         """Return the name under which `enroll` would enroll an object, before its views are rendered or embedded.

@@ -65,19 +65,16 @@ class ExactSearch:
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
-        similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
-        index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
+        parts = []
         with one_blas_thread() if len(self._embeddings) <= FAST_VIEWS else contextlib.nullcontext():
             for start in range(0, len(self._embeddings), CHUNK):
                 chunk = self._embeddings[start : start + CHUNK]
                 products = queries @ chunk.T.astype(np.float32, copy=False)
                 best = _largest(products, count)
-                index = np.concatenate([index, best + start], axis=1)
-                similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
-                best = _largest(similarity, count)
-                index = np.take_along_axis(index, best, axis=1)
-                similarity = np.take_along_axis(similarity, best, axis=1)
-        return similarity, index
+                parts.append((np.take_along_axis(products, best, axis=1), best + start))
+        similarity, index = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+        best = _largest(similarity, count)
+        return np.take_along_axis(similarity, best, axis=1), np.take_along_axis(index, best, axis=1)
 
 
 def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:

@@ -217,15 +217,13 @@ def test_a_damaged_or_missing_file_is_rejected(tmp_path: Path, embedding: Embedd
     for prefix in ("further/1/", "further/", "further/0/head"):  # networks or parts of one are missing
         ensemble().save(path)
         rewritten(path, lambda name, prefix=prefix: not name.startswith(prefix))
-        with pytest.raises(thor2.InputError, match="embedding.safetensors is missing or damaged"):
+        with pytest.raises(thor2.InputError, match="embedding.safetensors cannot be used"):
             Embedding.load(path)
 
 
 def test_sizes_past_the_largest_embedding_are_rejected() -> None:
     with pytest.raises(thor2.InputError, match="300"):
         Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(learned=294, color=6))
-    with pytest.raises(thor2.InputError, match="EmbeddingSizes"):
-        EmbeddingSizes(hidden=(0,))
 
 
 def test_the_packaged_embedding_is_small_enough() -> None:
