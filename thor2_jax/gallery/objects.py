@@ -10,10 +10,9 @@ import numpy as np
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
-from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import embed_views, enrolled_views
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.printable import check_name, find_name
 

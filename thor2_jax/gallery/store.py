@@ -26,8 +26,7 @@ import safetensors.numpy
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, read_file, remove_leftovers, safetensors_metadata, write_text
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 
 __all__ = [
     "GALLERY_DIRECTORY",

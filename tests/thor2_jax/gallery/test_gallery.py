@@ -10,8 +10,7 @@ from sklearn.gaussian_process.kernels import RBF
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
+from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 

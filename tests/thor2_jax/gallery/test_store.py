@@ -21,8 +21,7 @@ from helpers import files_of
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.store import GalleryError, check_index, gallery_stamp, load_gallery, update_gallery
 
 FINGERPRINT = "f" * 64
