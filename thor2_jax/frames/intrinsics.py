@@ -48,7 +48,8 @@ _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrad
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= LARGEST_INTRINSIC
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and bool(abs(value) <= LARGEST_INTRINSIC)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,10 @@
-"""Foreground of a plane: pixels that differ from it in height or colour."""
+"""Foreground of a plane: pixels that differ from it in height or colour, and edges of depth.
+
+Edges are steps, where a surface ends in front of another, and folds, where two surfaces form a dent. Both are found by
+extrapolation. In inverse depth a plane is linear, so the value two pixels after an edge is compared with that
+extrapolated from two and six pixels before it, and the other way round. At a step the two differences have opposite
+signs; at a fold both are positive, since both surfaces bend towards the camera.
+"""
 
 import dataclasses
 
@@ -6,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.pixels import (
     Mask,
     components,
     float_image,
     grow,
     median_high,
+    nearest_known,
     open_round,
     pixel_mask,
     shrink,
@@ -75,7 +81,7 @@ class Evidence:
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
         shade: colored pixels on the support that are darker than it, but of its hue: deep shadows, and black things.
         region: pixels in the convex hull of the support.
-        steps: steps of depth along rows and along columns, see `depth_edges`.
+        steps: steps of depth along rows and along columns.
         folds: folds of depth.
     """
 
@@ -117,8 +123,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
     beside = on_support | (~depth.valid & region)
     colored = open_round(beside & known & (contrast > UNIT) & ~plain)
     shade = open_round(colored & on_support & darker)
-    *steps, folds = depth_edges(depth)
-    return Evidence(heights, open_round(high), contrast, colored, shade, region, (steps[0], steps[1]), folds)
+    return Evidence(heights, open_round(high), contrast, colored, shade, region, *_depth_edges(depth))
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
@@ -204,3 +209,44 @@ def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32], window:
 
 def _channel_sum(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     return float_image(cv2.transform(cv2.absdiff(a, b), np.ones((1, 3), np.float32)))
+
+
+STEP = (0.006, 0.015)
+"""Least step: the first in metres, plus the second times the squared depth in metres."""
+
+NARROW = 0.4
+"""Least share of a step between the two neighbours of a pixel."""
+
+BEND = 0.4
+"""Least change of slope at a fold."""
+
+NEAR, FAR = 2, 6
+"""Pixels between an edge and the values that are extrapolated."""
+
+
+def _depth_edges(depth: DepthImage) -> tuple[tuple[Mask, Mask], Mask]:
+    """Return the steps of a depth image along rows and along columns, and its folds, [H, W] each."""
+    known = depth.valid
+    if not known.any():
+        none = np.zeros(known.shape, bool)
+        return (none, none), none
+    inverse = depth.inverse[known].take(nearest_known(known))
+    inverse = np.asarray(cv2.medianBlur(inverse, 5))
+    unknown = (~known).view(np.uint8)
+    gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))
+    # Metres are differences of inverse depth times the squared depth.
+    least = STEP[0] * inverse * inverse + STEP[1]
+    least_fold = 0.5 * least + (NEAR * BEND * depth.pixel_size) * inverse + gap
+    # The value after a pixel minus its extrapolation, the same from the other side, and a difference.
+    forward, slope = np.zeros(2 * FAR + 1, np.float32), 2 * NEAR / (FAR - NEAR)
+    forward[[0, FAR - NEAR, FAR + NEAR]] = slope, -1 - slope, 1
+    kernels, average = (forward, forward[::-1].copy(), np.array([-1, 0, 1], np.float32)), np.full(3, 1 / 3, np.float32)
+    steps, folds = [], np.zeros(known.shape, bool)
+    for along_rows in (True, False):  # averaged over three pixels across
+        pairs = [(kernel, average) if along_rows else (average, kernel) for kernel in kernels]
+        before, after, difference = (float_image(cv2.sepFilter2D(inverse, cv2.CV_32F, *pair)) for pair in pairs)
+        smaller = np.minimum(np.abs(before), np.abs(after))
+        opposite = (before > 0) != (after > 0)
+        steps.append((smaller > least) & opposite & (np.abs(difference) > NARROW * least))
+        folds |= np.minimum(before, after) > least_fold
+    return (steps[0], steps[1]), folds

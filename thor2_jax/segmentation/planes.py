@@ -187,13 +187,9 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
     scored = left[:: max(1, len(left) // SCORED_POINTS)]
     fields = points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance
     x, y, inverse, tolerance = (values[scored].astype(np.float32) for values in fields)
-    # Not a matrix product, for which threads would be started.
     single = planes.astype(np.float32)
-    misses = single[:, :1] * x
-    misses += single[:, 1:2] * y
-    misses += single[:, 2:]
-    misses -= inverse
-    near = np.abs(misses, out=misses) < tolerance
+    # Not a matrix product, for which threads would be started.
+    near = np.abs(single[:, :1] * x + single[:, 1:2] * y + single[:, 2:] - inverse) < tolerance
     return planes[int(np.count_nonzero(near, axis=1).argmax())]
 
 
