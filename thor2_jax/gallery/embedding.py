@@ -315,11 +315,6 @@ class Embedding:
     def _embed_looks(self) -> Callable[[LookDescriptors], jax.Array]:
         return compiled(_embed_looks, [self._embedder])
 
-    @functools.cached_property
-    def _class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
-        models = [self._embedder, *map(_split, self.further)]
-        return compiled(_class_probabilities, models, len(self.classes), self.sizes.nearest and self.distractors > 0)
-
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
 
@@ -338,16 +333,16 @@ class Embedding:
             oriented = oriented.with_balanced(clouds)
         return self._embed_looks(oriented)
 
-    def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:
-        """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
+    @functools.cached_property
+    def class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
+        """Function from K looks at clouds, described by this embedding's descriptor, to class probabilities [B, C].
 
-        They are the geometric mean over the networks and over the looks, by their weights. With `sizes.nearest`, every
-        distractor has the logit of the nearest one, for each network and look.
-
-        Args:
-            oriented: K looks at clouds, described by this embedding's descriptor.
+        What they lack to 1 is that of the distractors. They are the geometric mean over the networks and over the
+        looks, by their weights. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
+        network and look.
         """
-        return self._class_probabilities(oriented)
+        models = [self._embedder, *map(_split, self.further)]
+        return compiled(_class_probabilities, models, len(self.classes), self.sizes.nearest and self.distractors > 0)
 
     @functools.cached_property
     def _content(self) -> bytes:

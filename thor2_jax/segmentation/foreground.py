@@ -103,8 +103,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         depth: the depth image.
         planes: at least one plane.
     """
-    least = HEIGHT[1] * depth.z2
-    least += HEIGHT[0]
+    least = HEIGHT[1] * (depth.z * depth.z) + HEIGHT[0]
     heights = planes[0].heights(depth)
     on_support = (np.abs(heights) <= least) & depth.valid
     high = (heights > least) & depth.valid

@@ -50,7 +50,6 @@ class DepthImage:
 
     Attributes:
         z: [H, W] float32, metres; 0 where depth is missing or outside `MIN_DEPTH` to `MAX_DEPTH`.
-        z2: [H, W] float32, squares of `z`.
         inverse: [H, W] float32, 1 / z; 0 where `z` is.
         valid: [H, W], where `z` is not 0.
         x: [W] float32, of the rays (x, y, 1) of the pixels.
@@ -62,7 +61,6 @@ class DepthImage:
         """Prepare `depth_m` [H, W], metres, of a camera."""
         self.valid: Mask = (depth_m >= MIN_DEPTH) & (depth_m <= MAX_DEPTH)
         self.z = depth_m * self.valid
-        self.z2 = self.z * self.z
         self.inverse = np.zeros_like(self.z)
         np.divide(1, self.z, out=self.inverse, where=self.valid)
         height, width = self.z.shape
