@@ -12,17 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.pixels import (
-    Mask,
-    components,
-    float_image,
-    grow,
-    median_high,
-    nearest_known,
-    open_round,
-    pixel_mask,
-    shrink,
-)
+from thor2_jax.segmentation.pixels import Mask, components, grow, nearest_known, open_round, pixel_mask, shrink
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
 __all__ = ["UNIT", "Evidence", "find_foreground"]
@@ -146,13 +136,13 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     height, width = plane.shape
     around, near, window_share, share = _plane_color(color, plane)
     ones = np.ones((1, 3), np.float32)
-    length = np.sqrt(float_image(cv2.transform(around * around, ones))) + np.float32(1e-3)
-    direction = float_image(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
-    reference = float_image(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
+    length = np.sqrt(_floats(cv2.transform(around * around, ones))) + np.float32(1e-3)
+    direction = _floats(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
+    reference = _floats(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
     # A shadow changes the length of a colour, not its direction. The products share memory: new memory costs time.
     product = cv2.multiply(color, direction, direction, dtype=cv2.CV_32F)
-    along = float_image(cv2.transform(product, ones))
-    across = float_image(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
+    along = _floats(cv2.transform(product, ones))
+    across = _floats(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
     across -= along * along
     brightness = along - reference
     darker = (brightness < 0) & (across < SHADE * SHADE * brightness * brightness)
@@ -162,7 +152,7 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     difference = np.sqrt(np.maximum(across, 0, out=across), out=across)
     size = (share.shape[1], share.shape[0])
     noise = cv2.resize(np.minimum(difference, 60) * plane, size, interpolation=cv2.INTER_AREA)
-    noise = float_image(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)
+    noise = _floats(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)
     least = np.maximum(DIFFERENCE, NOISE * noise)
     scale = cv2.resize((UNIT / least).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
     contrast = np.asarray(cv2.multiply(difference, scale, dtype=cv2.CV_8U), np.uint8)
@@ -184,30 +174,31 @@ def _plane_color(
     height, width = plane.shape
     size = (-(-width // COARSE), -(-height // COARSE))
     masked = cv2.bitwise_and(color, color, mask=plane.view(np.uint8))
-    total = float_image(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
-    share = float_image(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-    own = float_image(total / np.maximum(share, 0.05)[..., None])
+    total = _floats(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
+    share = _floats(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    own = _floats(total / np.maximum(share, 0.05)[..., None])
     for window in WINDOWS_OF_OUTLIERS:  # leave out what has another colour than most of the window
-        off = _channel_sum(own, _window_mean(total, share, window))
+        off = _floats(cv2.transform(cv2.absdiff(own, _window_mean(total, share, window)), np.ones((1, 3), np.float32)))
         full = share > 0.5
-        typical = median_high(off[full]) if full.any() else 0.0
+        typical = float(np.quantile(off[full], 0.5, method="higher")) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
         share, total = share * kept, total * kept[..., None]
-    window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
+    window_share = _floats(cv2.blur(share, (WINDOW, WINDOW)))
     mean = _window_mean(total, share, WINDOW)
     far = window_share < LEAST_PLANE  # inside large things
     mean[far] = _window_mean(total, share, WIDE_WINDOW)[far]
     window_share[far] = cv2.blur(share, (WIDE_WINDOW, WIDE_WINDOW))[far]
-    return float_image(cv2.blur(mean, (3, 3))), ~far, window_share, share
+    return _floats(cv2.blur(mean, (3, 3))), ~far, window_share, share
 
 
 def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     size = (window, window)
-    return float_image(cv2.blur(total, size)) / (float_image(cv2.blur(share, size))[..., None] + np.float32(1e-4))
+    return _floats(cv2.blur(total, size)) / (_floats(cv2.blur(share, size))[..., None] + np.float32(1e-4))
 
 
-def _channel_sum(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    return float_image(cv2.transform(cv2.absdiff(a, b), np.ones((1, 3), np.float32)))
+def _floats(image: object) -> NDArray[np.float32]:
+    """Return an image of floats of OpenCV as an array."""
+    return np.asarray(image, np.float32)
 
 
 STEP = (0.006, 0.015)
@@ -243,7 +234,7 @@ def _depth_edges(depth: DepthImage) -> tuple[tuple[Mask, Mask], Mask]:
     steps, folds = [], np.zeros(known.shape, bool)
     for along_rows in (True, False):  # averaged over three pixels across
         pairs = [(kernel, average) if along_rows else (average, kernel) for kernel in kernels]
-        before, after, difference = (float_image(cv2.sepFilter2D(inverse, cv2.CV_32F, *pair)) for pair in pairs)
+        before, after, difference = (_floats(cv2.sepFilter2D(inverse, cv2.CV_32F, *pair)) for pair in pairs)
         smaller = np.minimum(np.abs(before), np.abs(after))
         opposite = (before > 0) != (after > 0)
         steps.append((smaller > least) & opposite & (np.abs(difference) > NARROW * least))

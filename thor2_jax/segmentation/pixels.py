@@ -8,10 +8,8 @@ __all__ = [
     "Mask",
     "close",
     "components",
-    "float_image",
     "grow",
     "label_borders",
-    "median_high",
     "nearest_known",
     "open_round",
     "pixel_mask",
@@ -34,11 +32,6 @@ def _bytes(mask: Mask) -> NDArray[np.uint8]:
 def pixel_mask(image: object) -> Mask:
     """Return an image of zeros and ones of OpenCV as a mask."""
     return np.asarray(image, np.uint8).view(np.bool_)
-
-
-def float_image(image: object) -> NDArray[np.float32]:
-    """Return an image of floats of OpenCV as an array."""
-    return np.asarray(image, np.float32)
 
 
 def grow(mask: Mask, size: int) -> Mask:
@@ -95,12 +88,6 @@ def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
     """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 65535."""
     square, image = np.ones((size, size), np.uint8), labels.astype(np.uint16)
     return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
-
-
-def median_high(values: NDArray[np.float32]) -> float:
-    """Return the high median: the median, or the larger of the two middle values."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:

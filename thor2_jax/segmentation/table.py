@@ -14,7 +14,7 @@ from scipy import ndimage
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.pieces import find_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, median_high, watershed, window
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed, window
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -120,7 +120,7 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
     if not LEAST_PIXELS <= size <= LARGEST_SHARE * n_pixels or region[mask].mean() < LEAST_SUPPORT:
         return False
     z = z[mask & (z > 0)]
-    distance = median_high(z) if len(z) else 1.0
+    distance = float(np.quantile(z, 0.5, method="higher")) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
 
 

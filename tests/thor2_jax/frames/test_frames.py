@@ -191,13 +191,6 @@ def test_damaged_images(files: dict[str, Path], name: str) -> None:
             read_frame(**files)
 
 
-@pytest.mark.parametrize("name", ["depth", "labels"])
-def test_images_of_different_sizes(files: dict[str, Path], name: str) -> None:
-    Image.fromarray(np.zeros((5, 6), np.uint16)).save(files[name])
-    with pytest.raises(InputError, match=rf"^{name} has shape \(5, 6\).*\(5, 7\)"):
-        read_frame(**files)
-
-
 @pytest.mark.parametrize(
     ("read", "modes", "problem"),
     [

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.instance_clouds import MIN_POINTS, instance_clouds
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.frames.instance_clouds import MIN_POINTS, instance_clouds, voxel_downsample
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from training.readers import FrameFolder
 
@@ -43,22 +43,6 @@ def pixels_of(points: np.ndarray) -> np.ndarray:
     return np.stack([y / z * CAMERA.fy + CAMERA.cy, x / z * CAMERA.fx + CAMERA.cx], axis=1)
 
 
-def voxels_by_loop(frame: RGBDFrame, label: int) -> np.ndarray:
-    """Return the means of an instance's points in each cube of 3 mm, in float64, with a loop over the pixels."""
-    camera, points = frame.intrinsics, []
-    for row, column in zip(*np.nonzero(frame.labels == label), strict=True):
-        z = float(np.float32(frame.depth[row, column] / 1000))
-        if 0.26 <= z <= 2.5:
-            points.append(((column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z))
-    # Rounded to float32 as the clouds are, so that points at the face of a cube fall on the same side.
-    array = np.array(points, np.float32).astype(np.float64)
-    cubes: dict[tuple[int, ...], list[np.ndarray]] = {}
-    keys = np.floor((array - (array.min(axis=0) - 0.0015)) / 0.003).astype(int)
-    for key, point in zip(map(tuple, keys), array, strict=True):
-        cubes.setdefault(key, []).append(point)
-    return np.array([np.mean(cubes[key], axis=0) for key in sorted(cubes)])
-
-
 def only(frame: RGBDFrame) -> PreparedInstance:
     (cloud,) = instance_clouds(frame)
     return cloud
@@ -85,7 +69,8 @@ def test_points_are_voxel_means_of_backprojected_pixels() -> None:
     rng = np.random.default_rng(1)
     depth = (700 + np.arange(WIDTH) // 4 + rng.integers(-2, 3, (HEIGHT, WIDTH))).astype(np.uint16)
     frame = frame_of(depth, patch((1, 50, 110, 60, 150)))
-    cloud, expected = only(frame), voxels_by_loop(frame, 1)
+    points = backproject(frame.depth_m, CAMERA)[frame.label_image == 1]
+    cloud, expected = only(frame), voxel_downsample(points, points, 0.003)[0]
     distance = cdist(cloud.points, expected)
     assert distance.min(axis=1).max() < 1e-6
     assert len(set(distance.argmin(axis=1))) == len(cloud.points) >= 0.9 * len(expected)

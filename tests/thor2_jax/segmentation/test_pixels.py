@@ -6,7 +6,7 @@ from scipy import ndimage
 
 pytest.importorskip("cv2")
 
-from thor2_jax.segmentation.pixels import components, label_borders, median_high, nearest_known
+from thor2_jax.segmentation.pixels import components, label_borders, nearest_known
 
 
 def random_mask(shape: tuple[int, int] = (60, 90), seed: int = 0) -> np.ndarray:
@@ -37,9 +37,3 @@ def test_borders_have_two_labels_around(largest: int) -> None:
     labels = np.where(random_mask(), largest, 1).astype(np.int32)
     low, high = (f(labels, size=3, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
     assert np.array_equal(label_borders(labels, 3), low != high)
-
-
-def test_the_high_median_is_one_of_the_values() -> None:
-    values = np.random.default_rng(0).random(101).astype(np.float32)
-    assert median_high(values) == np.median(values)
-    assert median_high(values[:2]) == values[:2].max()
