@@ -86,6 +86,10 @@ class EmbeddingSizes:
         """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
         return self.balanced + (self.balanced and self.shape)
 
+    def total(self, n_regions: int) -> int:
+        """Return the length of an embedding, with a colour network of so many regions."""
+        return self.learned + self.color + (0 if self.balanced else n_regions)
+
 
 def _unit(x: jax.Array) -> jax.Array:
     """Scale the last axis to unit length; zeros stay zeros."""
@@ -274,14 +278,12 @@ class Embedding:
         """
         config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
         network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
+        size = sizes.total(network.n_regions)
+        if size > MAX_EMBEDDING_SIZE:
+            raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
         n_proxies = len(classes) + distractors
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
-        embedding = cls(config, network, sizes, model, classes, distractors)
-        if embedding.size > MAX_EMBEDDING_SIZE:
-            raise InputError(
-                f"sizes give embeddings of {embedding.size} numbers; expected at most {MAX_EMBEDDING_SIZE}"
-            )
-        return embedding
+        return cls(config, network, sizes, model, classes, distractors)
 
     def create_further(self, seed: int = 0) -> EmbeddingNetwork:
         """Return a network for `further` with random weights; without a colour block, since it does not embed.
@@ -305,7 +307,7 @@ class Embedding:
     @property
     def size(self) -> int:
         """Length D of an embedding."""
-        return self.sizes.learned + self.sizes.color + (0 if self.sizes.balanced else self.network.n_regions)
+        return self.sizes.total(self.network.n_regions)
 
     @functools.cached_property
     def _embedder(self) -> tuple[Any, Any]:

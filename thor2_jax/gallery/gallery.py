@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.references import References
-from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch, one_blas_thread
+from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name
 
 __all__ = ["CompactClouds", "Gallery", "GalleryObject", "score_odds"]
@@ -269,7 +269,7 @@ class Gallery:
         return (odds / (1 + odds)).round(3)
 
     @functools.cached_property
-    def _search(self) -> ViewSearch:
+    def _search(self) -> ExactSearch | IndexSearch:
         return (IndexSearch if self.search == "usearch" else ExactSearch)(self.regression[0])
 
     def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:

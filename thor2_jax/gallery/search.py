@@ -8,7 +8,7 @@ array([[1, 0]])
 import contextlib
 import functools
 import importlib
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import threadpoolctl
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import needs_extra
 
-__all__ = ["ExactSearch", "IndexSearch", "ViewSearch", "one_blas_thread"]
+__all__ = ["ExactSearch", "IndexSearch", "one_blas_thread"]
 
 CHUNK = 2**14
 """Views per matrix product: 16 MB as float32 at 256 numbers each."""
@@ -44,18 +44,6 @@ def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     return limited
 
 
-class ViewSearch(Protocol):
-    """Search for the views of largest cosine similarity."""
-
-    def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first.
-
-        Args:
-            queries: [Q, D] of unit length.
-            count: number of views.
-        """
-
-
 class ExactSearch:
     """Exact search by matrix products in chunks; it needs little memory beside the embeddings."""
 
@@ -64,7 +52,12 @@ class ExactSearch:
         self._embeddings = embeddings.astype(np.float32) if len(embeddings) <= FAST_VIEWS else embeddings
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
+        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first, ties by index.
+
+        Args:
+            queries: [Q, D] of unit length.
+            count: number of views.
+        """
         parts = []
         with one_blas_thread() if len(self._embeddings) <= FAST_VIEWS else contextlib.nullcontext():
             for start in range(0, len(self._embeddings), CHUNK):
@@ -109,7 +102,7 @@ class IndexSearch:
         self._index.add(np.arange(len(embeddings)), embeddings)
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """See `ViewSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
+        """See `ExactSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
         count = min(count, len(self._embeddings))
         matches = self._index.search(queries.astype(np.float16), count)
         rows = [matches] if len(queries) == 1 else list(matches)

@@ -110,15 +110,12 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
                 f"gallery: {directory} was enrolled with the embedding {index['embedding'][:8]}, and the run has "
                 f"{embedding[:8]}; embed its views again with `thor2 objects --reembed`"
             )
-        with contextlib.suppress(_Replaced):
+        # A file that the index names is missing if a writer replaced it after the index was read, or it was deleted.
+        with contextlib.suppress(FileNotFoundError):
             return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
     raise GalleryError(
         f"gallery: {directory / INDEX_FILE} names files that do not exist; restore the directory from a copy"
     )
-
-
-class _Replaced(Exception):
-    """A file that the index names is missing: a writer replaced it after the index was read, or it was deleted."""
 
 
 def _read_index(path: Path) -> dict[str, Any] | None:
@@ -184,7 +181,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     try:
         content = read_file(path)
     except FileNotFoundError:
-        raise _Replaced from None
+        raise
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     if content_digest([content]) != path.stem:
@@ -294,7 +291,7 @@ def previous_gallery(directory: Path, generation: int, gallery: Gallery) -> Gall
         )
     if index is None or index["generation"] != generation - 1 or index["embedding"] != gallery.embedding:
         raise InputError(f"generation is {generation}, and the gallery before it is not known; forget the object")
-    with contextlib.suppress(_Replaced):
+    with contextlib.suppress(FileNotFoundError):
         return _load_objects(directory, index, gallery)
     raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
 
@@ -325,7 +322,7 @@ def _own_objects(
 ) -> Iterator[tuple[Path, tuple[str | None, GalleryObject]]]:
     """Yield the files of objects that are not used, those with the name and the content of one, and `_read_object`."""
     for path in sorted((directory / "objects").glob("*.safetensors")):
-        with contextlib.suppress(GalleryError, _Replaced):
+        with contextlib.suppress(GalleryError, FileNotFoundError):
             if _DIGEST.fullmatch(path.stem) and path.stem not in used:
                 yield path, _read_object(path)
 

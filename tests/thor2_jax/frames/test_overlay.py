@@ -193,22 +193,6 @@ def test_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         draw_overlay(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4), int), [], tmp_path / "a.png")
 
 
-def test_a_failing_write_leaves_the_old_picture_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-
-    def fail(self: Image.Image, target: Path, **options: object) -> None:
-        Path(target).write_bytes(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(overlay.Image.Image, "save", fail)
-    with pytest.raises(OSError, match="disk full"):
-        draw_overlay(photo(), discs([(100, 100)], 20), [named(1)], path)
-    assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == b"old"
-
-
 @pytest.mark.parametrize(
     "name, drawn", [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")]
 )
