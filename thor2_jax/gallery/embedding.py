@@ -31,19 +31,16 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import InputError, decoding
+from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import compiled, model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_EMBEDDING_SIZE", "Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
+__all__ = ["Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
 
 EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
-
-MAX_EMBEDDING_SIZE = 256
-"""Largest length of an embedding."""
 
 IMAGE_SHARE = 0.5
 BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
@@ -85,10 +82,6 @@ class EmbeddingSizes:
     def version(self) -> int:
         """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
         return self.balanced + (self.balanced and self.shape)
-
-    def total(self, n_regions: int) -> int:
-        """Return the length of an embedding, with a colour network of so many regions."""
-        return self.learned + self.color + (0 if self.balanced else n_regions)
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -272,15 +265,9 @@ class Embedding:
             seed: seed for the weights.
             classes: names of the classes that the network also recognizes.
             distractors: number of objects that are none of the classes.
-
-        Raises:
-            InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers.
         """
         config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
         network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
-        size = sizes.total(network.n_regions)
-        if size > MAX_EMBEDDING_SIZE:
-            raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
         n_proxies = len(classes) + distractors
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
         return cls(config, network, sizes, model, classes, distractors)
@@ -307,7 +294,7 @@ class Embedding:
     @property
     def size(self) -> int:
         """Length D of an embedding."""
-        return self.sizes.total(self.network.n_regions)
+        return self.sizes.learned + self.sizes.color + (0 if self.sizes.balanced else self.network.n_regions)
 
     @functools.cached_property
     def _embedder(self) -> tuple[Any, Any]:

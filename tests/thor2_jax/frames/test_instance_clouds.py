@@ -128,14 +128,6 @@ def test_valid_depth(millimetres: int, used: bool) -> None:
         assert packed.rim is not None and not packed.rim.any() and not packed.mask.any()
 
 
-def test_depth_that_is_not_finite() -> None:
-    depth = flat().astype(np.float32) / 1000
-    depth[:, ::2] = np.nan
-    depth[::2] = np.inf
-    cloud = only(frame_of(depth, patch((1, 50, 150, 60, 200))))
-    assert cloud.reason is None and np.isfinite(cloud.points).all()
-
-
 @pytest.mark.parametrize(
     ("distance", "size", "points"),
     [(2250, (1, MIN_POINTS - 1), MIN_POINTS - 1), (2250, (1, MIN_POINTS), None), (300, (8, 10), 6)],

@@ -214,11 +214,6 @@ def test_a_damaged_or_missing_file_is_rejected(tmp_path: Path, embedding: Embedd
             Embedding.load(path)
 
 
-def test_sizes_past_the_largest_embedding_are_rejected() -> None:
-    with pytest.raises(thor2.InputError, match="300"):
-        Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(learned=294, color=6))
-
-
 def test_the_packaged_embedding_is_small_enough() -> None:
     embedding = load_default()
     assert embedding.size <= 256 and len(embedding._content) <= 5_500_000
