@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import time_calls
-from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import instance_view
-from thor2_jax.gallery.gallery import NEAREST, GalleryObject
+from thor2_jax.gallery.gallery import NEAREST, CompactClouds, GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch
+from thor2_jax.gallery.search import ExactSearch, IndexSearch
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects
@@ -70,7 +69,7 @@ def measure_search(options: argparse.Namespace) -> dict[str, Any]:
     exact = ExactSearch(embeddings).nearest(many, NEAREST)[1]
     for name, build in {"exact": ExactSearch, "usearch": IndexSearch}.items():
         start, processor = time.perf_counter(), time.process_time()
-        search: ViewSearch = build(embeddings)
+        search: ExactSearch | IndexSearch = build(embeddings)
         row = {"build_seconds": time.perf_counter() - start, "build_processor_seconds": time.process_time() - processor}
         row["query_seconds"] = time_calls(lambda: search.nearest(queries, NEAREST), least=3).median  # noqa: B023
         row["peak_gigabytes"] = peak_memory()

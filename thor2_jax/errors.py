@@ -1,9 +1,9 @@
-"""The exception for invalid input, a prefix for its message, and the message for a package that is missing."""
+"""The exception for invalid input, a prefix for its message, and messages for damaged files and missing packages."""
 
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["InputError", "needs_extra", "with_context"]
+__all__ = ["InputError", "decoding", "needs_extra", "with_context"]
 
 MAX_MESSAGE = 1000
 """Characters of a message that are kept: a damaged file may have a name or a number of millions."""
@@ -35,6 +35,16 @@ def with_context(identifier: str) -> Iterator[None]:
         raise InputError(f"{identifier}: {error.filename} is missing") from None
     except InputError as error:
         raise InputError(f"{identifier}: {error}") from None
+
+
+@contextlib.contextmanager
+def decoding(message: str, expected: str) -> Iterator[None]:
+    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{message} ({reason}); expected {expected}") from None
 
 
 @contextlib.contextmanager

@@ -1,8 +1,6 @@
 """Reading of files whose content is not trusted: PNG, JPEG and TIFF, and depth also as NPY and EXR."""
 
-import contextlib
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -10,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import InputError, decoding, needs_extra
 from thor2_jax.files import open_file
 
-__all__ = ["MAX_IMAGE_PIXELS", "check_size", "decoding", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
+__all__ = ["MAX_IMAGE_PIXELS", "check_size", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
 """Image formats that are read. For some of its other formats, Pillow runs external programs."""
@@ -25,16 +23,6 @@ _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metre
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 """Names of the channel of an EXR file that holds depth, if it has several."""
-
-
-@contextlib.contextmanager
-def decoding(message: str, expected: str) -> Iterator[None]:
-    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
-    try:
-        yield
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{message} ({reason}); expected {expected}") from None
 
 
 def check_size(width: int, height: int) -> None:
@@ -114,7 +102,7 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = read_header[version](stream)
-    if math.prod(shape) * dtype.itemsize > max_bytes:
+    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # values without bytes, type V0, are refused as well
         raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
@@ -132,7 +120,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
         check_size(*(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]
+    names = [*channels] if len(channels) == 1 else [name for name in _EXR_CHANNELS if name in channels]
     if not names:
         raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")
-    return channels[min(names, key=lambda name: _EXR_CHANNELS.index(name) if name in _EXR_CHANNELS else -1)]
+    return channels[names[0]]

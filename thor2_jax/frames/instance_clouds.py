@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_points
 
 __all__ = [
-    "InstanceCloud",
+    "EMPTY_INSTANCE",
     "MIN_POINTS",
+    "PreparedInstance",
     "downsample_to_fit",
     "flying_pixels",
     "instance_cloud",
@@ -49,23 +51,17 @@ def voxel_downsample(
         rounded, halves up.
 
     Raises:
-        InputError: The size is not positive or too small for the cloud, points are not finite, or shapes are invalid.
+        InputError: the size is too small for the cloud, or points are not finite.
     """
-    if not size > 0:
-        raise InputError(f"size is {size!r}; expected a positive number")
-    if points.ndim != 2 or points.shape[1] != 3 or colors.ndim != 2 or len(colors) != len(points):
-        raise InputError(f"points and colors have shapes {points.shape} and {colors.shape}; expected [n, 3] and [n, c]")
     if len(points) == 0:
         return points.copy(), colors.copy()
-    if not np.isfinite(points).all():
-        n_invalid = int((~np.isfinite(points)).any(axis=1).sum())
-        raise InputError(f"points has {n_invalid} rows that are not finite; expected finite coordinates")
     exact = points.T.astype(np.float64, order="C")  # coordinates in contiguous rows, which reductions read faster
-    cubes = np.floor((exact - (exact.min(axis=1, keepdims=True) - size / 2)) / size).astype(np.int64)
-    extent = cubes.max(axis=1) + 1
-    if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
+    places = np.floor((exact - (exact.min(axis=1, keepdims=True) - size / 2)) / size)
+    if not np.prod(places.max(axis=1) + 1) < 2.0**62:
         sides = np.ptp(exact, axis=1).tolist()
         raise InputError(f"size is {size!r}; expected a larger one for a cloud with side lengths {sides}")
+    cubes = places.astype(np.int64)
+    extent = cubes.max(axis=1) + 1
     key = (cubes[0] * extent[1] + cubes[1]) * extent[2] + cubes[2]
     # Faster than `np.unique`: pixels come in rows, and a stable sort benefits from entries that are already in order.
     order = np.argsort(key, kind="stable")
@@ -88,10 +84,8 @@ def downsample_to_fit(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Call `voxel_downsample` with the size doubled until the cloud fits into the largest bucket."""
     downsampled = voxel_downsample(points, colors, size)
-    while len(downsampled[0]) > POINT_BUCKETS[-1]:
-        size *= 2
-        downsampled = voxel_downsample(points, colors, size)
-    return downsampled
+    fits = len(downsampled[0]) <= POINT_BUCKETS[-1]
+    return downsampled if fits else downsample_to_fit(points, colors, 2 * size)
 
 
 MAX_SLOPE = 15.0
@@ -185,8 +179,6 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
-        from scipy.spatial import KDTree  # takes .1 s to import, and rendering needs none
-
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
         among[rest] = distances.mean(axis=1) <= MAX_NEIGHBOR_DISTANCE
@@ -235,35 +227,42 @@ MIN_POINTS = 30
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class InstanceCloud:
-    """The point cloud of an instance.
+class PreparedInstance:
+    """The cloud of an instance of a frame; one of `prepare_instance` is on the descriptors' voxel grid.
 
     Attributes:
         label: its number in the label image.
-        points: [n, 3] float32, metres, OpenCV camera frame.
+        points: [n, 3] float32, metres, OpenCV camera frame; empty if the instance cannot be used.
         colors: [n, 3] uint8, sRGB.
-        n_pixels: number of pixels of its mask.
-        rim: [n] bool, points of pixels within `RIM` of the contour of the mask; None if it is not wanted.
+        boundary: [n] bool, points on the occlusion boundary; all False if the instance is not occluded.
+        occluded: another instance hides a part of it, or the image border cuts it.
         kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
-        reason: why the cloud cannot be used; None if it can.
+        reason: why the instance cannot be used; None if it can.
+        rim: [n] bool, points of pixels within `RIM` of the contour of the mask, if less than half of them are; None
+            without a mask.
     """
 
     label: int
     points: NDArray[np.float32]
     colors: NDArray[np.uint8]
-    n_pixels: int
-    rim: NDArray[np.bool_] | None = None
+    boundary: NDArray[np.bool_]
+    occluded: bool = False
     kept_by_fallback: bool = False
     reason: str | None = None
+    rim: NDArray[np.bool_] | None = None
 
 
-def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
+EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
+"""An instance without points, which pads a batch."""
+
+
+def instance_clouds(frame: RGBDFrame) -> list[PreparedInstance]:
     """Return the clouds of all instances in the order of `frame.instances`, including those that cannot be used."""
     return [instance_cloud(frame, label) for label in frame.instances]
 
 
-def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> InstanceCloud:
-    """Return the cloud of one instance; if it cannot be used, with a `reason`.
+def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> PreparedInstance:
+    """Return the cloud of one instance, on a voxel grid of 3 mm and before `find_occlusion`.
 
     Args:
         frame: the frame.
@@ -283,7 +282,6 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Insta
     if with_rim:  # as a further colour channel
         channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
     points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
-    colors, rim = channels[:, :3], channels[:, 3] > 127 if with_rim else None
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
@@ -291,12 +289,11 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Insta
         )
         if not frame.has_usable_depth:
             reason += f"; no instance has such depth: {unit_question(frame)}"
-        return InstanceCloud(label, points, colors, len(pixels), rim, reason=reason)
+        return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=reason)
     kept, relaxed = remove_outliers(points)
-    rim = None if rim is None else rim.take(kept)
-    return InstanceCloud(
-        label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), rim, steep or relaxed
-    )
+    points, channels, none = points.take(kept, axis=0), channels.take(kept, axis=0), np.zeros(len(kept), bool)
+    rim = channels[:, 3] > 127 if with_rim else None
+    return PreparedInstance(label, points, channels[:, :3], none, False, steep or relaxed, rim=rim)
 
 
 def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -304,11 +301,7 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
     (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
     columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
     window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    # As `scipy.ndimage.minimum_filter`, in half of the time.
-    padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
-    inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
-    inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
-    return ~inside[window]
+    return ~ndimage.minimum_filter(window, 2 * RIM + 1, mode="nearest")[window]
 
 
 def unit_question(frame: RGBDFrame) -> str:

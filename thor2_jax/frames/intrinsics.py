@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, decoding, with_context
 from thor2_jax.files import parse_json, parse_yaml, read_file
+from thor2_jax.frames.image_files import read_npy
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
 
@@ -47,10 +48,8 @@ _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrad
 
 
 def _is_number(value: Any) -> bool:
-    try:
-        return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST_INTRINSIC
-    except OverflowError:  # an integer past the largest float
-        return False
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and bool(abs(value) <= LARGEST_INTRINSIC)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,15 +82,12 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         for name in (*_PINHOLE, "depth_scale"):
-            value = getattr(self, name)
-            if not _is_number(value):
+            value, least = getattr(self, name), 1 / LARGEST_INTRINSIC  # smaller positive numbers make points infinite
+            if name in ("cx", "cy"):
+                least = -LARGEST_INTRINSIC
+            if not _is_number(value) or value < least:
                 raise InputError(
-                    f"intrinsics.{name} is {value!r}; expected a finite number of at most {LARGEST_INTRINSIC:.0e}"
-                )
-            # Smaller positive numbers make points infinite.
-            if value < 1 / LARGEST_INTRINSIC and name not in ("cx", "cy"):
-                raise InputError(
-                    f"intrinsics.{name} is {value!r}; expected a positive number, at least {1 / LARGEST_INTRINSIC:.0e}"
+                    f"intrinsics.{name} is {value!r}; expected a number from {least:.0e} to {LARGEST_INTRINSIC:.0e}"
                 )
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -112,12 +108,11 @@ class Intrinsics:
         if isinstance(values, Intrinsics):
             return values
         if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, (str, bytes)):
-            return _of_matrix_alone(values)
+            return cls.of_matrix(values)
+        if hasattr(values, "distortion_model"):  # a CameraInfo message
+            values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
         if not isinstance(values, Mapping):
-            if hasattr(values, "distortion_model"):  # a CameraInfo message
-                values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
-            else:
-                raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
+            raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
             values = values["intrinsic"]
         for names, convert in _FORMATS:
@@ -185,8 +180,7 @@ def _supported(model: Any, distortion: Any) -> Any:
     """
     distortion = () if distortion is None else distortion
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
-    values = np.asarray(distortion, dtype=object).ravel().tolist() if not isinstance(distortion, Mapping) else [1]
-    if name not in _PINHOLE_MODELS and any(values):
+    if name not in _PINHOLE_MODELS and np.any(np.asarray(distortion, dtype=object)):
         raise InputError(
             f"intrinsics has the distortion model {model}; expected plumb_bob or rational_polynomial; rectify the "
             "images and give the intrinsics of the rectified images"
@@ -249,14 +243,6 @@ def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
     return transposed, values.get("depth_scale"), ()
 
 
-def _of_matrix_alone(matrix: Any) -> Intrinsics:
-    # Values without bytes, type V0 of a small NPY file, would fill gigabytes as objects.
-    array = matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix, dtype=object)
-    if array.shape not in ((3, 3), (9,)):
-        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {array.shape}; expected a 3 x 3 matrix")
-    return Intrinsics.of_matrix(array)
-
-
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:
     """Return the first of these entries, of a matrix in OpenCV's YAML its data."""
     value = next((values[name] for name in names if name in values), None)
@@ -286,7 +272,14 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
         InputError: `content` is in none of the formats, or as `Intrinsics.of`.
     """
     values = _parse(content)
-    if isinstance(values, Mapping) and values and all(_is_image_entry(*item) for item in values.items()):
+    if (
+        isinstance(values, Mapping)
+        and values
+        and all(
+            str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry
+            for number, entry in values.items()
+        )
+    ):
         numbers = {int(number): entry for number, entry in values.items()}
         if len(numbers) > 1 and image not in numbers:
             raise InputError(
@@ -297,54 +290,32 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
     return Intrinsics.of(values)
 
 
-def _is_image_entry(number: Any, entry: Any) -> bool:
-    return str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry
-
-
 def _parse(content: bytes) -> Any:
     """Return the value in a file, whose format shows in its first bytes."""
-    is_json = content.lstrip()[:1] in (b"{", b"[")
-    if not is_json:
-        content = _first_document(content)
-        if len(content) > MAX_TEXT_BYTES:
-            raise InputError(f"intrinsics has {len(content)} bytes; expected at most {MAX_TEXT_BYTES}")
-    if content.startswith(b"\x93NUMPY"):
-        try:
-            return np.load(io.BytesIO(content), allow_pickle=False)
-        except Exception:  # a damaged header raises many kinds of exception
-            raise InputError("intrinsics is a damaged NPY file; expected a 3 x 3 matrix") from None
-    if is_json:
-        try:
+    expected = "fx, fy, cx, cy or another known format"
+    if content.lstrip()[:1] in (b"{", b"["):
+        with decoding("intrinsics is not valid JSON", expected):
             return parse_json(content)
-        except ValueError as error:
-            reason = "not UTF-8" if isinstance(error, UnicodeDecodeError) else error
-            raise InputError(
-                f"intrinsics is not valid JSON ({reason}); expected fx, fy, cx, cy or another known format"
-            ) from None
+    is_npy = content.startswith(b"\x93NUMPY")
+    if not is_npy:
+        content = _first_document(content)
+    if len(content) > MAX_TEXT_BYTES:
+        raise InputError(f"intrinsics has {len(content)} bytes; expected at most {MAX_TEXT_BYTES}")
+    if is_npy:
+        with decoding("intrinsics is a damaged NPY file", "a 3 x 3 matrix"):
+            return read_npy(io.BytesIO(content), MAX_TEXT_BYTES)
     try:
         return np.array([float(word) for word in content.replace(b",", b" ").split()]) if content.strip() else None
     except ValueError:
-        pass
-    try:
-        # OpenCV's FileStorage writes a directive and tags that YAML parsers refuse.
-        return parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
-    except ValueError:
-        raise InputError(
-            "intrinsics is neither JSON, YAML, NPY nor nine numbers; expected fx, fy, cx, cy or another known format"
-        ) from None
+        with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
+            # OpenCV's FileStorage writes a directive and tags that YAML parsers refuse.
+            return parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
 
 
 def _first_document(content: bytes) -> bytes:
     """Return the text before the line --- that ends each message of `ros2 topic echo`."""
-    if content.startswith(b"\x93NUMPY"):
-        return content
-    lines = content.splitlines(keepends=True)
-    is_filled = False
-    for number, line in enumerate(lines):
-        if is_filled and line.rstrip() == b"---":
-            return b"".join(lines[:number])
-        is_filled = is_filled or not line.startswith((b"#", b"%", b"---")) and bool(line.strip())
-    return content
+    documents = re.split(rb"(?m)^---[ \t\r]*$", content)
+    return next((each for each in documents if re.search(rb"(?m)^(?![#%])[ \t]*\S", each)), content)
 
 
 def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:

@@ -10,7 +10,6 @@ An occluded object is recognized like any other. Its boundary points only decide
 normalization turns it so that the occluded end does not come first along x. `Recognition.occluded` reports it.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.instance_clouds import InstanceCloud, downsample_to_fit, instance_cloud
+from thor2_jax.frames.instance_clouds import EMPTY_INSTANCE, PreparedInstance, downsample_to_fit, instance_cloud
 
 if TYPE_CHECKING:
     from thor2_jax.types import PointClouds
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = [
     "DESCRIPTOR_VOXEL",
     "EMPTY_INSTANCE",
-    "OcclusionBoundary",
     "PreparedInstance",
     "find_occlusion",
     "pack_instances",
@@ -56,25 +54,16 @@ BOUNDARY_REACH = 0.012
 """Largest distance in metres from a boundary pixel's point to the point of the cloud that it marks."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class OcclusionBoundary:
-    """Whether an instance is occluded, and where.
-
-    Attributes:
-        occluded: another instance hides a part of it, or the image border cuts it.
-        boundary: [n] bool, points of its cloud on the occlusion boundary; all False if it is not occluded.
-    """
-
-    occluded: bool
-    boundary: NDArray[np.bool_]
-
-
-def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> OcclusionBoundary:
+def find_occlusion(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, NDArray[np.bool_]]:
     """Find the occlusion boundary of one instance.
 
     Args:
         frame: the frame.
         cloud: the instance's cloud, from `instance_cloud`.
+
+    Returns:
+        Whether another instance hides a part of it or the image border cuts it, and [n] bool, the points of the cloud
+        on the boundary; all False if it is not occluded.
     """
     pixels = frame.instance_pixels[cloud.label]
     on_contour, on_boundary, own_depth = _contour(frame, cloud.label, pixels)
@@ -85,7 +74,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> OcclusionBoundary:
         edge = pixel_rays(pixels[seen], frame.depth.shape[1], frame.intrinsics) * own_depth[seen, None]
         distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
         boundary[nearest[distance <= BOUNDARY_REACH]] = True
-    return OcclusionBoundary(occluded, boundary)
+    return occluded, boundary
 
 
 def _window(
@@ -141,35 +130,6 @@ DESCRIPTOR_VOXEL = 0.01
 """Voxel side, in scaled units, of every cloud that is described, in training too: colour vectors count points."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PreparedInstance:
-    """An instance of a frame, ready to be described: its cloud on the descriptors' voxel grid.
-
-    Attributes:
-        label: its number in the label image.
-        points: [n, 3] float32, metres, OpenCV camera frame; empty if the instance cannot be used.
-        colors: [n, 3] uint8, sRGB.
-        boundary: [n] bool, points on the occlusion boundary; all False if the instance is not occluded.
-        occluded: another instance hides a part of it, or the image border cuts it.
-        kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
-        reason: why the instance cannot be used; None if it can.
-        rim: [n] bool, points near the contour of the mask, if less than half of them; None if they are unknown.
-    """
-
-    label: int
-    points: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    boundary: NDArray[np.bool_]
-    occluded: bool = False
-    kept_by_fallback: bool = False
-    reason: str | None = None
-    rim: NDArray[np.bool_] | None = None
-
-
-EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
-"""An instance without points, which pads a batch."""
-
-
 def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: bool = True) -> PreparedInstance:
     """Compute the cloud of one instance and its occlusion boundary, on the descriptors' voxel grid.
 
@@ -181,17 +141,17 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
     """
     cloud = instance_cloud(frame, label, with_rim)
     if cloud.reason is not None:
-        return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=cloud.reason)
-    occlusion = find_occlusion(frame, cloud)
+        return cloud
+    occluded, boundary = find_occlusion(frame, cloud)
     # Flags are further colour channels: a voxel is on the boundary if any of its points is, on the rim if most are.
-    flags = [occlusion.boundary] if cloud.rim is None else [occlusion.boundary, cloud.rim]
+    flags = [boundary] if cloud.rim is None else [boundary, cloud.rim]
     channels = np.column_stack([cloud.colors, np.stack(flags, axis=1) * np.uint8(255)])
     points, channels = downsample_to_fit(cloud.points, channels, DESCRIPTOR_VOXEL / sigma_s)
     rim = None if cloud.rim is None else channels[:, 4] > 127
     if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object has no inside
         rim[:] = False
     colors, boundary = channels[:, :3], channels[:, 3] > 0
-    return PreparedInstance(label, points, colors, boundary, occlusion.occluded, cloud.kept_by_fallback, rim=rim)
+    return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim)
 
 
 def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity: int | None = None) -> "PointClouds":

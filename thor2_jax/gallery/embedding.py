@@ -31,19 +31,16 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import InputError
+from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import compiled, model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_EMBEDDING_SIZE", "Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
+__all__ = ["Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
 
 EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
-
-MAX_EMBEDDING_SIZE = 256
-"""Largest length of an embedding."""
 
 IMAGE_SHARE = 0.5
 BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
@@ -76,9 +73,6 @@ class EmbeddingSizes:
         nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
             embeddings of earlier versions, where each counts with its own.
         views: whether the reference views take part in the classification; False in embeddings of earlier versions.
-
-    Raises:
-        InputError: a size is not a positive integer (`color` may be 0).
     """
 
     cell: int = 20
@@ -89,12 +83,6 @@ class EmbeddingSizes:
     shape: bool = True
     nearest: bool = True
     views: bool = True
-
-    def __post_init__(self) -> None:
-        values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        flags = self.balanced, self.shape, self.nearest, self.views
-        if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
-            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
     @property
     def version(self) -> int:
@@ -185,10 +173,6 @@ class EmbeddingNetwork(nnx.Module):
             blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
         weights = jnp.sqrt(self.block_weights[...])
         return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
-
-
-def _embedding_size(sizes: EmbeddingSizes, network: colornet.ColorNetwork) -> int:
-    return sizes.learned + sizes.color + (0 if sizes.balanced else network.n_regions)
 
 
 def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
@@ -316,16 +300,9 @@ class Embedding:
             seed: seed for the weights.
             classes: names of the classes that the network also recognizes.
             distractors: number of objects that are none of the classes.
-
-        Raises:
-            InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers, or more colour components than
-                there are colour embeddings.
         """
         config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
         network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
-        size = _embedding_size(sizes, network)
-        if size > MAX_EMBEDDING_SIZE:
-            raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
         n_proxies = len(classes) + distractors
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
         return cls(config, network, sizes, model, classes, distractors)
@@ -352,7 +329,7 @@ class Embedding:
     @property
     def size(self) -> int:
         """Length D of an embedding."""
-        return _embedding_size(self.sizes, self.network)
+        return self.sizes.learned + self.sizes.color + (0 if self.sizes.balanced else self.network.n_regions)
 
     @functools.cached_property
     def _embedder(self) -> tuple[Any, Any]:
@@ -361,14 +338,6 @@ class Embedding:
     @functools.cached_property
     def _embed_looks(self) -> Callable[[LookDescriptors], jax.Array]:
         return compiled(_embed_looks, [self._embedder])
-
-    @functools.cached_property
-    def _class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
-        models = [self._embedder, *map(_split, self.further)]
-        static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
-        if self.sizes.views and self.references is not None:
-            models.append(nnx.split(_ClassViews(self.references, self.sizes.learned)))
-        return compiled(_class_probabilities, models, *static)
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
@@ -388,19 +357,22 @@ class Embedding:
             oriented = oriented.with_balanced(clouds)
         return self._embed_looks(oriented)
 
-    def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:
-        """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
+    @functools.cached_property
+    def class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
+        """Function from K looks at clouds, described by this embedding's descriptor, to class probabilities [B, C].
 
-        They are the geometric mean over the networks and over the looks, by their weights. With `sizes.nearest`, every
-        distractor has the logit of the nearest one, for each network and look. With `sizes.views`, the odds of all
-        classes are multiplied by exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between
-        the learned blocks of a look and of a reference view of the most probable class, averaged over the looks (Sun et
-        al., "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022).
-
-        Args:
-            oriented: K looks at clouds, described by this embedding's descriptor.
+        What they lack to 1 is that of the distractors. They are the geometric mean over the networks and over the
+        looks, by their weights. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
+        network and look. With `sizes.views`, the odds of all classes are multiplied by
+        exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between the learned blocks of a
+        look and of a reference view of the most probable class, averaged over the looks (Sun et al.,
+        "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022).
         """
-        return self._class_probabilities(oriented)
+        models = [self._embedder, *map(_split, self.further)]
+        static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
+        if self.sizes.views and self.references is not None:
+            models.append(nnx.split(_ClassViews(self.references, self.sizes.learned)))
+        return compiled(_class_probabilities, models, *static)
 
     @functools.cached_property
     def _content(self) -> bytes:
@@ -450,7 +422,7 @@ class Embedding:
                 one. The message names the file.
         """
         path, network = Path(path), network or colornet.load_default()
-        try:
+        with decoding(f"embedding: {path} cannot be used", "an embedding of this version; train the run again"):
             content = read_file(path)
             about = json.loads(safetensors_metadata(content)[_METADATA])
             arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
@@ -459,7 +431,7 @@ class Embedding:
             current = (version, DESCRIPTOR_VERSION, network.fingerprint)
             for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
                 if about[field] != expected:
-                    raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
+                    raise ValueError(f"{field} is {about[field]!r}; expected {expected!r}")
             config = DescriptorConfig.of_record(about["descriptor_config"])
             earlier: dict[str, Any] = dict.fromkeys(("balanced", "shape", "nearest", "views"), False)
             sizes = EmbeddingSizes(**earlier | about["sizes"] | {"hidden": tuple(about["sizes"]["hidden"])})
@@ -470,10 +442,6 @@ class Embedding:
             for prefix in map(_FURTHER.format, range(count)):
                 own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
                 further.append(model_from_arrays(embedding.create_further, own))
-        except InputError as error:
-            raise InputError(f"embedding: {path}: {error}") from None
-        except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
         file, references = path.with_name(REFERENCES_FILE), None
         if file.is_file():
             references = References.load(file, content_digest([content]), embedding.size)

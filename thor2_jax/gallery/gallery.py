@@ -1,5 +1,7 @@
 """The gallery: embedded views of enrolled objects, and their scores for the views of unknown instances.
 
+The views are kept as compact clouds with a few bytes per point, from which any embedding can be computed again.
+
 >>> gallery = Gallery("embedding-1").with_object("mug", mug)                        # doctest: +SKIP
 >>> gallery.scores(embeddings).argmax(axis=-1)                                      # doctest: +SKIP
 
@@ -12,19 +14,19 @@ enrolled or forgotten.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.references import References
-from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch, one_blas_thread
+from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name
 
-__all__ = ["Gallery", "GalleryObject", "score_odds"]
+__all__ = ["CompactClouds", "Gallery", "GalleryObject", "score_odds"]
 
 NEAREST = 128
 """Views of the gallery in the regression of a query; all views give the same accuracy on held-out frames."""
@@ -47,6 +49,77 @@ EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
 
 
+STEP = 5e-5
+"""Resolution of the coordinates, metres."""
+
+MAX_DISTANCE = STEP * np.iinfo(np.int16).max
+"""Largest distance of a point from the centre of its cloud along an axis, metres (1.6)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CompactClouds:
+    """The clouds of V views, one after the other.
+
+    Attributes:
+        points: [n, 3] int16, multiples of `STEP`, relative to `centre`.
+        colors: [n, 3] uint8, sRGB.
+        boundary: [n] bool, points on the occlusion boundary.
+        counts: [V] int32, points of each view.
+        centre: [V, 3] float32, metres, camera frame.
+    """
+
+    points: NDArray[np.int16]
+    colors: NDArray[np.uint8]
+    boundary: NDArray[np.bool_]
+    counts: NDArray[np.int32]
+    centre: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, views: Sequence[PreparedInstance]) -> "CompactClouds":
+        """Round prepared instances to compact clouds.
+
+        Raises:
+            InputError: an instance has no points or is larger than 2 `MAX_DISTANCE`.
+        """
+        points = [np.zeros((0, 3), np.int16)]
+        centres = []
+        for number, view in enumerate(views):
+            if not len(view.points):
+                raise InputError(f"views[{number}] has no points ({view.reason}); leave it out")
+            centre = ((view.points.min(axis=0) + view.points.max(axis=0)) / 2).astype(np.float32)
+            relative = view.points - centre
+            if np.abs(relative).max() > MAX_DISTANCE:
+                raise InputError(
+                    f"views[{number}] is {2 * np.abs(relative).max():.2g} m long; expected at most "
+                    f"{2 * MAX_DISTANCE:.2g} m: check its mask and the depth scale"
+                )
+            points.append(np.rint(relative / STEP).astype(np.int16))
+            centres.append(centre)
+        return cls(
+            np.concatenate(points),
+            np.concatenate([np.zeros((0, 3), np.uint8), *(view.colors for view in views)]),
+            np.concatenate([np.zeros(0, bool), *(view.boundary for view in views)]),
+            np.array([len(view.points) for view in views], np.int32),
+            np.array(centres, np.float32).reshape(-1, 3),
+        )
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __add__(self, other: "CompactClouds") -> "CompactClouds":
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return CompactClouds(*(np.concatenate(pair) for pair in pairs))
+
+    def views(self) -> Iterator[PreparedInstance]:
+        """Yield each view as a prepared instance, in metres."""
+        ends = np.cumsum(self.counts)
+        for number, (count, end, centre) in enumerate(zip(self.counts, ends, self.centre, strict=True)):
+            rows = slice(end - count, end)
+            points = self.points[rows] * np.float32(STEP) + centre
+            boundary = self.boundary[rows]
+            yield PreparedInstance(number, points, self.colors[rows], boundary, bool(boundary.any()))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class GalleryObject:
     """The views of an enrolled object.
@@ -56,12 +129,14 @@ class GalleryObject:
         clouds: the views as they were enrolled.
         source: where the views come from: "mesh", "frames" or "mesh and frames".
         date: date of the last enrolment, ISO 8601.
+        file: name of its file in the gallery on disk; None until it is written.
     """
 
     embeddings: NDArray[np.float16]
     clouds: CompactClouds
     source: str
     date: str
+    file: str | None = None
 
     def __add__(self, other: "GalleryObject") -> "GalleryObject":
         return GalleryObject(
@@ -84,6 +159,8 @@ class Gallery:
         version: version of the embedding, see `EmbeddingSizes`.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
+        generation: number of changes on disk so far.
+        stamp: `store.gallery_stamp` of this state; None if it is not on disk.
     """
 
     embedding: str
@@ -92,6 +169,8 @@ class Gallery:
     search: str = "exact"
     references: References | None = None
     version: int = 0
+    generation: int = 0
+    stamp: tuple[int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.search not in ("exact", "usearch"):
@@ -121,7 +200,7 @@ class Gallery:
             raise InputError(f"name: {name!r} is enrolled already; add views to it (extend) or replace it (replace)")
         if name in self.objects and extend:
             views = self.objects[name] + views
-        return dataclasses.replace(self, objects={**self.objects, name: views})
+        return dataclasses.replace(self, objects={**self.objects, name: dataclasses.replace(views, file=None)})
 
     def without(self, name: str, *, hide: bool = False) -> "Gallery":
         """Return the gallery without an object; with `hide`, a trained class of this name is not answered any more.
@@ -130,7 +209,8 @@ class Gallery:
             InputError: no object has the name, and `hide` is not given.
         """
         if name not in self.objects and not hide:
-            raise InputError(f"name: {name!r} is not enrolled; expected one of {shown_names(self.names)}")
+            known = ", ".join(map(repr, self.names))
+            raise InputError(f"name: {name!r} is not enrolled; expected one of {known or 'none'}")
         objects = {other: views for other, views in self.objects.items() if other != name}
         hidden = (*self.hidden, name) if hide and name not in self.hidden else self.hidden
         return dataclasses.replace(self, objects=objects, hidden=hidden)
@@ -143,7 +223,7 @@ class Gallery:
             embed: function of an object's clouds and their source that returns embeddings [E, D].
         """
         objects = {
-            name: dataclasses.replace(views, embeddings=embed(views.clouds, views.source))
+            name: dataclasses.replace(views, embeddings=embed(views.clouds, views.source), file=None)
             for name, views in self.objects.items()
         }
         return dataclasses.replace(self, embedding=embedding, objects=objects)
@@ -187,7 +267,7 @@ class Gallery:
         return (odds / (1 + odds)).round(3)
 
     @functools.cached_property
-    def _search(self) -> ViewSearch:
+    def _search(self) -> ExactSearch | IndexSearch:
         return (IndexSearch if self.search == "usearch" else ExactSearch)(self.regression[0])
 
     def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
@@ -225,9 +305,3 @@ class Gallery:
 def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
     """Return the odds of scores against everything that is not enrolled."""
     return np.asarray((scores / EVEN) ** STEEPNESS)
-
-
-def shown_names(names: tuple[str, ...]) -> str:
-    """Return the first names for an error message."""
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return (", ".join(map(repr, names[:5])) or "none") + more

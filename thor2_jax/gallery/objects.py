@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -10,11 +9,10 @@ import numpy as np
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import embed_views, enrolled_views
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import StoredGallery, check_index, gallery_stamp, load_gallery, undo_change, update_gallery
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.printable import check_name, find_name
 
@@ -31,9 +29,9 @@ class ObjectGallery:
     shallow copy shares the gallery, and neither sees what is changed through the other one before it is refreshed.
 
     Attributes:
+        gallery: the gallery.
         directory: directory of the gallery; None if it is in memory. `open` sets it.
-        lock_seconds: time that a change waits for another process that writes to the gallery; None is the default of
-            `store`.
+        lock_seconds: time that a change waits for another process that writes to the gallery.
     """
 
     def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
@@ -51,8 +49,8 @@ class ObjectGallery:
         self._search = search
         self._embedding = embedding
         self.directory: Path | None = None
-        self._stored = StoredGallery(Gallery("", search=search), {}, 0)
-        self.lock_seconds: float | None = None
+        self.gallery = Gallery("", search=search)
+        self.lock_seconds = store.LOCK_SECONDS
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
         """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
@@ -66,12 +64,12 @@ class ObjectGallery:
             InputError: see `refresh`.
             OSError: the gallery cannot be written; it is as before.
         """
-        self.directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
+        self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
         if reembed and directory.exists():
             embed = functools.partial(embed_views, self.embedding)
             self._change(lambda gallery: gallery.reembed(self.embedding.fingerprint, embed), rebuild=True)
         else:
-            check_index(directory)
+            store.check_index(directory)
             self.refresh()
 
     @property
@@ -80,16 +78,6 @@ class ObjectGallery:
         if self._embedding is None:
             self._embedding = load_default()
         return self._embedding
-
-    @property
-    def gallery(self) -> Gallery:
-        """The gallery."""
-        return self._stored.gallery
-
-    @property
-    def generation(self) -> int:
-        """Number of changes of the gallery on disk."""
-        return self._stored.generation
 
     @property
     def union(self) -> ClassUnion:
@@ -113,38 +101,22 @@ class ObjectGallery:
         Raises:
             InputError: it cannot be read, or has another embedding; the gallery in memory stays.
         """
-        if self.directory is None or gallery_stamp(self.directory) == self._stored.stamp:
+        if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
             return False
-        self._set(load_gallery(self.directory, self.embedding.fingerprint, self._stored))
+        self._set(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
         return True
 
-    def _change(
-        self, change: Callable[[Gallery], Gallery], embedding: str | None = None, rebuild: bool = False
-    ) -> None:
+    def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
         if self.directory is None:
-            self._set(dataclasses.replace(self._stored, gallery=change(self.gallery)))
+            self._set(change(self.gallery))
         else:
-            self._set(update_gallery(self.directory, change, embedding, self._stored, self.lock_seconds, rebuild))
+            embedding = None if rebuild else self.embedding.fingerprint
+            self._set(store.update_gallery(self.directory, change, embedding, self.gallery, self.lock_seconds, rebuild))
 
-    def _set(self, stored: StoredGallery) -> None:
-        """Keep a state, with what the embedding and the options add to it; references only once it has objects."""
-        references = self.embedding.references if stored.gallery.objects else None
-        version = self.embedding.sizes.version
-        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references, version=version)
-        self._stored = dataclasses.replace(stored, gallery=gallery)
-
-    def check_writable(self) -> None:
-        """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
-        if self.directory is None:
-            return
-        try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.directory):
-                pass
-        except OSError as error:
-            raise InputError(
-                f"gallery: {self.directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
-            ) from None
+    def _set(self, gallery: Gallery) -> None:
+        """Keep a gallery, with what the embedding and the options add to it; references only once it has objects."""
+        references, version = self.embedding.references if gallery.objects else None, self.embedding.sizes.version
+        self.gallery = dataclasses.replace(gallery, search=self._search, references=references, version=version)
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
         """Return the name under which `enroll` would enroll an object, before its views are rendered or embedded.
@@ -197,12 +169,7 @@ class ObjectGallery:
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
-        fingerprint = self.embedding.fingerprint
-
-        def change(gallery: Gallery) -> Gallery:
-            return dataclasses.replace(self._with_objects(gallery, objects, extend, replace), embedding=fingerprint)
-
-        self._change(change, fingerprint)
+        self._change(lambda gallery: self._with_objects(gallery, objects, extend, replace))
 
     def forget(self, name: str) -> None:
         """Remove the views of an object, and never answer its trained class again.
@@ -216,17 +183,17 @@ class ObjectGallery:
             known = self._found(gallery, name) or name
             return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
 
-        if self.directory is not None and gallery_stamp(self.directory) is None:
+        if self.directory is not None and store.gallery_stamp(self.directory) is None:
             change(self.gallery)  # a name that is refused leaves nothing behind
-        self._change(change, self.embedding.fingerprint)
+        self._change(change)
 
     def undo(self, generation: int) -> None:
         """Take back the last change of a gallery on disk; `generation` is the one after that change.
 
         Raises:
-            InputError: the gallery is in memory, or as `store.undo_change`.
+            InputError: the gallery is in memory, or as `store.previous_gallery`.
             OSError: the gallery cannot be written; it is as before.
         """
         if self.directory is None:
             raise InputError("undo needs a gallery on disk; open one")
-        self._change(undo_change(self.directory, generation, self._stored), self.embedding.fingerprint)
+        self._change(functools.partial(store.previous_gallery, self.directory, generation))

@@ -13,7 +13,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, open_file
 
 __all__ = ["BACKGROUND", "REFERENCES_FILE", "References"]
@@ -56,7 +56,7 @@ class References:
         Raises:
             InputError: the file is missing or damaged, or of another embedding. The message names the file.
         """
-        try:
+        with decoding(f"embedding: {path} cannot be used", "the views of the embedding beside it; train the run again"):
             open_file(path).close()
             with safetensors.safe_open(path, "numpy") as stored:
                 about = json.loads(stored.metadata()[_METADATA])
@@ -66,8 +66,6 @@ class References:
                 raise ValueError(f"embeddings are {embeddings.dtype} {list(embeddings.shape)}")
             if len(label) and not (BACKGROUND <= label.min() and label.max() < len(classes)):
                 raise ValueError("a label is out of range")
-        except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
-        if about["embedding"] != fingerprint:
-            raise InputError(f"embedding: {path} is of another embedding; copy both files, or train the run again")
+            if about["embedding"] != fingerprint:
+                raise ValueError("it is of another embedding")
         return cls(embeddings, label, classes)

@@ -8,7 +8,7 @@ array([[1, 0]])
 import contextlib
 import functools
 import importlib
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import threadpoolctl
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import needs_extra
 
-__all__ = ["ExactSearch", "IndexSearch", "ViewSearch", "one_blas_thread"]
+__all__ = ["ExactSearch", "IndexSearch", "one_blas_thread"]
 
 CHUNK = 2**14
 """Views per matrix product: 16 MB as float32 at 256 numbers each."""
@@ -44,18 +44,6 @@ def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     return limited
 
 
-class ViewSearch(Protocol):
-    """Search for the views of largest cosine similarity."""
-
-    def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first.
-
-        Args:
-            queries: [Q, D] of unit length.
-            count: number of views.
-        """
-
-
 class ExactSearch:
     """Exact search by matrix products in chunks; it needs little memory beside the embeddings."""
 
@@ -64,20 +52,22 @@ class ExactSearch:
         self._embeddings = embeddings.astype(np.float32) if len(embeddings) <= FAST_VIEWS else embeddings
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
-        similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
-        index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
+        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first, ties by index.
+
+        Args:
+            queries: [Q, D] of unit length.
+            count: number of views.
+        """
+        parts = []
         with one_blas_thread() if len(self._embeddings) <= FAST_VIEWS else contextlib.nullcontext():
             for start in range(0, len(self._embeddings), CHUNK):
                 chunk = self._embeddings[start : start + CHUNK]
                 products = queries @ chunk.T.astype(np.float32, copy=False)
                 best = _largest(products, count)
-                index = np.concatenate([index, best + start], axis=1)
-                similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
-                best = _largest(similarity, count)
-                index = np.take_along_axis(index, best, axis=1)
-                similarity = np.take_along_axis(similarity, best, axis=1)
-        return similarity, index
+                parts.append((np.take_along_axis(products, best, axis=1), best + start))
+        similarity, index = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+        best = _largest(similarity, count)
+        return np.take_along_axis(similarity, best, axis=1), np.take_along_axis(index, best, axis=1)
 
 
 def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:
@@ -112,7 +102,7 @@ class IndexSearch:
         self._index.add(np.arange(len(embeddings)), embeddings)
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """See `ViewSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
+        """See `ExactSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
         count = min(count, len(self._embeddings))
         matches = self._index.search(queries.astype(np.float16), count)
         rows = [matches] if len(queries) == 1 else list(matches)

@@ -26,8 +26,7 @@ import safetensors.numpy
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, read_file, remove_leftovers, safetensors_metadata, write_text
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 
 __all__ = [
     "GALLERY_DIRECTORY",
@@ -35,11 +34,10 @@ __all__ = [
     "LOCK_SECONDS",
     "GalleryBusyError",
     "GalleryError",
-    "StoredGallery",
     "check_index",
     "gallery_stamp",
     "load_gallery",
-    "undo_change",
+    "previous_gallery",
     "update_gallery",
 ]
 
@@ -70,23 +68,6 @@ class GalleryBusyError(GalleryError):
     """Another process is writing to the gallery."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StoredGallery:
-    """A gallery as it was read.
-
-    Attributes:
-        gallery: the content.
-        files: object -> name of its file.
-        generation: number of changes so far.
-        stamp: `gallery_stamp` of this state; None if the gallery is not on disk.
-    """
-
-    gallery: Gallery
-    files: dict[str, str]
-    generation: int
-    stamp: tuple[int, int, int] | None = None
-
-
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     """Return a value that differs after every change of the gallery in a directory; None if there is no gallery."""
     try:
@@ -107,7 +88,7 @@ def check_index(directory: Path) -> None:
         )
 
 
-def load_gallery(directory: Path, embedding: str | None = None, known: StoredGallery | None = None) -> StoredGallery:
+def load_gallery(directory: Path, embedding: str | None = None, known: Gallery | None = None) -> Gallery:
     """Read a gallery; one that does not exist is empty.
 
     Args:
@@ -123,21 +104,18 @@ def load_gallery(directory: Path, embedding: str | None = None, known: StoredGal
         index = _read_index(directory / INDEX_FILE)
         if index is None:
             check_index(directory)
-            return StoredGallery(Gallery(embedding or ""), {}, 0)
+            return Gallery(embedding or "")
         if embedding is not None and index["embedding"] != embedding:
             raise GalleryError(
                 f"gallery: {directory} was enrolled with the embedding {index['embedding'][:8]}, and the run has "
                 f"{embedding[:8]}; embed its views again with `thor2 objects --reembed`"
             )
-        with contextlib.suppress(_Replaced):
+        # A file that the index names is missing if a writer replaced it after the index was read, or it was deleted.
+        with contextlib.suppress(FileNotFoundError):
             return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
     raise GalleryError(
         f"gallery: {directory / INDEX_FILE} names files that do not exist; restore the directory from a copy"
     )
-
-
-class _Replaced(Exception):
-    """A file that the index names is missing: a writer replaced it after the index was read, or it was deleted."""
 
 
 def _read_index(path: Path) -> dict[str, Any] | None:
@@ -168,8 +146,8 @@ def _read_index(path: Path) -> dict[str, Any] | None:
     return dict(index)
 
 
-def _load_objects(directory: Path, index: dict[str, Any], known: StoredGallery | None) -> StoredGallery:
-    loaded = {} if known is None else {file: known.gallery.objects[name] for name, file in known.files.items()}
+def _load_objects(directory: Path, index: dict[str, Any], known: Gallery | None) -> Gallery:
+    loaded = {} if known is None else {views.file: views for views in known.objects.values()}
     objects: dict[str, GalleryObject] = {}
     for entry in index["objects"]:
         views = loaded.get(entry["file"]) or _read_object(_object_file(directory, entry["file"]))[1]
@@ -177,8 +155,7 @@ def _load_objects(directory: Path, index: dict[str, Any], known: StoredGallery |
     sizes = {views.embeddings.shape[1] for views in objects.values()}
     if len(sizes) > 1:
         raise GalleryError(f"gallery: {directory} has embeddings of {sorted(sizes)} numbers; expected one size")
-    gallery = Gallery(index["embedding"], objects, tuple(map(str, index["hidden"])))
-    return StoredGallery(gallery, {entry["name"]: entry["file"] for entry in index["objects"]}, index["generation"])
+    return Gallery(index["embedding"], objects, tuple(map(str, index["hidden"])), generation=index["generation"])
 
 
 def _object_file(directory: Path, digest: str) -> Path:
@@ -204,7 +181,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     try:
         content = read_file(path)
     except FileNotFoundError:
-        raise _Replaced from None
+        raise
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     if content_digest([content]) != path.stem:
@@ -213,7 +190,8 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         arrays = safetensors.numpy.load(content)
         embeddings = arrays.pop("embeddings")
         about = json.loads(safetensors_metadata(content).get(_METADATA, "{}"))
-        return about.get("name"), _with_origin(GalleryObject(embeddings, CompactClouds(**arrays), "", ""), about)
+        views = GalleryObject(embeddings, CompactClouds(**arrays), "", "", file=path.stem)
+        return about.get("name"), _with_origin(views, about)
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
@@ -234,10 +212,10 @@ def update_gallery(
     directory: Path,
     change: Callable[[Gallery], Gallery],
     embedding: str | None = None,
-    known: StoredGallery | None = None,
-    lock_seconds: float | None = None,
+    known: Gallery | None = None,
+    lock_seconds: float = LOCK_SECONDS,
     rebuild: bool = False,
-) -> StoredGallery:
+) -> Gallery:
     """Change a gallery on disk; another writer's change is never lost.
 
     Args:
@@ -245,7 +223,7 @@ def update_gallery(
         change: function of the gallery on disk that returns the new one. Whatever it raises leaves the disk as it was.
         embedding: fingerprint that the gallery must have; None accepts any.
         known: an earlier state, whose objects are not read again.
-        lock_seconds: time to wait for another writer; by default `LOCK_SECONDS`.
+        lock_seconds: time to wait for another writer.
         rebuild: if the index is missing, begin with the objects whose files are there; `change` embeds them again.
 
     Returns:
@@ -256,31 +234,29 @@ def update_gallery(
         GalleryBusyError: another process holds the lock.
         OSError: a file cannot be written; the gallery is as before.
     """
-    with _lock(directory, LOCK_SECONDS if lock_seconds is None else lock_seconds):
+    with _lock(directory, lock_seconds):
         is_lost = rebuild and gallery_stamp(directory) is None
-        stored = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
-        gallery = change(stored.gallery)
+        before = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
+        changed = dataclasses.replace(change(before), generation=before.generation + 1)
         (directory / "objects").mkdir(exist_ok=True)
-        _remove_orphans(directory, set(stored.files.values()))
-        files: dict[str, str] = {}
+        _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
+        objects = dict(changed.objects)
         written: list[Path] = []
         try:
-            if stored.stamp is None and not stored.files:
+            if before.stamp is None and not before.objects:
                 # A writer that is killed leaves an empty gallery, and no objects without an index.
                 written.append(directory / INDEX_FILE)
-                write_text(written[0], _index_content(StoredGallery(Gallery(gallery.embedding), {}, 0)))
-            for name, views in gallery.objects.items():
-                old = stored.gallery.objects.get(name)
-                if old is not None and views.embeddings is old.embeddings and views.clouds is old.clouds:
-                    files[name] = stored.files[name]
-                    continue
-                content = _object_content(name, views)
-                files[name] = content_digest([content])
-                path = _object_file(directory, files[name])
-                if not path.exists():
-                    written.append(path)
-                    _write_durably(path, content)
-            changed = StoredGallery(gallery, files, stored.generation + 1)
+                write_text(written[0], _index_content(Gallery(changed.embedding)))
+            for name, views in changed.objects.items():
+                if views.file is None:
+                    content = _object_content(name, views)
+                    file = content_digest([content])
+                    objects[name] = dataclasses.replace(views, file=file)
+                    path = _object_file(directory, file)
+                    if not path.exists():
+                        written.append(path)
+                        _write_durably(path, content)
+            changed = dataclasses.replace(changed, objects=objects)
             write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
             for path in reversed(written):
@@ -289,39 +265,35 @@ def update_gallery(
         # The change is made; it only cannot be taken back if that fails, or a foreign file has this name.
         with contextlib.suppress(OSError, GalleryError):
             _read_index(directory / PREVIOUS_FILE)
-            write_text(directory / PREVIOUS_FILE, _index_content(stored))
+            write_text(directory / PREVIOUS_FILE, _index_content(before))
         return dataclasses.replace(changed, stamp=gallery_stamp(directory))
 
 
-def undo_change(directory: Path, generation: int, known: StoredGallery | None = None) -> Callable[[Gallery], Gallery]:
-    """Return the change for `update_gallery` that takes back the last one of a gallery on disk.
+def previous_gallery(directory: Path, generation: int, gallery: Gallery) -> Gallery:
+    """Return a gallery before its last change, to which `update_gallery` can change it.
 
     Taking that back, in turn, restores the first change.
 
     Args:
         directory: directory of the gallery.
         generation: generation of the gallery after the change that is taken back.
-        known: see `update_gallery`.
+        gallery: the gallery on disk.
 
-    Returns:
-        A function that raises InputError if the gallery has been changed since, or the state before the change is not
-        known.
+    Raises:
+        InputError: the gallery has been changed since, or the state before the change is not known.
     """
-
-    def previous(gallery: Gallery) -> Gallery:
-        current, index = _read_index(directory / INDEX_FILE), None
-        with contextlib.suppress(GalleryError):
-            index = _read_index(directory / PREVIOUS_FILE)
-        last = 0 if current is None else current["generation"]
-        if last != generation:
-            raise InputError(f"generation is {generation}; expected {last}: the gallery has been changed since")
-        if index is None or index["generation"] != generation - 1 or index["embedding"] != gallery.embedding:
-            raise InputError(f"generation is {generation}, and the gallery before it is not known; forget the object")
-        with contextlib.suppress(_Replaced):
-            return _load_objects(directory, index, known).gallery
-        raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
-
-    return previous
+    index = None
+    with contextlib.suppress(GalleryError):
+        index = _read_index(directory / PREVIOUS_FILE)
+    if gallery.generation != generation:
+        raise InputError(
+            f"generation is {generation}; expected {gallery.generation}: the gallery has been changed since"
+        )
+    if index is None or index["generation"] != generation - 1 or index["embedding"] != gallery.embedding:
+        raise InputError(f"generation is {generation}, and the gallery before it is not known; forget the object")
+    with contextlib.suppress(FileNotFoundError):
+        return _load_objects(directory, index, gallery)
+    raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
 
 
 def _write_durably(path: Path, content: bytes) -> None:
@@ -331,14 +303,13 @@ def _write_durably(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())  # the index must not reach the disk before the files that it names
 
 
-def _index_content(stored: StoredGallery) -> str:
-    gallery = stored.gallery
+def _index_content(gallery: Gallery) -> str:
     index = {
         "format": GALLERY_FORMAT,
-        "generation": stored.generation,
+        "generation": gallery.generation,
         "embedding": gallery.embedding,
         "objects": [
-            {"name": name, "file": stored.files[name], "views": len(views.clouds), **_origin(views)}
+            {"name": name, "file": views.file, "views": len(views.clouds), **_origin(views)}
             for name, views in gallery.objects.items()
         ],
         "hidden": list(gallery.hidden),
@@ -347,27 +318,26 @@ def _index_content(stored: StoredGallery) -> str:
 
 
 def _own_objects(
-    directory: Path, used: Collection[str] = ()
+    directory: Path, used: Collection[str | None] = ()
 ) -> Iterator[tuple[Path, tuple[str | None, GalleryObject]]]:
     """Yield the files of objects that are not used, those with the name and the content of one, and `_read_object`."""
     for path in sorted((directory / "objects").glob("*.safetensors")):
-        with contextlib.suppress(GalleryError, _Replaced):
+        with contextlib.suppress(GalleryError, FileNotFoundError):
             if _DIGEST.fullmatch(path.stem) and path.stem not in used:
                 yield path, _read_object(path)
 
 
-def _remove_orphans(directory: Path, used: set[str]) -> None:
+def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
     """Remove what an interrupted writer left, and the files of objects that an earlier change removed."""
     for folder in (directory, directory / "objects"):
         remove_leftovers(folder)
     if (directory / "objects").is_symlink():  # Another gallery may share the files behind it.
         return
     for path, _ in _own_objects(directory, used):
-        if not path.is_symlink():
-            path.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
 
-def _rebuilt(directory: Path) -> StoredGallery:
+def _rebuilt(directory: Path) -> Gallery:
     """Return the gallery of the objects whose files are there, if the index is lost; its embedding is unknown."""
     previous: dict[str, Any] = {"objects": [], "hidden": [], "generation": -1}
     with contextlib.suppress(GalleryError):
@@ -379,8 +349,7 @@ def _rebuilt(directory: Path) -> StoredGallery:
         if name is None and entry is not None:
             name, views = entry["name"], _with_origin(views, entry)
         # Of two files with one name, the one that is not in the index before the last change is newer.
-        objects.append((entry is None, views.date, name or f"object-{path.stem[:8]}", path.stem, views))
-    objects.sort(key=lambda each: each[:4])
-    gallery = Gallery("", {name: views for *_, name, _, views in objects}, tuple(map(str, previous["hidden"])))
-    files = {name: file for *_, name, file, _ in objects}
-    return StoredGallery(gallery, files, previous["generation"] + 1)
+        objects.append((entry is None, views.date, name or f"object-{path.stem[:8]}", views))
+    objects.sort(key=lambda each: each[:3])
+    of_name = {name: views for *_, name, views in objects}
+    return Gallery("", of_name, tuple(map(str, previous["hidden"])), generation=previous["generation"] + 1)

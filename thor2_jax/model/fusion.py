@@ -19,10 +19,10 @@ answer is the product of two logistic functions,
 
     score = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
 
-In new runs the first one is constant, since the answer to an object that looks like two classes is not one to an unknown
-object. The two kinds of objects have equal weights in the fit, so that the score separates them well. The confidence is a
-third logistic function, of the log-odds of the score: the share of correct answers to known objects with this score
-(Platt, 1999). They are fitted by `training` on views that no network was trained on.
+In new runs the first one is constant, since an object that looks like two classes is no unknown object. Known and
+unknown objects have equal weights in the fit, so that the score separates them well. The confidence is a third logistic
+function, of the log-odds of the score: the share of correct answers to known objects with this score (Platt, 1999).
+They are fitted by `training` on views that no network was trained on.
 """
 
 import dataclasses

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, check_size, decoding
+from thor2_jax.errors import InputError, decoding
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, check_size
 
 __all__ = ["color_image", "depth_image", "image_kind", "stamp_of"]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, label_sizes, nearest_known
+from thor2_jax.segmentation.pixels import Mask, components, nearest_known, window
 
 __all__ = ["segment_known"]
 
@@ -146,7 +146,7 @@ def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[n
     for cluster in range(1, count + 1):
         here, _ = components(clusters == cluster)
         numbers = np.where(here > 0, here + numbers.max(), numbers)
-    sizes = label_sizes(numbers, int(numbers.max()) + 1)
+    sizes = np.bincount(numbers.ravel())
     sizes[0] = 0
     large = np.argsort(-sizes, kind="stable")[:MOST_PARTS]
     kept = large[sizes[large] >= min(LEAST_PART // 4, sizes.max())]
@@ -188,12 +188,11 @@ def _mask(parts: NDArray[np.int32], candidate: Parts) -> Mask:
 def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBDFrame:
     """Return the part of a frame around a candidate, which has the label 1; all other parts are beside it."""
     mask = _mask(parts, candidate)
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
-    here = np.s_[top : rows[-1] + MARGIN + 1, left : columns[-1] + MARGIN + 1]
+    here = window(mask, MARGIN)
     labels = np.where(mask[here], 1, np.where(parts[here] > 0, parts[here] + 1, 0))
     camera = frame.intrinsics
-    moved = dataclasses.replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=None, height=None)
+    cx, cy = camera.cx - here[1].start, camera.cy - here[0].start
+    moved = dataclasses.replace(camera, cx=cx, cy=cy, width=None, height=None)
     return RGBDFrame(frame.color[here], frame.depth[here], labels, moved)
 
 

@@ -15,10 +15,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from thor2_jax.segmentation.foreground import UNIT, Evidence
-from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
+from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, renumbered, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
-__all__ = ["flood", "merge_pieces"]
+__all__ = ["find_pieces"]
 
 LEAST_MARKER = 10
 """Least pixels of a marker."""
@@ -66,81 +66,9 @@ BEFORE, AFTER = 2, 2
 """Pixels beside a border at which the two pieces are compared."""
 
 
-def flood(
-    color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
-) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Return the pieces between edges.
-
-    Args:
-        color: [H, W, 3] uint8, a little blurred.
-        depth: the depth image.
-        evidence: probabilities by height and colour, and edges of depth.
-
-    Returns:
-        Labels [H, W], 0 for the background, and for each label [n] whether the piece was found by its colour alone.
-    """
-    steps, folds = evidence.steps[0] | evidence.steps[1], evidence.folds
-    high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
-    markers, n_bodies = _body_markers(high, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
-    body_numbers, body_sizes = components(high)
-    marked = np.zeros(len(body_sizes), bool)
-    marked[body_numbers[markers > 0]] = True
-    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
-    rank = np.cumsum(alone) * alone
-    markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
-    n_bodies += int(alone.sum())
-    body = (marked | alone)[body_numbers]
-    colored = close(evidence.colored | (high & ~body & (evidence.contrast > UNIT)), GAP)
-    near = grow(body, 5)
-    n_pieces = n_bodies
-    shades, sizes = components(evidence.shade)
-    beside_body = np.bincount(shades[grow(body, SHADOW)], minlength=len(sizes)) > 0
-    shade = evidence.shade & beside_body[shades]
-    for part in (colored & ~near & ~shade, colored & ~near & shade):
-        numbers, n_colored = _colored_markers(part)
-        markers = np.where(numbers > 0, numbers + n_pieces, markers)
-        n_pieces += n_colored
-    beside = grow(near | colored, 5) | (~evidence.region & grow(body, OUTSIDE))
-    unknown = near | colored | (~depth.valid & beside)
-    markers += 1  # the background is 1, and 0 is flooded
-    markers[(markers == 1) & unknown] = 0
-    labels = watershed(color, markers) - 1
-    return labels, np.arange(1 + n_pieces) > n_bodies
-
-
-def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are.
-
-    Edges have gaps, so parts are also divided at necks. `merge_pieces` undoes what was no edge.
-    """
-    numbers, sizes = components(shrink(body, RIM) & ~edges)
-    room = np.asarray(cv2.distanceTransform((numbers > 0).view(np.uint8), cv2.DIST_L2, 3))
-    parts, part_sizes = components((room > NECK) & (sizes >= LEAST_MARKER)[numbers])
-    part_sizes[part_sizes < LEAST_MARKER] = 0
-    whole = sizes >= LEAST_MARKER
-    whole[numbers[part_sizes[parts] > 0]] = False
-    kept = part_sizes > 0
-    markers = (np.cumsum(kept) * kept).astype(np.int32)[parts]
-    n_parts = int(kept.sum())
-    if n_parts > 0:  # the rest of a divided component goes to its nearest part
-        known = markers > 0
-        nearest = nearest_known(known)
-        same = (numbers[known].take(nearest) == numbers) & (numbers > 0)
-        markers = np.where(same, markers[known].take(nearest), 0)
-    markers += np.where(whole, np.cumsum(whole) + n_parts, 0).astype(np.int32)[numbers]
-    return markers, n_parts + int(whole.sum())
-
-
-def _colored_markers(colored: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of things that are found by their colour, and how many there are."""
-    numbers, sizes = components(colored, connectivity=8)
-    kept = sizes >= LEAST_MARKER
-    return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Borders:
-    """Borders between pairs of neighbouring pieces [N], the smaller number first; the background is a piece, too.
+class _Pieces:
+    """Pieces [n], and borders between pairs of neighbours [N], the smaller number first; the background is a piece.
 
     Attributes:
         pairs: [N, 2] the pieces of each pair.
@@ -149,6 +77,11 @@ class _Borders:
         contrast: [N] mean colour difference across, sum over the channels.
         behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
         perimeter: [n] border pixels of each piece.
+        colored: [n] pieces that were found by their colour alone.
+        tall: [n] pieces that reach `TALL`; this and the following by every second pixel in each direction.
+        low: [n] pieces below `LOW`.
+        unknown: [n] pieces mostly without depth.
+        shade: [n] pieces mostly in the shade.
     """
 
     pairs: NDArray[np.int64]
@@ -157,40 +90,83 @@ class _Borders:
     contrast: NDArray[np.float64]
     behind: NDArray[np.float64]
     perimeter: NDArray[np.intp]
+    colored: Mask
+    tall: Mask
+    low: Mask
+    unknown: Mask
+    shade: Mask
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Shapes:
-    """Which pieces [n] are tall, low, mostly without depth or in the shade, by every second pixel in each direction."""
+def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> NDArray[np.int32]:
+    """Return the pieces between edges, merged where they are one thing: labels [H, W], 0 for the background.
 
-    tall: NDArray[np.bool_]
-    low: NDArray[np.bool_]
-    unknown: NDArray[np.bool_]
-    shade: NDArray[np.bool_]
-
-
-def merge_pieces(
-    labels: NDArray[np.int32],
-    colored: NDArray[np.bool_],
-    color: NDArray[np.uint8],
-    depth: DepthImage,
-    evidence: Evidence,
-) -> NDArray[np.int32]:
-    """Return the labels [H, W] of the pieces of `flood` after merging; the arguments are as there."""
-    n = len(colored)
-    borders = _find_borders(labels, n, color, depth, evidence)
-    shapes = _measure(labels, n, borders, evidence)
-    apart = borders.length < LEAST_CONTACT * borders.perimeter[borders.pairs].min(axis=1)
-    together = _belong_together(borders, shapes, colored, apart)
-    for k, (a, b) in enumerate(borders.pairs.tolist()):
-        if not together[k] and not apart[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
-            together[k] = _is_hollow(k, a, b, borders, labels, depth, evidence)
-    a, b = borders.pairs.T
-    groups = _components(borders.pairs[together & (shapes.shade[a] == shapes.shade[b])], n)
-    shadow = _is_shadow(groups, borders, shapes)
-    groups = _components(borders.pairs[together & ~shadow[a] & ~shadow[b]], n)
+    Args:
+        color: [H, W, 3] uint8, a little blurred.
+        depth: the depth image.
+        evidence: probabilities by height and colour, and edges of depth.
+    """
+    labels, colored = _flood(color, depth, evidence)
+    pieces, n = _measure(labels, colored, color, depth, evidence), len(colored)
+    apart = pieces.length < LEAST_CONTACT * pieces.perimeter[pieces.pairs].min(axis=1)
+    together = _belong_together(pieces, apart)
+    for k, (a, b) in enumerate(pieces.pairs.tolist()):
+        if not together[k] and not apart[k] and a > 0 and pieces.tall[a] and pieces.tall[b]:
+            together[k] = _is_hollow(k, pieces, labels, depth, evidence)
+    a, b = pieces.pairs.T
+    groups = _components(pieces.pairs[together & (pieces.shade[a] == pieces.shade[b])], n)
+    shadow = _is_shadow(groups, pieces)
+    groups = _components(pieces.pairs[together & ~shadow[a] & ~shadow[b]], n)
     groups[shadow] = 0
     return groups[labels]
+
+
+def _flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> tuple[NDArray[np.int32], Mask]:
+    """Return labels [H, W], and for each label [n] whether the piece was found by its colour alone."""
+    steps, folds = evidence.steps[0] | evidence.steps[1], evidence.folds
+    high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
+    markers, n_bodies = _body_markers(high, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
+    body_numbers, body_sizes = components(high)
+    marked = np.zeros(len(body_sizes), bool)
+    marked[body_numbers[markers > 0]] = True
+    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
+    rest, n_bodies = renumbered(body_numbers, alone, n_bodies)
+    markers += rest
+    body = (marked | alone)[body_numbers]
+    colored = close(evidence.colored | (high & ~body & (evidence.contrast > UNIT)), GAP)
+    near = grow(body, 5)
+    n_pieces = n_bodies
+    shades, sizes = components(evidence.shade)
+    beside_body = np.bincount(shades[grow(body, SHADOW)], minlength=len(sizes)) > 0
+    shade = evidence.shade & beside_body[shades]
+    for part in (colored & ~near & ~shade, colored & ~near & shade):
+        numbers, sizes = components(part, connectivity=8)
+        numbers, n_pieces = renumbered(numbers, sizes >= LEAST_MARKER, n_pieces)
+        markers = np.where(numbers > 0, numbers, markers)
+    beside = grow(near | colored, 5) | (~evidence.region & grow(body, OUTSIDE))
+    unknown = near | colored | (~depth.valid & beside)
+    markers += 1  # the background is 1, and 0 is flooded
+    markers[(markers == 1) & unknown] = 0
+    return watershed(color, markers) - 1, np.arange(1 + n_pieces) > n_bodies
+
+
+def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are.
+
+    Edges have gaps, so parts are also divided at necks. `find_pieces` undoes what was no edge.
+    """
+    numbers, sizes = components(shrink(body, RIM) & ~edges)
+    room = np.asarray(cv2.distanceTransform((numbers > 0).view(np.uint8), cv2.DIST_L2, 3))
+    whole = sizes >= LEAST_MARKER
+    parts, part_sizes = components((room > NECK) & whole[numbers])
+    markers, n_parts = renumbered(parts, part_sizes >= LEAST_MARKER)
+    whole[numbers[markers > 0]] = False
+    if n_parts > 0:  # the rest of a divided component goes to its nearest part
+        known = markers > 0
+        nearest = nearest_known(known)
+        same = (numbers[known].take(nearest) == numbers) & (numbers > 0)
+        markers = np.where(same, markers[known].take(nearest), 0)
+    rest, count = renumbered(numbers, whole, n_parts)
+    return markers + rest, count
 
 
 def _components(pairs: NDArray[np.int64], n: int) -> NDArray[np.int32]:
@@ -200,48 +176,42 @@ def _components(pairs: NDArray[np.int64], n: int) -> NDArray[np.int32]:
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
-def _is_shadow(groups: NDArray[np.int32], borders: _Borders, shapes: _Shapes) -> NDArray[np.bool_]:
+def _is_shadow(groups: NDArray[np.int32], pieces: _Pieces) -> Mask:
     """Return which pieces [n] lie in the shade along a tall thing and are part of nothing else."""
-    alone = ~np.isin(groups, groups[~shapes.shade])
-    tall = np.isin(groups, groups[shapes.tall])
-    ends, others = np.concatenate([borders.pairs, borders.pairs[:, ::-1]]).T
-    along = np.bincount(ends, np.tile(borders.length, 2) * tall[others], minlength=len(groups))
-    return alone & (along > ATTACHED * borders.perimeter)
+    alone = ~np.isin(groups, groups[~pieces.shade])
+    tall = np.isin(groups, groups[pieces.tall])
+    ends, others = np.concatenate([pieces.pairs, pieces.pairs[:, ::-1]]).T
+    along = np.bincount(ends, np.tile(pieces.length, 2) * tall[others], minlength=len(groups))
+    return alone & (along > ATTACHED * pieces.perimeter)
 
 
-def _belong_together(
-    borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_], apart: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
     """Return which pairs [N] are of one thing, but for hollow things."""
-    a, b = borders.pairs.T
-    part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
-    is_part = (borders.contrast < PART) | _main_contact(borders, shapes, part_by_color, colored)
-    cases = [part_by_color, shapes.low[a] & shapes.low[b], apart]
+    a, b = pieces.pairs.T
+    part_by_color = (pieces.colored[a] != pieces.colored[b]) & (pieces.tall[a] | pieces.tall[b])
+    is_part = (pieces.contrast < PART) | _main_contact(pieces, part_by_color)
+    cases = [part_by_color, pieces.low[a] & pieces.low[b], apart]
     answers: list[Any] = [is_part, True, False]
-    return np.select(cases, answers, borders.step < EDGE)
+    return np.select(cases, answers, pieces.step < EDGE)
 
 
-def _main_contact(
-    borders: _Borders, shapes: _Shapes, parts: NDArray[np.bool_], colored: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
     """Return which pairs [N] of a body and a piece that was found by its colour are one thing without a step between.
 
     The body must be that with the longest common border, and the piece must not be in the shade.
     """
-    part = np.where(colored[borders.pairs[:, 0]], *borders.pairs.T)
-    length = borders.length * parts
-    longest = np.zeros(len(colored), length.dtype)
+    part = np.where(pieces.colored[pieces.pairs[:, 0]], *pieces.pairs.T)
+    length = pieces.length * parts
+    longest = np.zeros(len(pieces.colored), length.dtype)
     np.maximum.at(longest, part, length)
-    joined = (shapes.unknown[part] | (borders.step < EDGE)) & ~shapes.shade[part]
-    return parts & joined & (length == longest[part]) & (length > ATTACHED * borders.perimeter[part])
+    joined = (pieces.unknown[part] | (pieces.step < EDGE)) & ~pieces.shade[part]
+    return parts & joined & (length == longest[part]) & (length > ATTACHED * pieces.perimeter[part])
 
 
-def _is_hollow(
-    k: int, a: int, b: int, borders: _Borders, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence
-) -> bool:
-    """Return whether the piece that is farther is the inner side of the other: concave, with the same upper rim."""
-    inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
-    if borders.length[k] < ATTACHED * borders.perimeter[inner]:
+def _is_hollow(k: int, pieces: _Pieces, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence) -> bool:
+    """Return whether the farther piece of a pair is the inner side of the other: concave, with the same upper rim."""
+    outer, inner = pieces.pairs[k].tolist() if pieces.behind[k] > 0 else pieces.pairs[k, ::-1].tolist()
+    if pieces.length[k] < ATTACHED * pieces.perimeter[inner]:
         return False
     heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
     rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
@@ -266,43 +236,35 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
 
 
-def _measure(labels: NDArray[np.int32], n: int, borders: _Borders, evidence: Evidence) -> _Shapes:
+def _measure(
+    labels: NDArray[np.int32], colored: Mask, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
+) -> _Pieces:
+    n, flat, pixels, z = len(colored), labels.ravel(), color.reshape(-1, 3), depth.z.ravel()
+    parts = []
+    for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
+        here = np.flatnonzero(flat[:-step] != flat[step:])
+        a, b = flat[here], flat[here + step]
+        before, after = np.maximum(here - BEFORE * step, 0), np.minimum(here + AFTER * step, flat.size - 1)
+        difference = np.abs(pixels[before].astype(np.int16) - pixels[after]).sum(axis=1)
+        farther = np.sign(z[after] - z[before]) * np.where(a < b, 1, -1)
+        behind = np.where((z[before] > 0) & (z[after] > 0), farther, 0)
+        parts.append((np.minimum(a, b), np.maximum(a, b), grow(steps, 5).ravel()[here], difference, behind))
+    a, b, at_step, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
+    keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
+    length, pairs = np.bincount(pair, minlength=len(keys)), np.stack(np.divmod(keys, n), axis=1)
+    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
+    at_step, contrast, behind = (
+        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, difference, behind)
+    )
+
     every = labels[::2, ::2].ravel()
     things = np.flatnonzero(every)
-    every = every[things]
-    heights = evidence.heights[::2, ::2].ravel()[things]
+    every, heights = every[things], evidence.heights[::2, ::2].ravel()[things]
     size = np.maximum(np.bincount(every, minlength=n), 1)
     tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
     low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
     unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
     shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-    to_plane = np.bincount(borders.pairs[:, 1], borders.length * (borders.pairs[:, 0] == 0), minlength=n)
-    return _Shapes(tall, low, unknown, shade & (to_plane > OPEN * borders.perimeter))
-
-
-def _find_borders(
-    labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
-) -> _Borders:
-    flat, pixels = labels.ravel(), color.reshape(-1, 3)
-    z = depth.z.ravel()
-    parts = []
-    for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
-        near_step = grow(steps, 5).ravel()
-        here = np.flatnonzero(flat[:-step] != flat[step:])
-        a, b = flat[here], flat[here + step]
-        swap = a > b
-        before, after = np.maximum(here - BEFORE * step, 0), np.minimum(here + AFTER * step, flat.size - 1)
-        difference = np.abs(pixels[before].astype(np.int16) - pixels[after]).sum(axis=1)
-        at_a, at_b = np.where(swap, after, before), np.where(swap, before, after)
-        behind = np.where((z[at_a] > 0) & (z[at_b] > 0), np.sign(z[at_b] - z[at_a]), 0)
-        a, b = np.minimum(a, b), np.maximum(a, b)
-        parts.append((a, b, near_step[here], difference, behind))
-    a, b, at_step, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
-    keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
-    length = np.bincount(pair, minlength=len(keys))
-    pairs = np.stack(np.divmod(keys, n), axis=1)
-    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
-    step_share, contrast, behind = (
-        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, difference, behind)
-    )
-    return _Borders(pairs, length, step_share, contrast, behind, perimeter)
+    to_plane = np.bincount(pairs[:, 1], length * (pairs[:, 0] == 0), minlength=n)
+    shade &= to_plane > OPEN * perimeter
+    return _Pieces(pairs, length, at_step, contrast, behind, perimeter, colored, tall, low, unknown, shade)

@@ -1,7 +1,5 @@
 """Operations on images of pixels, with the types of NumPy; masks are boolean images [H, W]."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +8,15 @@ __all__ = [
     "Mask",
     "close",
     "components",
-    "float_image",
     "grow",
     "label_borders",
-    "label_sizes",
-    "median_high",
     "nearest_known",
     "open_round",
     "pixel_mask",
+    "renumbered",
     "shrink",
     "watershed",
+    "window",
 ]
 
 Mask = NDArray[np.bool_]
@@ -35,11 +32,6 @@ def _bytes(mask: Mask) -> NDArray[np.uint8]:
 def pixel_mask(image: object) -> Mask:
     """Return an image of zeros and ones of OpenCV as a mask."""
     return np.asarray(image, np.uint8).view(np.bool_)
-
-
-def float_image(image: object) -> NDArray[np.float32]:
-    """Return an image of floats of OpenCV as an array."""
-    return np.asarray(image, np.float32)
 
 
 def grow(mask: Mask, size: int) -> Mask:
@@ -68,10 +60,21 @@ def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], ND
     The size with the number 0 is 0.
     """
     count, numbers = cv2.connectedComponents(_bytes(mask), connectivity=connectivity)
-    numbered = np.asarray(numbers, np.int32)
-    sizes = label_sizes(numbered, count)
+    sizes = np.bincount(numbers.ravel(), minlength=count)
     sizes[0] = 0
-    return numbered, sizes
+    return np.asarray(numbers, np.int32), sizes
+
+
+def renumbered(numbers: NDArray[np.int32], kept: Mask, last: int = 0) -> tuple[NDArray[np.int32], int]:
+    """Return numbers [H, W] with those that are kept [n] counted from `last` + 1 and others 0, and the last of them."""
+    return np.where(kept, np.cumsum(kept) + last, 0).astype(np.int32)[numbers], last + int(kept.sum())
+
+
+def window(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns around the pixels of a mask, which must not be empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    top, left = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
+    return slice(top, rows[-1] + margin + 1), slice(left, columns[-1] + margin + 1)
 
 
 def nearest_known(known: Mask) -> NDArray[np.int32]:
@@ -81,27 +84,10 @@ def nearest_known(known: Mask) -> NDArray[np.int32]:
     return np.asarray(numbers, np.int32) - 1  # OpenCV numbers the pixels of the mask from 1 on, row by row
 
 
-def _in_smallest_type(labels: NDArray[np.int32], count: int) -> NDArray[Any]:
-    """Return labels from 0 to count - 1 in the smallest type of OpenCV that holds them, which is the fastest."""
-    return labels.astype(np.uint8 if count <= 2**8 else np.uint16 if count <= 2**16 else np.float32)
-
-
 def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
-    """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 2^24."""
-    square, image = np.ones((size, size), np.uint8), _in_smallest_type(labels, int(labels.max()) + 1)
+    """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 65535."""
+    square, image = np.ones((size, size), np.uint8), labels.astype(np.uint16)
     return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
-
-
-def label_sizes(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
-    """Return the number of pixels of each label from 0 to count - 1; exact up to 2^24 labels and pixels of a label."""
-    image = _in_smallest_type(labels, count)
-    return np.asarray(cv2.calcHist([image], [0], None, [count], [0, count])).ravel().astype(np.intp)
-
-
-def median_high(values: NDArray[np.float32]) -> float:
-    """Return the high median: the median, or the larger of the two middle values."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -50,7 +50,6 @@ class DepthImage:
 
     Attributes:
         z: [H, W] float32, metres; 0 where depth is missing or outside `MIN_DEPTH` to `MAX_DEPTH`.
-        z2: [H, W] float32, squares of `z`.
         inverse: [H, W] float32, 1 / z; 0 where `z` is.
         valid: [H, W], where `z` is not 0.
         x: [W] float32, of the rays (x, y, 1) of the pixels.
@@ -62,7 +61,6 @@ class DepthImage:
         """Prepare `depth_m` [H, W], metres, of a camera."""
         self.valid: Mask = (depth_m >= MIN_DEPTH) & (depth_m <= MAX_DEPTH)
         self.z = depth_m * self.valid
-        self.z2 = self.z * self.z
         self.inverse = np.zeros_like(self.z)
         np.divide(1, self.z, out=self.inverse, where=self.valid)
         height, width = self.z.shape
@@ -187,13 +185,9 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
     scored = left[:: max(1, len(left) // SCORED_POINTS)]
     fields = points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance
     x, y, inverse, tolerance = (values[scored].astype(np.float32) for values in fields)
-    # Not a matrix product, for which threads would be started.
     single = planes.astype(np.float32)
-    misses = single[:, :1] * x
-    misses += single[:, 1:2] * y
-    misses += single[:, 2:]
-    misses -= inverse
-    near = np.abs(misses, out=misses) < tolerance
+    # Not a matrix product, for which threads would be started.
+    near = np.abs(single[:, :1] * x + single[:, 1:2] * y + single[:, 2:] - inverse) < tolerance
     return planes[int(np.count_nonzero(near, axis=1).argmax())]
 
 

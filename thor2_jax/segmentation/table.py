@@ -13,8 +13,8 @@ from scipy import ndimage
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.foreground import find_foreground
-from thor2_jax.segmentation.pieces import flood, merge_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, label_sizes, median_high, watershed
+from thor2_jax.segmentation.pieces import find_pieces
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed, window
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -66,8 +66,7 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
     if not planes:
         return np.zeros(frame.depth.shape, np.int32)
     evidence = find_foreground(color, depth, planes)
-    pieces = merge_pieces(*flood(color, depth, evidence), color, depth, evidence)
-    labels = _cleaned(pieces, depth, planes)
+    labels = _cleaned(find_pieces(color, depth, evidence), depth, planes)
     return _refined(labels, frame.color, stride) if stride > 1 else labels
 
 
@@ -76,11 +75,9 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     refined = np.zeros(color.shape[:2], np.int32)
     if not labels.any():
         return refined
-    rows, columns = (np.flatnonzero(labels.any(axis=axis)) for axis in (1, 0))
-    top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
-    labels = labels[top : rows[-1] + 1 + MARGIN, left : columns[-1] + 1 + MARGIN]
-    bottom, right = top + labels.shape[0], left + labels.shape[1]
-    here = np.s_[stride * top : stride * bottom, stride * left : stride * right]
+    around = window(labels > 0, MARGIN)
+    labels = labels[around]
+    here = tuple(slice(stride * part.start, stride * part.stop) for part in around)
     markers = np.where(label_borders(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
     markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
@@ -96,7 +93,7 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
     """
     rim = np.flatnonzero(label_borders(labels, size))
     of_rim = labels.take(rim)
-    sizes = label_sizes(labels, int(labels.max()) + 1)
+    sizes = np.bincount(labels.ravel())
     thick = sizes - np.bincount(of_rim, minlength=len(sizes)) >= LEAST_INNER * sizes
     trimmed = labels.copy()
     trimmed.put(rim[thick[of_rim]], 0)
@@ -123,7 +120,7 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
     if not LEAST_PIXELS <= size <= LARGEST_SHARE * n_pixels or region[mask].mean() < LEAST_SUPPORT:
         return False
     z = z[mask & (z > 0)]
-    distance = median_high(z) if len(z) else 1.0
+    distance = float(np.quantile(z, 0.5, method="higher")) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
 
 

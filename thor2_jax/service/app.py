@@ -267,7 +267,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         with gallery_errors(service.engine.objects.directory, 500, "gallery"):
             service.engine.objects.refresh()
         known = service.engine.objects
-        return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.generation)
+        return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.gallery.generation)
 
 
 def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
@@ -292,7 +292,9 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             name, label, flags = parse_enrolment(files)
             known = await service.enroll(files, name, label, flags, admitted)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
-        return schemas.EnrolmentAnswer(**dict(enrolled), generation=known.generation, timings=admitted.milliseconds())
+        return schemas.EnrolmentAnswer(
+            **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
+        )
 
     @routes.post(
         "/v1/objects/undo",
@@ -304,7 +306,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         async with _admitted_form(service, request, schemas.UNDO_FORM) as (admitted, files):
             generation = parse_number(files, "generation")
             known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
-        return schemas.ChangeAnswer(generation=known.generation)
+        return schemas.ChangeAnswer(generation=known.gallery.generation)
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
@@ -313,7 +315,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             with admitted.stage("upload"):
                 pass  # There is no body; a late answer gets status 504.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
-        return schemas.ChangeAnswer(generation=known.generation)
+        return schemas.ChangeAnswer(generation=known.gallery.generation)
 
     authenticated.include_router(routes)
 

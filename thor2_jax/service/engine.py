@@ -23,9 +23,10 @@ from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.class_scores import padded_points
 from thor2_jax.explanation.explain import explained_kinds
+from thor2_jax.files import check_output_file
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.gallery.store import INDEX_FILE, check_index
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
 from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
@@ -328,7 +329,7 @@ def _load(settings: Settings) -> Recognizer:
         raise InputError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
-        recognizer.objects.check_writable()
+        check_output_file("gallery", (directory or settings.model / GALLERY_DIRECTORY) / INDEX_FILE)
         if recognizer.run.record.get("answer_by") == "classifiers":  # They would never answer by an enrolled object.
             recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory, answer_by="both")
     return recognizer

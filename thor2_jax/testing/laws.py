@@ -21,7 +21,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import InstanceCloud
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.testing.comparing import UNIT, assert_equal, assert_near, joined, map_points, taken, with_points
 from thor2_jax.testing.strategies import settled
 from thor2_jax.types import Descriptors, PointClouds, Strips
@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 Describe = Callable[[PointClouds], Descriptors]
-InstanceClouds = Callable[[RGBDFrame], Sequence[InstanceCloud]]
+InstanceClouds = Callable[[RGBDFrame], Sequence[PreparedInstance]]
 
 
 def _compare(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
@@ -330,7 +330,7 @@ def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, s
     clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=other[frame.label_image]))}
     for cloud in instance_clouds(frame):
         same = clouds.pop(int(other[cloud.label]))
-        for name in ("n_pixels", "kept_by_fallback", "reason", "points", "colors"):
+        for name in ("kept_by_fallback", "reason", "points", "colors"):
             np.testing.assert_array_equal(getattr(same, name), getattr(cloud, name), err_msg=name)
     assert not clouds
 

@@ -37,7 +37,7 @@ def objects(
     description = read_description(model)
     trained, embedding = tuple(description["classes"]), description.get("embedding")
     directory = model / GALLERY_DIRECTORY if gallery is None else gallery
-    known = load_gallery(directory, None if embedding is None else str(embedding)).gallery
+    known = load_gallery(directory, None if embedding is None else str(embedding))
     union = ClassUnion(trained, known.names, known.hidden)
     table = Table("name", "views", "source", "enrolled")
     for name in union.names:

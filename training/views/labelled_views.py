@@ -14,7 +14,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.augment import augmented_view
+from thor2_jax.gallery.enrollment import augmented_view
 from training.views.crops import QuantizedCrop, ViewCrops, stacked
 from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views
 

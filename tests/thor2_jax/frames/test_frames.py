@@ -45,7 +45,7 @@ BAD_INTRINSICS: list[tuple[Any, str]] = [
     *((PINHOLE | {name: v}, rf"\.{name} is ") for name in (*PINHOLE, "depth_scale") for v in NO_NUMBERS),
     *((PINHOLE | {name: v}, rf"\.{name} is {v};") for name in ("fx", "fy", "depth_scale") for v in (0, -1.5)),
     *(({name: 1 for name in PINHOLE if name != missing}, f" lacks {missing};") for missing in PINHOLE),
-    *((values, rf" is a {type(values).__name__}(;| of shape)") for values in (None, 3, [500, 500, 3, 2], "fx", b"fx")),
+    *((values, rf" is a {type(values).__name__};") for values in (None, 3, "fx", b"fx")),
 ]
 
 
@@ -189,13 +189,6 @@ def test_damaged_images(files: dict[str, Path], name: str) -> None:
         files[name].write_bytes(content)
         with input_error(f"{name}: {files[name]} ", match=f"^{name}: "):
             read_frame(**files)
-
-
-@pytest.mark.parametrize("name", ["depth", "labels"])
-def test_images_of_different_sizes(files: dict[str, Path], name: str) -> None:
-    Image.fromarray(np.zeros((5, 6), np.uint16)).save(files[name])
-    with pytest.raises(InputError, match=rf"^{name} has shape \(5, 6\).*\(5, 7\)"):
-        read_frame(**files)
 
 
 @pytest.mark.parametrize(

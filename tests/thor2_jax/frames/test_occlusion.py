@@ -1,22 +1,29 @@
 """The occlusion rule on scenes with known boundaries, and against a loop over the pixels of the mask."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.instance_clouds import InstanceCloud, instance_clouds
-from thor2_jax.frames.prepared_instance import OcclusionBoundary, find_occlusion
+from thor2_jax.frames.instance_clouds import instance_clouds
+from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion
 
 HEIGHT, WIDTH = 120, 160
 CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)
 BACK, FRONT = 1, 2
 
 
-def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[InstanceCloud, OcclusionBoundary]]:
+def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, PreparedInstance]:
     frame = RGBDFrame(np.zeros((*labels.shape, 3), np.uint8), depth, labels, CAMERA)
-    return {cloud.label: (cloud, find_occlusion(frame, cloud)) for cloud in instance_clouds(frame)}
+    clouds = instance_clouds(frame)
+    found = [find_occlusion(frame, cloud) for cloud in clouds]
+    return {
+        cloud.label: dataclasses.replace(cloud, occluded=occluded, boundary=boundary)
+        for cloud, (occluded, boundary) in zip(clouds, found, strict=True)
+    }
 
 
 def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndarray, np.ndarray]:
@@ -32,12 +39,12 @@ def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndar
 
 def test_only_the_farther_block_is_occluded_along_the_common_edge() -> None:
     answers = occlusions(*scene())
-    cloud, occlusion = answers[BACK]
-    assert occlusion.occluded and occlusion.boundary.shape == (len(cloud.points),)
-    marked = cloud.points[occlusion.boundary]
+    cloud = answers[BACK]
+    assert cloud.occluded and cloud.boundary.shape == (len(cloud.points),)
+    marked = cloud.points[cloud.boundary]
     assert (marked[:, 0] / marked[:, 2] * CAMERA.fx + CAMERA.cx).min() > 76
     assert 35 <= len(marked) <= 50  # 50 pixels of 2.7 mm on a grid of 3 mm
-    assert not answers[FRONT][1].occluded and not answers[FRONT][1].boundary.any()
+    assert not answers[FRONT].occluded and not answers[FRONT].boundary.any()
 
 
 @pytest.mark.parametrize(("touching", "front", "occluded"), [(9, 789, False), (10, 791, False), (10, 789, True)])
@@ -46,7 +53,7 @@ def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front:
     depth, labels = scene(front=front)
     labels[:, 30:38] = 0
     labels[40 + touching :, 80:130] = 0
-    occlusion = occlusions(depth, labels)[BACK][1]
+    occlusion = occlusions(depth, labels)[BACK]
     assert occlusion.occluded == occluded and occlusion.boundary.any() == occluded
 
 
@@ -55,7 +62,7 @@ def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front:
 def test_depth_may_be_missing_along_the_edge(whose: str, missing: int, occluded: bool) -> None:
     depth, labels = scene()
     depth[:, slice(80 - missing, 80) if whose == "own" else slice(80, 80 + missing)] = 0
-    _, occlusion = occlusions(depth, labels)[BACK]
+    occlusion = occlusions(depth, labels)[BACK]
     assert occlusion.occluded == occluded
     # Without its own depth, the edge is at least 13 mm from the cloud.
     assert occlusion.boundary.any() == (occluded and whose == "other")
@@ -65,18 +72,18 @@ def test_depth_may_be_missing_along_the_edge(whose: str, missing: int, occluded:
 def test_gaps_between_masks(gap: int, occluded: bool) -> None:
     depth, labels = scene()
     labels[:, 80 : 80 + gap] = 0
-    assert occlusions(depth, labels)[BACK][1].occluded == occluded
+    assert occlusions(depth, labels)[BACK].occluded == occluded
 
 
 def test_background_and_other_parts_of_the_object_do_not_occlude() -> None:
     depth, labels = scene(front=800, table=500)
     labels[:, 80:82] = 0
     depth[:, 80:82] = 500
-    assert not occlusions(depth, labels)[BACK][1].occluded
+    assert not occlusions(depth, labels)[BACK].occluded
     depth, labels = scene()
     labels[labels == FRONT] = BACK
     labels[:, 79:81] = 0
-    assert not occlusions(depth, labels)[BACK][1].occluded
+    assert not occlusions(depth, labels)[BACK].occluded
 
 
 def test_instances_without_depth_or_of_one_pixel() -> None:
@@ -85,17 +92,13 @@ def test_instances_without_depth_or_of_one_pixel() -> None:
     depth[labels == BACK] = 0
     labels[0, 0], labels[110, 50] = 3, 4
     answers = occlusions(depth, labels)
-    assert {label: (found.occluded, len(found.boundary)) for label, (_, found) in answers.items()} == {
-        BACK: (False, 0),
-        3: (True, 1),  # at the border of the image
-        4: (False, 1),
-    }
+    assert {label: cloud.occluded for label, cloud in answers.items()} == {BACK: False, 3: True, 4: False}  # 3: border
 
 
 # Against a loop over the pixels
 
 
-def occlusion_by_loop(frame: RGBDFrame, cloud: InstanceCloud) -> tuple[bool, np.ndarray]:
+def occlusion_by_loop(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, np.ndarray]:
     """Apply the rule to masks without gaps or missing depth, where only direct neighbours matter."""
     height, width = frame.labels.shape
     contour, edge = 0, []
@@ -136,9 +139,9 @@ def test_against_a_loop_over_the_pixels(seed: int) -> None:
     answers = []
     for cloud in instance_clouds(frame):
         occluded, marked = occlusion_by_loop(frame, cloud)
-        occlusion = find_occlusion(frame, cloud)
-        assert occlusion.occluded == occluded
+        found, boundary = find_occlusion(frame, cloud)
+        assert found == occluded
         # A boundary pixel halfway between two points may mark either.
-        assert (occlusion.boundary != marked).sum() <= 0.02 * len(marked)
+        assert (boundary != marked).sum() <= 0.02 * len(marked)
         answers.append(occluded)
     assert any(answers) and len(answers) >= 5

@@ -109,7 +109,7 @@ def test_two_ray_nodes_enroll_and_recognize_and_one_is_killed(
 
     def enrolled(out: Path, *options: object) -> dict[str, bytes]:
         assert run_thor2("enroll", "--mesh", meshes, "--model", out, *options) == 0
-        objects = load_gallery(out / GALLERY_DIRECTORY).gallery.objects
+        objects = load_gallery(out / GALLERY_DIRECTORY).objects
         return {name: views.embeddings.tobytes() for name, views in objects.items()}
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})

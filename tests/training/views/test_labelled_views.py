@@ -9,7 +9,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.augment import augmented_view
+from thor2_jax.gallery.enrollment import augmented_view
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, WithLabelledViews
 from training.views.normalized_views import COORDINATE_STEP, MemoryViews, WithoutClasses
