@@ -52,7 +52,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
             that the server accepts no connection before; a single process answers with status 503 until then.
 
     Raises:
-        InputError: the run cannot be read, or lacks a classifier.
+        InputError: the run cannot be read.
     """
     service = Service(settings)
 

@@ -137,7 +137,7 @@ class InferenceEngine:
         """Load the run.
 
         Raises:
-            InputError: the run cannot be read or lacks a classifier of THOR2, or an error of `Recognizer`.
+            InputError: the run or the gallery cannot be used, or an error of `Recognizer`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
@@ -146,12 +146,6 @@ class InferenceEngine:
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         recognizer = _load(settings)
         run = recognizer.run
-        missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
-        if missing:
-            raise InputError(
-                f"model: {settings.model} has no classifier {', '.join(missing)}; "
-                f"serving needs {' and '.join(THOR2)}: train the run with them"
-            )
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         model = dataclasses.replace(recognizer.model, run=self.run)
