@@ -29,7 +29,8 @@ def check_name(name: object) -> str:
         InputError: it is no text, empty, longer than 200 characters, has characters that cannot be seen, means that an
             object has no name, or has a part "." or "..", which addresses and paths cannot contain.
     """
-    normal = normal_name(name) if isinstance(name, str) else ""
+    # The normalization of a long text can take a time that grows with the square of its length.
+    normal = normal_name(name) if isinstance(name, str) and len(name) <= 1000 else ""
     if not 1 <= len(normal) <= 200 or not normal.isprintable() or _INVISIBLE.search(normal):
         raise InputError(f"name is {name!a}; expected a printable text of 1 to 200 visible characters")
     if normal.casefold() in _RESERVED or not {".", ".."}.isdisjoint(normal.split("/")):

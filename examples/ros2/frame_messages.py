@@ -14,8 +14,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Detection, detections_of
-from thor2_jax.recordings.detections import detection_array
-from thor2_jax.recordings.messages import color_image, depth_image, stamp_of
+from thor2_jax.recordings.messages import color_image, depth_image, detection_array, stamp_of
 
 MILLIMETRES = 1000.0
 """Depth units per metre of depth that is sent to the service."""

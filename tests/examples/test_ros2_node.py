@@ -60,7 +60,7 @@ def test_messages_become_detections(conversion: Any, step: int) -> None:
     stamp = {"sec": START // 10**9, "nanosec": 7}
     assert fields["header"] == {"stamp": stamp, "frame_id": "camera_color_optical_frame"}
     types = detection_types()
-    content = types.serialize_cdr(ros_message(types, DETECTION_ARRAY, fields), DETECTION_ARRAY)
+    content = types.serialize_cdr(ros_message(fields), DETECTION_ARRAY)
     message = types.deserialize_cdr(content, DETECTION_ARRAY)
     boxes = [(one.bbox.center.position.x, one.bbox.center.position.y, one.bbox.size_x) for one in message.detections]
     np.testing.assert_allclose(boxes, [(84.5, 114.5, 50), (214.5, 114.5, 70)], atol=2)

@@ -304,14 +304,9 @@ class OnlineAdaptation:
     The estimate runs in one thread at a time; instances that arrive meanwhile are kept for the next one.
     """
 
-    def __init__(self, criterion: Criterion, adapted: Callable[[Adaptation], None] = lambda adaptation: None) -> None:
-        """Start without instances.
-
-        Args:
-            criterion: see `estimate_transform`.
-            adapted: called with each new estimate, in the thread that made it.
-        """
-        self._criterion, self._adapted = criterion, adapted
+    def __init__(self, criterion: Criterion) -> None:
+        """Start without instances; `criterion` is that of `estimate_transform`."""
+        self._criterion = criterion
         self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
         self._new = 0
         self._thread: threading.Thread | None = None
@@ -340,9 +335,6 @@ class OnlineAdaptation:
 
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
-            adaptation = estimate_transform(instances, self._criterion, capacity=CAPACITY)
+            self.latest = estimate_transform(instances, self._criterion, capacity=CAPACITY)
         except Exception:
             log.exception("adaptation failed; the colours are corrected as before")
-            return
-        self.latest = adaptation
-        self._adapted(adaptation)

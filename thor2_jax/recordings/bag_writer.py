@@ -8,8 +8,9 @@ import contextlib
 import io
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +20,7 @@ from thor2_jax.files import errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import annotate
 from thor2_jax.model.recognition import Detection
-from thor2_jax.recordings.detections import detection_array, ros_time
+from thor2_jax.recordings.messages import detection_array, ros_time
 
 __all__ = [
     "COMPRESSED_IMAGE",
@@ -74,9 +75,6 @@ class MessageBag:
     """A ROS 2 bag or an MCAP file that is being written.
 
     It appears when the context ends, also with an exception, if at least one message was written.
-
-    Attributes:
-        path: the MCAP file (.mcap), or the directory of the ROS 2 bag.
     """
 
     argument = "path"
@@ -103,17 +101,17 @@ class MessageBag:
             pass
         with needs_extra(f"{self.argument} is {path}, which", "rosbags", "bags"):
             self._types = detection_types()
-        self.path, self._topics, self._n_messages = path, topics, 0
+        self._path, self._topics, self._n_messages = path, topics, 0
 
     def __enter__(self) -> Self:
         """Create a temporary bag beside `path`."""
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         self._stack = contextlib.ExitStack()
-        folder = self._stack.enter_context(temporary_directory(self.path.absolute().parent))
-        plugin = StoragePlugin.MCAP if self.path.suffix == ".mcap" else StoragePlugin.SQLITE3
+        folder = self._stack.enter_context(temporary_directory(self._path.absolute().parent))
+        plugin = StoragePlugin.MCAP if self._path.suffix == ".mcap" else StoragePlugin.SQLITE3
         # ROS 2 names the files of a bag by its directory.
-        self._bag = folder / self.path.stem
+        self._bag = folder / self._path.stem
         self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
         self._writer.open()
         self._connections = {
@@ -124,11 +122,11 @@ class MessageBag:
 
     def __exit__(self, *_: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
-        with self._stack, errors_name(self.path):
+        with self._stack, errors_name(self._path):
             self._writer.close()
             if self._n_messages:
-                is_file = self.path.suffix == ".mcap"
-                os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self.path)
+                is_file = self._path.suffix == ".mcap"
+                os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self._path)
 
     def write_message(self, topic: str, fields: Mapping[str, Any], stamp: int) -> None:
         """Write a message, recorded at `stamp` (ns) or, as bags have no earlier time, at 0.
@@ -142,8 +140,8 @@ class MessageBag:
                 f"range of ROS 2; correct the clock of the recording, or leave out {self.argument}"
             )
         kind = self._topics[topic]
-        content = self._types.serialize_cdr(ros_message(self._types, kind, fields), kind)
-        with errors_name(self.path):
+        content = self._types.serialize_cdr(ros_message(fields), kind)
+        with errors_name(self._path):
             self._writer.write(self._connections[topic], max(stamp, 0), content)
         self._n_messages += 1
 
@@ -153,9 +151,6 @@ class DetectionBag(MessageBag):
 
     It holds `vision_msgs/Detection2DArray` in the topic `/thor2/detections` and, as JPEG, the colour images with
     outlines and names in `/thor2/overlay/compressed`.
-
-    Attributes:
-        n_frames: frames written.
     """
 
     argument = "out_bag"
@@ -163,7 +158,6 @@ class DetectionBag(MessageBag):
     def __init__(self, path: Path) -> None:
         """Check that `path` can be written; exceptions as `MessageBag`."""
         super().__init__(path, {DETECTIONS_TOPIC: DETECTION_ARRAY, OVERLAY_TOPIC: COMPRESSED_IMAGE})
-        self.n_frames = 0
 
     def write(self, frame: RGBDFrame, detections: Sequence[Detection], *, stamp: int, frame_id: str = "") -> None:
         """Write the detections of a frame; arguments as `detection_array`, exceptions as `write_message`."""
@@ -179,23 +173,12 @@ class DetectionBag(MessageBag):
             "data": np.frombuffer(picture.getvalue(), np.uint8),
         }
         self.write_message(OVERLAY_TOPIC, overlay, stamp)
-        self.n_frames += 1
 
 
-def ros_message(types: Any, kind: str, fields: Any) -> Any:
-    """Return a message of rosbags with the values of nested mappings and lists."""
-    from rosbags.interfaces import Nodetype
-
-    def convert(description: Any, value: Any) -> Any:
-        node, details = description
-        if node == Nodetype.NAME:
-            return ros_message(types, details, value)
-        if node == Nodetype.BASE or isinstance(value, np.ndarray):
-            return value
-        (element, name), _ = details
-        if element == Nodetype.NAME:
-            return [ros_message(types, name, one) for one in value]
-        return np.asarray(value, dtype=name[0])
-
-    cls: Callable[..., Any] = types.types[kind]
-    return cls(**{name: convert(description, fields[name]) for name, description in types.fielddefs[kind][1]})
+def ros_message(value: Any) -> Any:
+    """Return what rosbags writes as a message: objects in place of mappings, and arrays of numbers."""
+    if isinstance(value, Mapping):
+        return SimpleNamespace(**{name: ros_message(field) for name, field in value.items()})
+    if not isinstance(value, list):
+        return value
+    return [ros_message(each) for each in value] if not value or isinstance(value[0], Mapping) else np.array(value)

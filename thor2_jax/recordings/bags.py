@@ -7,8 +7,8 @@ with Bag("table.mcap") as bag:
 
 import contextlib
 import dataclasses
-import errno
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, with_context
-from thor2_jax.files import parse_yaml, read_file
+from thor2_jax.files import open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
@@ -25,7 +25,6 @@ from thor2_jax.recordings.topics import (
     CAMERA_TYPE,
     DEFAULT_MAX_GAP,
     IMAGE_TYPES,
-    ImagePair,
     PairCounts,
     StampedImage,
     Topics,
@@ -44,9 +43,6 @@ __all__ = ["Bag"]
 
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
-
-MAX_TOPICS = 1000
-"""Largest number of image and camera topics: finding the first message of each may read the whole recording."""
 
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex", "": "ros2 bag reindex"}
 """Suffix of a recording (a directory has none) -> the command that repairs it."""
@@ -110,17 +106,13 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
 
             limit_decompression()
-        if not self.path.exists():
-            raise FileNotFoundError(2, "No such file or directory", str(self.path))
-        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
-            raise InputError(
-                f"bag: {self.path} has no metadata.yaml; expected a ROS 2 bag; repair it: ros2 bag reindex"
-            )
         for file in [self.path, *self.path.glob("*")]:
-            if file.exists() and not (file.is_file() or file.is_dir()):  # rosbags would read it forever
-                raise OSError(errno.EINVAL, "a device, pipe or socket; expected a file", str(file))
+            if not file.is_dir():
+                open_file(file).close()  # an OSError if it is a pipe, which rosbags would read forever
         with self._damage_named():
             if self.path.is_dir():
+                if not (self.path / "metadata.yaml").is_file():
+                    raise ValueError("it has no metadata.yaml")
                 # rosbags would expand aliases without a limit, and fail to close other values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
@@ -157,12 +149,15 @@ class Bag:
         """
         tolerance = round(self._max_gap * 1e9)
         names: Counter[str] = Counter()
-        for pair in nearest_pairs(self._images(), tolerance, self.counts):
-            gap = pair.depth.stamp - pair.color.stamp
-            read, name = functools.partial(self._read, pair), stamp_name(pair.color.stamp)
+        images = (
+            StampedImage(topic == self.topics.color, stamp_of(message) or arrival, arrival, message)
+            for topic, message, arrival in self._messages(self.topics.color, self.topics.depth)
+        )
+        for color, depth in nearest_pairs(images, tolerance, self.counts):
+            read, name = functools.partial(self._read, color.message, depth.message), stamp_name(color.stamp)
             names[name] += 1
             unique = name if names[name] == 1 else f"{name}-{names[name]}"
-            yield RecordedFrame(unique, read, pair.color.stamp, gap, self.frame_id)
+            yield RecordedFrame(unique, read, color.stamp, depth.stamp - color.stamp, self.frame_id)
         if self.is_truncated:
             raise self._truncation()
         if self.counts.pairs == 0:
@@ -180,8 +175,8 @@ class Bag:
             f"repair it: {_REPAIR['.mcap']} {self.path.name}, or record it again"
         )
 
-    def _read(self, pair: ImagePair) -> RGBDFrame:
-        color, depth = color_image(pair.color.message), depth_image(pair.depth.message)
+    def _read(self, color_message: Any, depth_message: Any) -> RGBDFrame:
+        color, depth = color_image(color_message), depth_image(depth_message)
         if color.shape[:2] != depth.shape:
             raise InputError(
                 f"depth has {depth.shape[1]} x {depth.shape[0]} pixels and color {color.shape[1]} x {color.shape[0]}; "
@@ -190,9 +185,9 @@ class Bag:
         assert self.intrinsics is not None
         return RGBDFrame(color, depth, None, self.intrinsics)
 
-    def _images(self) -> Iterator[StampedImage]:
-        wanted = [c for c in self._reader.connections if c.topic in (self.topics.color, self.topics.depth)]
-        messages = self._reader.messages(wanted)
+    def _messages(self, *topics: str | None) -> Iterator[tuple[str, Any, int]]:
+        """Yield the messages of some topics: topic, message, and time of arrival in nanoseconds."""
+        messages = self._reader.messages([each for each in self._reader.connections if each.topic in topics])
         while True:
             with self._damage_named():
                 item = next(messages, None)
@@ -200,10 +195,7 @@ class Bag:
                     return
                 connection, arrival, content = item
                 message, arrival = self._deserialize(content, connection.msgtype), int(arrival)
-                image = StampedImage(
-                    connection.topic == self.topics.color, stamp_of(message) or arrival, arrival, message
-                )
-            yield image
+            yield connection.topic, message, arrival
 
     def _choose(self) -> None:
         """Choose the topics by their first messages, and read the camera."""
@@ -212,10 +204,6 @@ class Bag:
             if not all(isinstance(name, str) for name in (*types, *types.values())):
                 raise ValueError("a topic has a name that is no text")
             images = [topic for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)]
-            if len(images) > MAX_TOPICS:
-                raise InputError(
-                    f"bag: {self.path} has {len(images)} topics of images and cameras; expected at most {MAX_TOPICS}"
-                )
             overlap = largest_overlap(self._reader, {c.id for c in self._reader.connections if c.topic in images})
             if overlap > MAX_OVERLAPPING:
                 raise InputError(
@@ -224,7 +212,7 @@ class Bag:
                 )
         if self.is_truncated and not types:
             raise self._truncation()
-        first = {topic: message for topic in images if (message := self._first(topic)) is not None}
+        first = {topic: message for topic in images for _, message, _ in itertools.islice(self._messages(topic), 1)}
         kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}
         with with_context(f"bag: {self.path}"):
             self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
@@ -240,14 +228,6 @@ class Bag:
                 f"depth ({self.topics.depth}) is in the coordinate frame {depth} and color in {color}: it is probably "
                 "not aligned to color"
             )
-
-    def _first(self, topic: str) -> Any:
-        """Return the first message of a topic; None if there is none."""
-        connections = [connection for connection in self._reader.connections if connection.topic == topic]
-        with self._damage_named():
-            for connection, _, content in self._reader.messages(connections):
-                return self._deserialize(content, connection.msgtype)
-        return None
 
     @contextlib.contextmanager
     def _damage_named(self) -> Iterator[None]:

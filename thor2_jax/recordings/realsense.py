@@ -35,7 +35,6 @@ class RealSenseCamera:
         """
         self._source, self._timeout = source, timeout
         self._pipeline: Any = None
-        self._align: Any = None
 
     def __enter__(self) -> "RealSenseCamera":
         """Start the camera.
@@ -45,7 +44,7 @@ class RealSenseCamera:
         """
         with needs_extra("realsense", "pyrealsense2 and the system library libusb-1.0-0", "realsense"):
             import pyrealsense2 as rs
-        self._align = rs.align(rs.stream.color)
+        self._align: Any = rs.align(rs.stream.color)
         if self._source is None:
             config = rs.config()
             config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, RATE)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError
@@ -11,7 +11,6 @@ __all__ = [
     "CAMERA_TYPE",
     "DEFAULT_MAX_GAP",
     "IMAGE_TYPES",
-    "ImagePair",
     "PairCounts",
     "StampedImage",
     "Topics",
@@ -21,6 +20,13 @@ __all__ = [
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
+
+_EXPECTED = {
+    "color": "8-bit colour images",
+    "depth": "depth images (16UC1 or 32FC1)",
+    "camera": "sensor_msgs/CameraInfo",
+}
+"""Kind of a topic -> what it holds."""
 
 _ALIGNED = ("aligned", "registered")
 """Parts of the names of topics with depth that is registered to colour."""
@@ -79,7 +85,7 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
             raise InputError(f"{option} is {wanted}; expected one of the recording's topics: {_listed(types)}")
         if kinds.get(topic) != kind:
             holds = types[topic] if topic in kinds else f"{types[topic]} without messages"
-            raise InputError(f"{option} is {wanted}, which holds {holds}; expected {_expected(kind)}")
+            raise InputError(f"{option} is {wanted}, which holds {holds}; expected {_EXPECTED[kind]}")
         return topic
     candidates = [topic for topic, held in kinds.items() if held == kind]
     if kind == "depth":
@@ -90,25 +96,16 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
     if not candidates:
         advice = "; or give the file of the intrinsics" if kind == "camera" else ""
         raise InputError(
-            f"{option}: no topic holds {_expected(kind)}; the recording has {_listed(types)}; record one{advice}"
+            f"{option}: no topic holds {_EXPECTED[kind]}; the recording has {_listed(types)}; record one{advice}"
         )
     if len(candidates) > 1:
-        raise InputError(f"{option} is not given, and {', '.join(sorted(candidates))} hold {_expected(kind)}; give one")
+        raise InputError(f"{option} is not given, and {', '.join(sorted(candidates))} hold {_EXPECTED[kind]}; give one")
     return candidates[0]
 
 
-def _expected(kind: str) -> str:
-    return {
-        "color": "8-bit colour images",
-        "depth": "depth images (16UC1 or 32FC1)",
-        "camera": "sensor_msgs/CameraInfo",
-    }[kind]
-
-
-def _listed(types: Mapping[str, Any], limit: int = 12) -> str:
-    names: Sequence[str] = sorted(types)
-    listed = ", ".join(f"{name} ({types[name]})" for name in names[:limit])
-    return (listed + (", ..." if len(names) > limit else "")) or "no topic"
+def _listed(types: Mapping[str, Any]) -> str:
+    listed = [f"{name} ({types[name]})" for name in sorted(types)]
+    return ", ".join(listed[:12] + (["..."] if len(listed) > 12 else [])) or "no topic"
 
 
 DEFAULT_MAX_GAP = 0.03
@@ -134,13 +131,6 @@ class StampedImage(NamedTuple):
     message: Any
 
 
-class ImagePair(NamedTuple):
-    """A colour image and the depth image that is nearest to it in time."""
-
-    color: StampedImage
-    depth: StampedImage
-
-
 class PairCounts:
     """Counts of `nearest_pairs` so far.
 
@@ -158,8 +148,10 @@ class PairCounts:
         self.smallest_gap: int | None = None
 
 
-def nearest_pairs(images: Iterable[StampedImage], tolerance: int, counts: PairCounts) -> Iterator[ImagePair]:
-    """Pair each colour image with the depth image that is nearest in time.
+def nearest_pairs(
+    images: Iterable[StampedImage], tolerance: int, counts: PairCounts
+) -> Iterator[tuple[StampedImage, StampedImage]]:
+    """Yield each colour image with the depth image that is nearest in time, at most `tolerance` away.
 
     The images of each stream are in the order of their time stamps. A depth image may belong to several colour images.
 
@@ -172,7 +164,7 @@ def nearest_pairs(images: Iterable[StampedImage], tolerance: int, counts: PairCo
     depths: deque[StampedImage] = deque()
     latest = None  # time stamp of the latest colour image
 
-    def resolve(color: StampedImage) -> Iterator[ImagePair]:
+    def resolve(color: StampedImage) -> Iterator[tuple[StampedImage, StampedImage]]:
         if not depths:
             return
         nearest = min(depths, key=lambda depth: abs(depth.stamp - color.stamp))
@@ -180,7 +172,7 @@ def nearest_pairs(images: Iterable[StampedImage], tolerance: int, counts: PairCo
         counts.smallest_gap = gap if counts.smallest_gap is None else min(gap, counts.smallest_gap)
         if gap <= tolerance:
             counts.pairs += 1
-            yield ImagePair(color, nearest)
+            yield color, nearest
 
     for image in images:
         if image.is_color:

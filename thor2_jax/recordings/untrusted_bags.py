@@ -122,58 +122,29 @@ class CompleteRecords(type(Path())):  # type: ignore[misc]  # Path itself cannot
 
     def open(self, mode: str = "rb") -> BinaryIO:
         """Open the complete records for reading."""
-        stream = super().open(mode)
-        return io.BufferedReader(_View(stream, _complete_bytes(stream)))
+        return _OpenRecords(io.FileIO(self, mode))
 
 
-def _complete_bytes(stream: Any) -> int:
-    """Return the number of bytes of the complete records before the index."""
-    size = stream.seek(0, os.SEEK_END)
-    position = len(_MAGIC)
-    while True:
-        stream.seek(position)
-        header = stream.read(_HEADER_BYTES)
-        if len(header) < _HEADER_BYTES or header[0] in (_DATA_END, _FOOTER):
-            return position
-        end = position + _HEADER_BYTES + int.from_bytes(header[1:], "little")
-        if end > size:
-            return position
-        position = end
+class _OpenRecords(io.BufferedReader):
+    """A truncated MCAP file, for rosbags: only `_TAIL` is read without a size, and it is looked for at the end."""
 
-
-class _View(io.RawIOBase):
-    """The first bytes of a file, and `_TAIL`."""
-
-    def __init__(self, stream: Any, size: int) -> None:
-        self._stream, self._size, self._position = stream, size, 0
-
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return that it is a file."""
-        return True
+    def __init__(self, stream: io.FileIO) -> None:
+        size = os.fstat(stream.fileno()).st_size
+        self._end = end = len(_MAGIC)
+        super().__init__(stream)
+        while end <= size:
+            self._end = end
+            self.seek(end)
+            header = self.read(_HEADER_BYTES)
+            if len(header) < _HEADER_BYTES or header[0] in (_DATA_END, _FOOTER):
+                break
+            end += _HEADER_BYTES + int.from_bytes(header[1:], "little")
+        self.seek(0)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a position, and return it."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size + len(_TAIL)}[whence]
-        self._position = max(start + offset, 0)
-        return self._position
+        """Move to a position, for which `_TAIL` lies at the end of the complete records, and return it."""
+        return super().seek(self._end) if whence == os.SEEK_END else super().seek(offset, whence)
 
-    def readinto(self, buffer: Any) -> int:
-        """Read the next bytes, and return their number."""
-        count = len(buffer)
-        if self._position < self._size:
-            self._stream.seek(self._position)
-            content = self._stream.read(min(count, self._size - self._position))
-        else:
-            content = _TAIL[self._position - self._size :][:count]
-        buffer[: len(content)] = content
-        self._position += len(content)
-        return len(content)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
-        super().close()
+    def read(self, size: int | None = -1) -> bytes:
+        """Return the next bytes, or `_TAIL`."""
+        return _TAIL if size == -1 else super().read(size)

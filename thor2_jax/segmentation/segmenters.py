@@ -88,7 +88,7 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
         labels = function(dataclasses.replace(frame, labels=None))
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"segmenter {name} failed on the frame ({_reason(error)}); check its package") from error
     expected = f"expected integers of shape {frame.depth.shape} (rows, columns), 0 for the background"
     if not isinstance(labels, np.ndarray):
@@ -107,6 +107,6 @@ def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame
     return dataclasses.replace(frame, labels=segment(frame, segmenter))
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     message = " ".join(str(error).split())
     return f"{type(error).__name__}: {message}" if message else type(error).__name__

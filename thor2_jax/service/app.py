@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import os
 import secrets
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -27,28 +26,21 @@ from thor2_jax.service.answers import adaptation_answer, instance_answer, object
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.hosts import is_allowed_host
-from thor2_jax.service.metrics import RequestCounter
+from thor2_jax.service.metrics import count_requests
 from thor2_jax.service.pipeline import AdmittedRequest, Service, gallery_errors
+from thor2_jax.service.preparation import timed
 from thor2_jax.service.problem import RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
 from thor2_jax.signals import handlers_replaced
 
-__all__ = ["PageFiles", "create_app"]
+__all__ = ["create_app"]
 
 WHY_SECONDS = 90.0
 """Least deadline of an explanation: further ones wait for it."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
-
-PAGE_HEADERS = {
-    # The page loads from and connects to its own server only, has no inline code and cannot be framed.
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # Browsers revalidate each file and transfer it only if it changed.
-}
 
 
 def create_app(settings: Settings, workers: int = 1) -> FastAPI:
@@ -60,7 +52,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
             that the server accepts no connection before; a single process answers with status 503 until then.
 
     Raises:
-        InputError: the run cannot be read, or lacks a classifier.
+        InputError: the run cannot be read.
     """
     service = Service(settings)
 
@@ -82,8 +74,8 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = service
-    app.add_middleware(AllowedHosts, names=settings.allow_host)
-    app.add_middleware(RequestCounter, metrics=service.metrics)
+    app.add_middleware(check_host, names=settings.allow_host)
+    app.add_middleware(count_requests, metrics=service.metrics)
     _add_health_routes(app, service, workers)
     authenticated = APIRouter()
     if settings.token:
@@ -92,40 +84,24 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     _add_model_routes(authenticated, service)
     _add_teaching_routes(authenticated, service)
     app.include_router(authenticated)
-    app.router.default = PageFiles()
+    app.router.default = StaticFiles(directory=Path(__file__).parent / "page", html=True)
     for kind in (RequestError, HTTPException, ClientDisconnect, Exception):
         app.add_exception_handler(kind, _on_error)
     return app
 
 
-class PageFiles(StaticFiles):
-    """Static files of the page (`page/`: HTML, CSS and JavaScript without a build step) with security headers."""
+def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
+    """Return ASGI middleware that answers with status 403 unless the header Host names this server."""
 
-    def __init__(self) -> None:
-        super().__init__(directory=Path(__file__).parent / "page", html=True)
+    async def checked(scope: Scope, receive: Receive, send: Send) -> None:
+        host = Headers(scope=scope).get("host", "") if scope["type"] == "http" else "localhost"
+        if is_allowed_host(host, (scope.get("server") or ("",))[0], names):
+            await app(scope, receive, send)
+        else:
+            message = f"Host is {host[:100]!r}; expected localhost, the address, or a name given to --allow-host."
+            await _problem_response(RequestError(403, "Host", message))(scope, receive, send)
 
-    def file_response(self, full_path: str | os.PathLike[str], *args: Any, **kwargs: Any) -> Response:
-        """Return the response for a file, with `PAGE_HEADERS`."""
-        response = super().file_response(full_path, *args, **kwargs)
-        response.headers.update(PAGE_HEADERS)
-        return response
-
-
-class AllowedHosts:
-    """ASGI middleware that answers with status 403 unless the header Host names this server."""
-
-    def __init__(self, app: ASGIApp, names: Sequence[str]) -> None:
-        self._app, self._names = app, names
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Call the application, or refuse the request."""
-        if scope["type"] == "http":
-            host = Headers(scope=scope).get("host", "")
-            if not is_allowed_host(host, (scope.get("server") or ("",))[0], self._names):
-                message = f"Host is {host[:100]!r}; expected localhost, the address, or a name given to --allow-host."
-                await _problem_response(RequestError(403, "Host", message))(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+    return checked
 
 
 @contextlib.contextmanager
@@ -166,7 +142,7 @@ async def _admitted_form(
 ) -> AsyncIterator[tuple[AdmittedRequest, dict[str, bytes]]]:
     """Admit a request as `Service.admit`, and read the fields of its form."""
     async with service.admit(seconds) as admitted:
-        with admitted.stage("upload"):
+        with timed(admitted.seconds, "upload"):
             files = await read_form(request, form)
         yield admitted, files
 
@@ -180,11 +156,11 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; one without labels is segmented."""
         async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
-            recognitions, label_map = await service.recognize(files, admitted)
+            prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
             knows=service.engine.model.union.summary,
-            label_map=label_map,
+            label_map=prepared.label_map,
             adaptation=adaptation_answer(service.engine.adaptation),
             timings=admitted.milliseconds(),
         )
@@ -222,7 +198,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         if content_type not in (NPZ, "application/json"):
             raise RequestError(415, "body", f"The body must be application/json or {NPZ} (npz).")
         async with service.admit() as admitted:
-            with admitted.stage("upload"):
+            with timed(admitted.seconds, "upload"):
                 content = await read_body(request)
             results = await service.describe(content, content_type == NPZ, admitted)
             if content_type == NPZ:
@@ -312,8 +288,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def forget(name: str) -> schemas.ChangeAnswer:
         """Forget an object: its views are removed, and a trained class is never answered again."""
         async with service.admit() as admitted:
-            with admitted.stage("upload"):
-                pass  # There is no body; a late answer gets status 504.
+            admitted.seconds["upload"] = 0.0  # There is no body; a late answer gets status 504.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 

@@ -18,7 +18,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
-from thor2_jax.service.problem import RequestError
+from thor2_jax.service.problem import RequestError, parse_fields
 from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import MAX_BODY, MAX_CLOUD_COORDINATE, MAX_CLOUDS
 
@@ -45,7 +45,7 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
     Raises:
         RequestError: 413 or 422, with the errors of all fields.
     """
-    decoders: dict[str, Callable[[], Any]] = {
+    parsers: dict[str, Callable[[], Any]] = {
         "color": lambda: _decode_image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
         "depth": lambda: _decode_image("depth", depth, ("PNG",), ("I;16",)),
         "labels": lambda: (
@@ -53,14 +53,7 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
         ),
         "intrinsics": lambda: _decode_intrinsics(intrinsics),
     }
-    fields, errors = {}, []
-    for name, decode in decoders.items():
-        try:
-            fields[name] = decode()
-        except RequestError as error:
-            errors.append(error)
-    if errors:
-        raise RequestError.merge(errors)
+    fields = parse_fields(parsers)
     try:
         frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
     except InputError as error:

@@ -6,11 +6,10 @@ Descriptors and class probabilities for batches of a few sizes are all compiled 
 import dataclasses
 import logging
 import queue
-import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from typing import Generic, NamedTuple, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -32,104 +31,9 @@ from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import THOR2, Recognizer
-from thor2_jax.service.problem import deadline_exceeded
 from thor2_jax.service.settings import Settings
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Job(Generic[Item, Result]):
-    items: Sequence[Item]
-    deadline: float
-    future: Future[list[Result]]
-
-
-class Batcher(Generic[Item, Result]):
-    """Combine the items of several jobs into batches and process them in one thread."""
-
-    def __init__(
-        self,
-        process_batch: Callable[[list[Item]], list[Result]],
-        count_expected: Callable[[], int],
-        max_batch: int,
-        window: float,
-    ) -> None:
-        """Start the thread.
-
-        Args:
-            process_batch: returns one result per item, for at most `max_batch` items.
-            count_expected: returns the number of current jobs, including jobs that are not submitted yet.
-            max_batch: maximum number of items in a batch.
-            window: seconds for which an incomplete batch waits for expected jobs.
-        """
-        self._process_batch, self._count_expected = process_batch, count_expected
-        self._max_batch, self._window = max_batch, window
-        # A SimpleQueue of CPython 3.11 may wait for ever where its timeout passes before it begins to wait.
-        self._waiting: queue.Queue[_Job[Item, Result] | None] = queue.Queue()
-        self._thread = threading.Thread(target=self._run, name="device")
-        self._thread.start()
-
-    def submit(self, items: Sequence[Item], deadline: float) -> Future[list[Result]]:
-        """Queue `items` and return a future of their results, in order.
-
-        The future raises RequestError (504) if the job still waits at `deadline` (a time of `time.monotonic`). A
-        future that is cancelled while it waits is skipped.
-        """
-        job = _Job(items, deadline, Future[list[Result]]())
-        if items:
-            self._waiting.put(job)
-        else:
-            job.future.set_result([])
-        return job.future
-
-    def close(self) -> None:
-        """Finish all submitted jobs and stop the thread."""
-        self._waiting.put(None)
-        self._thread.join()
-
-    def _run(self) -> None:
-        is_open = True
-        while is_open:
-            jobs: list[_Job[Item, Result]] = []
-            free, window_end = self._max_batch, 0.0
-            while free > 0:
-                try:
-                    timeout = window_end - time.monotonic() if len(jobs) < self._count_expected() else 0.0
-                    job = self._waiting.get(timeout=max(0.0, timeout) if jobs else None)
-                except queue.Empty:
-                    break
-                if job is None:
-                    is_open = False
-                    break
-                if not jobs:
-                    window_end = time.monotonic() + self._window
-                jobs.append(job)
-                free -= len(job.items)
-            self._process([job for job in jobs if job.future.set_running_or_notify_cancel()])
-
-    def _process(self, jobs: list[_Job[Item, Result]]) -> None:
-        now = time.monotonic()
-        for job in jobs:
-            if job.deadline < now:
-                job.future.set_exception(deadline_exceeded())
-        jobs = [job for job in jobs if job.deadline >= now]
-        items = [item for job in jobs for item in job.items]
-        results: list[Result] = []
-        try:
-            for first in range(0, len(items), self._max_batch):
-                results += self._process_batch(items[first : first + self._max_batch])
-        except Exception as error:  # The callers receive the error; the thread continues with the next batch.
-            for job in jobs:
-                job.future.set_exception(error)
-            return
-        for job in jobs:
-            job.future.set_result(results[: len(job.items)])
-            del results[: len(job.items)]
-
 
 log = logging.getLogger(__name__)
 
@@ -159,6 +63,74 @@ class CloudResult(NamedTuple):
     inference: Inference
 
 
+Job = tuple[Sequence[PreparedInstance], Future[list[CloudResult]]]
+"""The usable instances of a request, and their results."""
+
+
+class Batcher:
+    """Combine the instances of several requests into batches and process them in one thread."""
+
+    def __init__(
+        self,
+        process_batch: Callable[[list[PreparedInstance]], list[CloudResult]],
+        count_expected: Callable[[], int],
+        max_batch: int,
+        window: float,
+    ) -> None:
+        """Start without requests.
+
+        Args:
+            process_batch: returns one result per instance, for at most `max_batch` instances.
+            count_expected: returns the number of current requests, including those that are not submitted yet.
+            max_batch: maximum number of instances in a batch.
+            window: seconds for which an incomplete batch waits for expected requests.
+        """
+        self._process_batch, self._count_expected = process_batch, count_expected
+        self._max_batch, self._window = max_batch, window
+        # A SimpleQueue of CPython 3.11 may wait for ever where its timeout passes before it begins to wait.
+        self._waiting: queue.Queue[Job] = queue.Queue()
+        self._device = ThreadPoolExecutor(1, thread_name_prefix="device")
+
+    def submit(self, instances: Sequence[PreparedInstance]) -> Future[list[CloudResult]]:
+        """Queue `instances` and return a future of their results, in order; one that is cancelled is skipped."""
+        future = Future[list[CloudResult]]()
+        self._waiting.put((instances, future))
+        self._device.submit(self._process)
+        return future
+
+    def close(self) -> None:
+        """Process all that was submitted and stop the thread."""
+        self._device.shutdown()
+
+    def _process(self) -> None:
+        """Process what waits, unless an earlier call has done so with its own batch."""
+        jobs: list[Job] = []
+        free, window_end = self._max_batch, 0.0
+        while free > 0:
+            timeout = window_end - time.monotonic() if len(jobs) < self._count_expected() else 0.0
+            try:
+                job = self._waiting.get(timeout=max(0.0, timeout))
+            except queue.Empty:
+                break
+            if not jobs:
+                window_end = time.monotonic() + self._window
+            jobs.append(job)
+            free -= len(job[0])
+        jobs = [job for job in jobs if job[1].set_running_or_notify_cancel()]
+        instances = [instance for of_job, _ in jobs for instance in of_job]
+        results: list[CloudResult] = []
+        try:
+            for first in range(0, len(instances), self._max_batch):
+                results += self._process_batch(instances[first : first + self._max_batch])
+        except Exception as error:  # The callers receive the error; the thread continues with the next batch.
+            for _, future in jobs:
+                future.set_exception(error)
+            return
+        for of_job, future in jobs:
+            future.set_result(results[: len(of_job)])
+            del results[: len(of_job)]
+
+
 class InferenceEngine:
     """A trained run on the device. Not thread-safe."""
 
@@ -166,7 +138,7 @@ class InferenceEngine:
         """Load the run.
 
         Raises:
-            InputError: the run cannot be read or lacks a classifier of THOR2, or an error of `Recognizer`.
+            InputError: the run or the gallery cannot be used, or an error of `Recognizer`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
@@ -175,33 +147,27 @@ class InferenceEngine:
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         recognizer = _load(settings)
         run = recognizer.run
-        missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
-        if missing:
-            raise InputError(
-                f"model: {settings.model} has no classifier {', '.join(missing)}; "
-                f"serving needs {' and '.join(THOR2)}: train the run with them"
-            )
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
-        recognizer.model = dataclasses.replace(recognizer.model, run=self.run)
+        model = dataclasses.replace(recognizer.model, run=self.run)
+        if settings.teach and model.answer_by == "classifiers":  # They would never answer by an enrolled object.
+            model = dataclasses.replace(model, answer_by="both")
+        recognizer.model = model
         self._recognizer = recognizer
         # A service that teaches compiles the embedding before the first object is enrolled.
-        self._embeds = settings.teach or self._uses_gallery
+        self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
         self.max_batch = settings.max_batch
         self._online: OnlineAdaptation | None = None
         if settings.adapt:
             if not self.model.classifiers:
                 raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(adaptation_criterion(self.model), self._set_transform)
+            self._online = OnlineAdaptation(adaptation_criterion(self.model))
 
     @property
     def model(self) -> Model:
         """The current model."""
         return self._recognizer.model
-
-    def _set_transform(self, adaptation: Adaptation) -> None:
-        self._recognizer.model = dataclasses.replace(self.model, color_transform=adaptation.transform)
 
     @property
     def adaptation(self) -> Adaptation | None:
@@ -218,11 +184,9 @@ class InferenceEngine:
         if observe and self._online is not None:
             self._online.observe(instances)
         model = self.model
+        if self.adaptation is not None:
+            model = dataclasses.replace(model, color_transform=self.adaptation.transform)
         return [model.corrected(instance) for instance in instances]
-
-    @property
-    def _uses_gallery(self) -> bool:
-        return self.model.answers_by() != "classifiers"
 
     @property
     def objects(self) -> ObjectGallery:
@@ -303,7 +267,7 @@ class InferenceEngine:
         gallery, and with forgotten classes.
         """
         temperatures, model = self.run.record.get("temperatures", {}), self.model
-        if not results or self._uses_gallery or self.objects.gallery.hidden:
+        if not results or model.answers_by() != "classifiers" or self.objects.gallery.hidden:
             return [None] * len(results)
         probabilities: dict[str, NDArray[np.float32]] = {
             name: np.stack([r.inference.probabilities[name] for r in results]) for name in model.classifiers.default
@@ -330,8 +294,6 @@ def _load(settings: Settings) -> Recognizer:
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
         check_output_file("gallery", (directory or settings.model / GALLERY_DIRECTORY) / INDEX_FILE)
-        if recognizer.run.record.get("answer_by") == "classifiers":  # They would never answer by an enrolled object.
-            recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory, answer_by="both")
     return recognizer
 
 

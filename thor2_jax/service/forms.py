@@ -11,14 +11,11 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
-from thor2_jax.service.problem import RequestError
+from thor2_jax.service.problem import RequestError, parse_fields
 from thor2_jax.service.schemas import FORM
 from thor2_jax.service.settings import MAX_BODY
 
 __all__ = ["parse_enrolment", "parse_number", "read_body", "read_form"]
-
-MAX_NAME_BYTES = 1000
-"""Length in bytes up to which a name is checked, and named in an error."""
 
 
 async def _limited_stream(request: Request) -> AsyncGenerator[bytes, None]:
@@ -83,36 +80,32 @@ def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]
     Raises:
         RequestError: 422, with the errors of all fields.
     """
-    errors: list[RequestError] = []
+    values = parse_fields(
+        {
+            "name": lambda: _parse_name(fields.pop("name")),
+            "instance": lambda: parse_number(fields, "instance"),
+            "extend": lambda: _parse_flag(fields, "extend"),
+            "replace": lambda: _parse_flag(fields, "replace"),
+        }
+    )
+    name, instance = values.pop("name"), values.pop("instance")
+    if all(values.values()):
+        raise RequestError(422, "replace", "extend and replace are both true; choose one.")
+    return name, instance, values
 
-    def error(field: str, message: str) -> None:
-        errors.append(RequestError(422, field, message))
 
-    content, name, instance = fields.pop("name"), "", 0
-    if len(content) > MAX_NAME_BYTES:
-        error("name", f"name has {len(content)} bytes; expected a printable text of 1 to 200 characters.")
-    else:
-        try:
-            name = check_name(content.decode())
-        except UnicodeDecodeError:
-            error("name", "name is not valid UTF-8; expected a printable text of 1 to 200 characters.")
-        except InputError as problem:
-            error("name", f"{problem}.")
+def _parse_name(content: bytes) -> str:
     try:
-        instance = parse_number(fields, "instance")
-    except RequestError as problem:
-        errors.append(problem)
-    flags = {}
-    for field in ("extend", "replace"):
-        value = fields.pop(field, b"false").lower()
-        if value not in (b"true", b"1", b"false", b"0"):
-            error(field, f"{field} must be true or false.")
-        flags[field] = value in (b"true", b"1")
-    if all(flags.values()):
-        error("replace", "extend and replace are both true; choose one.")
-    if errors:
-        raise RequestError.merge(errors)
-    return name, instance, flags
+        return check_name(content.decode(errors="surrogateescape"))
+    except InputError as error:
+        raise RequestError(422, "name", f"{error}.") from None
+
+
+def _parse_flag(fields: dict[str, bytes], name: str) -> bool:
+    value = fields.pop(name, b"false").lower()
+    if value not in (b"true", b"1", b"false", b"0"):
+        raise RequestError(422, name, f"{name} must be true or false.")
+    return value in (b"true", b"1")
 
 
 def parse_number(fields: dict[str, bytes], name: str) -> int:

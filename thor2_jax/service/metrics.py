@@ -3,22 +3,16 @@
 import contextlib
 import functools
 import os
-import threading
 from pathlib import Path
 
-import jax
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["COMPILER_THREAD", "CompilationCounter", "Metrics", "RequestCounter"]
+__all__ = ["Metrics", "count_requests"]
 
 STAGE_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
-COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
-COMPILER_THREAD = "compile-explanations"
-"""Name of the thread whose compilations are not counted, since no request waits for them."""
-
 SHARED_DIRECTORY = "PROMETHEUS_MULTIPROC_DIR"
 
 
@@ -68,51 +62,23 @@ def _remove_dead_workers(directory: Path) -> None:
                 mark_process_dead(pid)
 
 
-class CompilationCounter:
-    """Count the programs that JAX compiles between `start` and `stop`, except in the thread `COMPILER_THREAD`."""
+def count_requests(app: ASGIApp, metrics: Metrics) -> ASGIApp:
+    """Return ASGI middleware that counts responses by route and status."""
 
-    def __init__(self, counter: Counter) -> None:
-        self._counter, self._is_active = counter, False
+    async def counted(scope: Scope, receive: Receive, send: Send) -> None:
+        status = 500  # An outer middleware answers so if the application raises an exception.
 
-    def _on_event(self, event: str, duration_secs: float, **_: str | int) -> None:
-        if event == COMPILATION_EVENT and not threading.current_thread().name.startswith(COMPILER_THREAD):
-            self._counter.inc()
-
-    def start(self) -> None:
-        """Start counting."""
-        self._is_active = True
-        jax.monitoring.register_event_duration_secs_listener(self._on_event)
-
-    def stop(self) -> None:
-        """Stop counting; does nothing before `start`."""
-        if self._is_active:
-            jax.monitoring.unregister_event_duration_listener(self._on_event)
-
-
-class RequestCounter:
-    """ASGI middleware that counts responses by route and status."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app, self._metrics = app, metrics
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Call the application and count the status of its response."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-
-        def count(status: int) -> None:
-            # Routes, not paths: callers could create an unlimited number of labels.
-            path = getattr(scope.get("route"), "path", "other")
-            self._metrics.requests.labels(path or "other", str(status)).inc()
-
-        async def send_counted(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                count(message["status"])
+        async def send_noted(message: Message) -> None:
+            nonlocal status
+            status = message.get("status", status)
             await send(message)
 
         try:
-            await self._app(scope, receive, send_counted)
-        except Exception:  # An outer middleware answers with status 500.
-            count(500)
-            raise
+            await app(scope, receive, send_noted)
+        finally:
+            if scope["type"] == "http":
+                # Routes, not paths: callers could create an unlimited number of labels.
+                path = getattr(scope.get("route"), "path", "other")
+                metrics.requests.labels(path or "other", str(status)).inc()
+
+    return counted

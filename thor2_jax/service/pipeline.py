@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from thor2_jax.capacity import POINT_BUCKETS
@@ -25,7 +26,7 @@ from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.answers import explained_frame, why_answer
 from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine
-from thor2_jax.service.metrics import COMPILER_THREAD, CompilationCounter, Metrics
+from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,
     PreparedRequest,
@@ -35,7 +36,7 @@ from thor2_jax.service.preparation import (
     timed,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
-from thor2_jax.service.schemas import ExplainedFrame, LabelMap, WhyAnswer
+from thor2_jax.service.schemas import ExplainedFrame, WhyAnswer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["AdmittedRequest", "Service", "gallery_errors"]
@@ -44,6 +45,12 @@ log = logging.getLogger(__name__)
 
 WHY_RETRY_SECONDS = 3
 """Value of Retry-After until explanations are compiled."""
+
+COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
+"""Event of JAX that a program was compiled."""
+
+COMPILER_THREAD = "compile-explanations"
+"""Name of the thread whose compilations are not counted, since no request waits for them."""
 
 LOCK_SHARE = 0.8
 """Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
@@ -88,10 +95,6 @@ class AdmittedRequest:
         self.deadline = self._start + time_limit
         self.seconds: dict[str, float] = {}
 
-    def stage(self, name: str) -> contextlib.AbstractContextManager[None]:
-        """Measure the duration of the context, unless it raises."""
-        return timed(self.seconds, name)
-
     def milliseconds(self) -> dict[str, float]:
         """Return the durations of all finished stages and the total so far."""
         total = time.monotonic() - self._start
@@ -113,7 +116,6 @@ class Service:
         self.engine = InferenceEngine(settings)
         self.state = "starting"
         self.progress = ""
-        self._compilations = CompilationCounter(self.metrics.compilations)
         self._in_progress = self._accepted = 0
         self._compiled: dict[ExplanationPrograms, Future[None]] = {}
         self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
@@ -127,6 +129,12 @@ class Service:
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
         self._warm_up_thread.start()
+        jax.monitoring.register_event_duration_secs_listener(self._count_compilation)
+
+    def _count_compilation(self, event: str, duration_secs: float, **_: str | int) -> None:
+        is_awaited = not threading.current_thread().name.startswith(COMPILER_THREAD)
+        if self.state == "ready" and event == COMPILATION_EVENT and is_awaited:
+            self.metrics.compilations.inc()
 
     def _warm_up(self) -> None:
         start, shapes = time.monotonic(), self.engine.batch_shapes
@@ -142,18 +150,14 @@ class Service:
             log.exception("warm-up failed")
             self.state = "failed"
             return
-        self._compilations.start()
         if self.state == "starting":
             self.state = "ready"
             self.metrics.ready_workers.set(1)
         log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
         if self.settings.warm_why:
-            self._warm_why([programs for n in POINT_BUCKETS for programs in self.engine.explanation_programs(n)])
-
-    def _warm_why(self, programs: list[ExplanationPrograms]) -> None:
-        """Compile for explanations, one size after the other, so that what requests ask for comes in between."""
-        if programs and self.state == "ready":
-            self._compile_explanations(programs[0]).add_done_callback(lambda _: self._warm_why(programs[1:]))
+            for n_points in POINT_BUCKETS:
+                for programs in self.engine.explanation_programs(n_points):
+                    self._compile_explanations(programs)
 
     def _compile_explanations(self, programs: ExplanationPrograms) -> Future[None]:
         """Compile what explanations need in the background, unless that has begun already."""
@@ -194,7 +198,7 @@ class Service:
         self._batcher.close()
         self._compiler.shutdown(cancel_futures=True)
         self._explainer.shutdown(cancel_futures=True)
-        self._compilations.stop()
+        jax.monitoring.unregister_event_duration_listener(self._count_compilation)
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
@@ -230,22 +234,27 @@ class Service:
                 self.metrics.stages.labels(name).observe(duration)
 
     async def recognize(
-        self, files: dict[str, bytes], request: AdmittedRequest
-    ) -> tuple[list[Recognition], LabelMap | None]:
+        self, files: dict[str, bytes], request: AdmittedRequest, with_label_map: bool = False
+    ) -> tuple[PreparedRequest, list[CloudResult], list[Recognition]]:
         """Recognize the frame in `files` (the arguments of `decoding.decode_frame`).
 
         Returns:
-            One recognition per instance, and the labels of a frame that was segmented here, otherwise None.
+            The frame with corrected colours, the results of its usable instances, and a recognition of each instance.
 
         Raises:
             RequestError: as `preparation.prepare_frame`.
         """
-        prepared, _, recognitions = await self._recognize_frame(files, False, request)
-        return recognitions, prepared.label_map
+        arguments = files, self.engine.run.config, with_label_map, self.settings.segmenter
+        prepared = await self._prepare(request, prepare_frame, *arguments)
+        corrected = self.engine.correct(prepared.instances, observe=True)
+        results = await self._infer(corrected, request)
+        self.engine.refresh()
+        recognitions = self.engine.recognize(corrected, results)
+        return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
     async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
         """Recognize a frame and return the evidence as well. Raises RequestError."""
-        prepared, results, recognitions = await self._recognize_frame(files, True, request)
+        prepared, results, recognitions = await self.recognize(files, request, with_label_map=True)
         confidences, config = self.engine.calibrated_confidences(results), self.engine.run.config
         arguments = prepared, recognitions, results, confidences, config, request.milliseconds()
         return await asyncio.to_thread(explained_frame, *arguments)
@@ -257,7 +266,7 @@ class Service:
             RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
                 this size are compiled.
         """
-        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label, True)
+        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
@@ -270,7 +279,7 @@ class Service:
             (instance,) = self.engine.correct(prepared.instances, observe=False)
             return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
-        with request.stage("explain"):
+        with timed(request.seconds, "explain"):
             try:
                 answer = await asyncio.wrap_future(self._explainer.submit(explained))
             except InputError as error:
@@ -294,9 +303,6 @@ class Service:
             RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
                 `prepare_view`. Nothing is enrolled.
         """
-        with gallery_errors(self.engine.objects.directory, 409, "name"):
-            self.engine.objects.refresh()
-            self.engine.objects.check(name, **flags)
         prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
@@ -319,7 +325,7 @@ class Service:
         Raises:
             RequestError: as `gallery_errors`, of whose arguments `refused` and `field` are two.
         """
-        with request.stage("gallery"):
+        with timed(request.seconds, "gallery"):
             async with self._gallery_lock:
                 copied = copy.copy(self.engine.objects)
                 copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
@@ -327,17 +333,6 @@ class Service:
                     await asyncio.to_thread(change, copied)
         self.engine.refresh()
         return copied
-
-    async def _recognize_frame(
-        self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
-    ) -> tuple[PreparedRequest, list[CloudResult], list[Recognition]]:
-        arguments = files, self.engine.run.config, with_label_map, self.settings.segmenter
-        prepared = await self._prepare(request, prepare_frame, *arguments)
-        corrected = self.engine.correct(prepared.instances, observe=True)
-        results = await self._infer(corrected, request)
-        self.engine.refresh()
-        recognitions = self.engine.recognize(corrected, results)
-        return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
     async def _prepare(
         self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any
@@ -348,8 +343,8 @@ class Service:
 
     async def _infer(self, instances: Sequence[PreparedInstance], request: AdmittedRequest) -> list[CloudResult]:
         usable = [instance for instance in instances if instance.reason is None]
-        with request.stage("device"):
-            return await asyncio.wrap_future(self._batcher.submit(usable, request.deadline))
+        with timed(request.seconds, "device"):
+            return await asyncio.wrap_future(self._batcher.submit(usable)) if usable else []
 
     def _process_batch(self, instances: list[PreparedInstance]) -> list[CloudResult]:
         self.metrics.batches.observe(len(instances))

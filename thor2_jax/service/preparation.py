@@ -55,7 +55,7 @@ class PreparedRequest:
         instances: its instances, in the order of their labels.
         seconds: stage -> duration.
         label_map: the label image of the frame, if requested, and if the frame was segmented here.
-        frame: the frame, if it is needed after its instances are prepared.
+        frame: the frame of a view, which pictures of an explanation show.
     """
 
     instances: list[PreparedInstance]
@@ -96,9 +96,6 @@ def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
         frame = segmented(frame, _segmenter(name))
     except InputError as error:
         raise RequestError(500, "labels", f"{error}, or send labels.") from None
-    except SystemExit:
-        message = f"segmenter {name} ended the process on the frame; check its package, or send labels."
-        raise RequestError(500, "labels", message) from None
     check_instances(frame)
     return frame
 
@@ -109,13 +106,11 @@ def _warm_up(name: str) -> None:
     If that fails, requests report the reason.
     """
     blank = RGBDFrame(np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), None, Intrinsics(60, 60, 32, 24))
-    with contextlib.suppress(InputError, SystemExit):
+    with contextlib.suppress(InputError):
         segmented(blank, _segmenter(name))
 
 
-def prepare_view(
-    files: dict[str, bytes], config: DescriptorConfig, label: int, with_frame: bool = False
-) -> PreparedRequest:
+def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
     """Decode a frame and compute the cloud of one instance, which is to be enrolled or explained.
 
     Raises:
@@ -132,7 +127,7 @@ def prepare_view(
         (view,) = _prepare_instances(frame, [label], config)
     if view.reason is not None:
         raise RequestError(422, "instance", f"instance {label} cannot be used: {view.reason}.")
-    return PreparedRequest([view], seconds, frame=frame if with_frame else None)
+    return PreparedRequest([view], seconds, frame=frame)
 
 
 def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], config: DescriptorConfig) -> list[PreparedInstance]:
@@ -167,34 +162,27 @@ def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
 
 def _run_process(pipe: Connection, segmenter: str | None) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; the service stops this one.
-        signal.signal(number, signal.SIG_IGN)
     if segmenter is not None:
         _warm_up(segmenter)
     pipe.send("ready")
-    while True:
-        try:
+    outcome: tuple[Any, Exception | None]
+    with contextlib.suppress(EOFError, OSError):  # The service has ended or was killed.
+        while True:
             function, arguments = pipe.recv()
-        except (EOFError, OSError):  # The service has ended or was killed.
-            return
-        outcome: tuple[Any, Exception | None]
-        try:
-            outcome = function(*arguments), None
-        except RequestError as error:
-            outcome = None, error
-        except Exception:
-            outcome = None, RuntimeError(traceback.format_exc())
-        try:
+            try:
+                outcome = function(*arguments), None
+            except RequestError as error:
+                outcome = None, error
+            except Exception:
+                outcome = None, RuntimeError(traceback.format_exc())
             pipe.send(outcome)
-        except OSError:  # As above.
-            return
 
 
 class _PreparationProcess:
     def __init__(self, context: Any, segmenter: str | None) -> None:
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(target=_run_process, args=(child_pipe, segmenter), daemon=True)
-        with signals_blocked(signal.SIGINT, signal.SIGTERM):
+        with signals_blocked(signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; `stop` ends this one.
             self.process.start()
         child_pipe.close()
         self.pipe.recv()
@@ -232,15 +220,12 @@ class PreparationPool:
     def _call(
         self, deadline: float, function: Callable[..., PreparedRequest], arguments: Sequence[Any]
     ) -> PreparedRequest:
-        remaining = deadline - time.monotonic()
-        if remaining <= 0:
-            raise deadline_exceeded()
         process = self._idle.get()
         try:
             if not process.process.is_alive():
                 process = self._replace(process)
             process.pipe.send((function, arguments))
-            if not process.pipe.poll(max(remaining, MIN_SECONDS)):
+            if not process.pipe.poll(max(deadline - time.monotonic(), MIN_SECONDS)):
                 process = self._replace(process)
                 raise deadline_exceeded()
             result, error = process.pipe.recv()

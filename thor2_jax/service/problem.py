@@ -1,13 +1,13 @@
 """Errors of the API: an HTTP status and a JSON body that names the field concerned."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 from thor2_jax.printable import escape_characters
 
-__all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_responses"]
+__all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_responses", "parse_fields"]
 
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
@@ -55,17 +55,30 @@ class RequestError(Exception):
         self.status, self.field, self.message = status, field, escape_characters(message)
         self.further = further
 
-    @classmethod
-    def merge(cls, errors: "Sequence[RequestError]") -> "RequestError":
-        """Combine the errors of several fields; the first one determines the status."""
-        first, *others = errors
-        return cls(first.status, first.field, first.message, *[(error.field, error.message) for error in others])
-
     @property
     def problem(self) -> Problem:
         """The body of the response."""
         further = [FieldError(field=field, message=message) for field, message in self.further]
         return Problem(field=self.field, message=self.message, further=further)
+
+
+def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+    """Call the parser of each field of a request and return their results.
+
+    Raises:
+        RequestError: with the errors of all fields; the first one determines the status.
+    """
+    values, errors = {}, []
+    for name, parse in parsers.items():
+        try:
+            values[name] = parse()
+        except RequestError as error:
+            errors.append(error)
+    if errors:
+        first, *others = errors
+        further = [(error.field, error.message) for error in others]
+        raise RequestError(first.status, first.field, first.message, *further)
+    return values
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -17,7 +17,6 @@ import sys
 import tempfile
 import threading
 from multiprocessing.process import BaseProcess
-from typing import Any, cast
 
 import uvicorn
 from fastapi import FastAPI
@@ -34,6 +33,16 @@ from thor2_jax.signals import ended_by_signals, signals_blocked
 __all__ = ["TimedConnection", "serve"]
 
 log = logging.getLogger(__name__)
+
+HEADERS = {
+    # The page loads from and connects to its own server only, has no inline code and cannot be framed.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # Browsers revalidate each file of the page and transfer it only if it changed.
+}
+"""Headers of all answers."""
 
 HEAD_SECONDS = 5.0
 """Time limit for a complete request head, counted from the connection, the previous answer and its own first byte."""
@@ -64,11 +73,12 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         functools.partial(_create_worker, settings, workers),
         factory=True,
         workers=workers,
+        loop="asyncio",  # uvloop raises an error for each answer to a connection that was reset.
         http=TimedConnection,
         ws="none",
         access_log=False,
         server_header=False,
-        headers=[("X-Content-Type-Options", "nosniff")],
+        headers=list(HEADERS.items()),
         log_config=log_config,
         timeout_graceful_shutdown=int(settings.deadline) + 5,
         timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
@@ -130,38 +140,19 @@ def _terminate_after(parent: BaseProcess) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-class _SafeTransport:
-    """Transport that discards data once it is closing.
-
-    Between the reset of a connection and the notification of the application, uvloop raises an error for each write.
-    """
-
-    def __init__(self, transport: Any) -> None:
-        self._transport = transport
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._transport, name)
-
-    def write(self, data: bytes) -> None:
-        """Send data, or discard it if the connection is closing."""
-        if not self._transport.is_closing():
-            self._transport.write(data)
-
-
 class TimedConnection(HttpToolsProtocol):
     """uvicorn connection that is closed if a request head arrives too slowly or is too large.
 
     Requests with complete heads are answered before the connection is closed. Bodies are limited by `forms`.
     """
 
-    _timer: asyncio.TimerHandle | None = None
     _in_head = False
     _head_bytes = 0
 
-    def connection_made(self, transport: Any) -> None:
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timer of the first request head."""
-        super().connection_made(cast(asyncio.Transport, _SafeTransport(transport)))
-        self._expect_head(HEAD_SECONDS)
+        super().connection_made(transport)
+        self._timer = self.loop.call_later(HEAD_SECONDS, self.shutdown)
 
     def data_received(self, data: bytes) -> None:
         """Process received bytes, and close the connection if a request head is too large."""
@@ -180,7 +171,7 @@ class TimedConnection(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """Stop the timer: the request head is complete."""
         self._in_head = False
-        self._stop_timer()
+        self._timer.cancel()
         super().on_headers_complete()
 
     def on_response_complete(self) -> None:
@@ -191,14 +182,9 @@ class TimedConnection(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the timer."""
-        self._stop_timer()
+        self._timer.cancel()
         super().connection_lost(exc)
 
     def _expect_head(self, seconds: float) -> None:
-        self._stop_timer()
+        self._timer.cancel()
         self._timer = self.loop.call_later(seconds, self.shutdown)
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None

@@ -75,11 +75,8 @@ class Settings:
     warm_why: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("queue", "deadline", "processes"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} is {getattr(self, name)}; expected a positive number")
-        if self.deadline > MAX_DEADLINE:
-            raise InputError(f"deadline is {self.deadline}; expected at most {MAX_DEADLINE} seconds")
+        if not 0 < self.deadline <= MAX_DEADLINE:
+            raise InputError(f"deadline is {self.deadline}; expected a positive number, at most {MAX_DEADLINE} seconds")
         check_host_names(self.allow_host)
         if self.cache is not None and self.cache.exists() and not self.cache.is_dir():
             raise InputError(f"cache is {self.cache}, a file; expected a directory, which may be new")

@@ -68,9 +68,6 @@ class Broadcast:
 
 
 class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
     def __init__(self, address: tuple[str, int], broadcast: Broadcast, allow_host: Sequence[str]) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.broadcast, self.is_stopping = broadcast, threading.Event()

@@ -13,7 +13,7 @@ from PIL import Image
 
 from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.recordings.bag_writer import COMPRESSED_IMAGE, MessageBag
-from thor2_jax.recordings.detections import ros_time
+from thor2_jax.recordings.messages import ros_time
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_views
 from training.rendering.view_sphere import Camera

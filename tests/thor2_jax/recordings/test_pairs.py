@@ -10,7 +10,7 @@ MS = 10**6
 
 def pairs_of(images: list[StampedImage], tolerance: int) -> tuple[list[tuple[int, int]], PairCounts]:
     counts = PairCounts()
-    pairs = [(pair.color.stamp, pair.depth.stamp) for pair in nearest_pairs(images, tolerance, counts)]
+    pairs = [(color.stamp, depth.stamp) for color, depth in nearest_pairs(images, tolerance, counts)]
     return pairs, counts
 
 

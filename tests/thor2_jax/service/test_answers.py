@@ -117,26 +117,19 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
 
 
 def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: Files) -> None:
-    two = random_clouds(1, (100, 250))
-
     async def ask() -> Any:
         client = AsyncClient(server.url)
         with pytest.raises(ServiceError, match="depth") as error:
             await client.recognize(**files | {"depth": b"not an image"})
         assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
-        return await asyncio.gather(
-            client.recognize(**files), client.recognize_frame(**files), client.model(), client.objects(),
-            client.describe(two),
-        )  # fmt: skip
+        return await asyncio.gather(client.recognize(**files), client.recognize_frame(**files), client.objects())
 
-    recognitions, (of_frame, labels), model, objects, descriptors = asyncio.run(ask())
+    recognitions, (of_frame, labels), objects = asyncio.run(ask())
     client = Client(server.url)
     expected = client.recognize(**files)
     for answers in (recognitions, of_frame):  # Requests that share a batch differ in the last digits.
         assert_same_answers(answers, expected, 1e-5)
-    assert labels is None
-    assert model == client.model() and objects == client.objects()
-    np.testing.assert_allclose(descriptors.tops2, client.describe(two).tops2, rtol=1e-5, atol=1e-5)
+    assert labels is None and objects == client.objects()
     methods = {name for name in vars(Client) if not name.startswith("_")}
     assert methods == {name for name in vars(AsyncClient) if not name.startswith("_")}
 

@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 import uvicorn
 from processes import HANG
+from starlette.staticfiles import StaticFiles
 
 from thor2_jax.service import server as serving
-from thor2_jax.service.app import PageFiles
+
+from .conftest import SAMPLE_INDEX
 
 WORK = 0.5
 HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
@@ -36,7 +38,7 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
 @contextlib.contextmanager
 def serve(app: Any, *sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
     """Serve an application in a thread; yield its address, and connections that had sent something before it began."""
-    config = uvicorn.Config(app, http=serving.TimedConnection, lifespan="off", log_config=None)
+    config = uvicorn.Config(app, loop="asyncio", http=serving.TimedConnection, lifespan="off", log_config=None)
     with contextlib.ExitStack() as stack:
         listening = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         address, connections = listening.getsockname(), []
@@ -131,7 +133,7 @@ def test_many_pipelined_requests(address: Any, monkeypatch: pytest.MonkeyPatch) 
 
 def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
     """Pipelined requests for static files whose client resets the connection while they are answered."""
-    with serve(PageFiles()) as (address, _):
+    with serve(StaticFiles(directory=SAMPLE_INDEX.parents[1], html=True)) as (address, _):
         for count in (1, 3, 50) * 4:
             with socket.create_connection(address) as connection:
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

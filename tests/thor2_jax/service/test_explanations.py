@@ -143,6 +143,7 @@ def test_why_is_503_until_explanations_are_compiled(
     def compile_explanations(_: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
         assert is_compiled.wait(300) and not is_stopped()
         compiled.append((n_points, by_classifiers))
+        raise InputError("the error is left to requests, which compile what is missing")
 
     monkeypatch.setattr(service, "_compiled", {})
     monkeypatch.setattr(pipeline, "compile_explanations", compile_explanations)
@@ -156,17 +157,6 @@ def test_why_is_503_until_explanations_are_compiled(
     next(iter(service._compiled.values())).result(300)
     check_refused(ask(teaching_url, files, 3), 422, "instance", "is explained")
     assert compiled == service.engine.explanation_programs()
-
-
-def test_failed_compilation_leaves_the_error_to_requests(
-    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    service, fail = teaching_app.state.service, Mock(side_effect=InputError("explanations need a convention"))
-    monkeypatch.setattr(service, "_compiled", {})
-    for name in ("compile_explanations", "explain_instance"):
-        monkeypatch.setattr(pipeline, name, fail)
-    service._compile_explanations(*service.engine.explanation_programs()).result(300)
-    check_refused(ask(teaching_url, files, 3), 422, "instance", "convention")
 
 
 @pytest.mark.slow

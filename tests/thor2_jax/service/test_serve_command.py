@@ -56,12 +56,6 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
     assert f"{name.replace('-', '_')} is " in error and value in error
 
 
-@pytest.mark.parametrize("name", ["queue", "processes"])
-def test_settings_that_only_the_library_can_have(name: str, run_dir: Path) -> None:
-    with pytest.raises(InputError, match=f"{name} is 0"):
-        Settings(run_dir, **{name: 0})
-
-
 def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty one does not switch authentication off."""
     for token in ("", "é"):
