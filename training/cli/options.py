@@ -31,6 +31,7 @@ __all__ = [
     "UnknownOption",
     "WorkerOptions",
     "WorkersOption",
+    "find_segmenter",
     "given_options",
     "grouped_options",
     "split_names",
@@ -169,7 +170,7 @@ class FrameOptions:
             InputError: the options contradict each other, or a folder or a recording cannot be read.
             OSError: a recording cannot be opened.
         """
-        from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
+        from thor2_jax.segmentation.segmenters import TABLE
         from training.readers.frame_files import FrameFiles, find_frames, recorded_sources, segmented_source
 
         self.check()
@@ -193,11 +194,8 @@ class FrameOptions:
             sources = [files.source(self.color.stem, self.depth_scale)]
         if segment is None:
             return sources
-        if model is not None and segment == MODEL:
-            load_segmenter(TABLE)  # it begins with these pieces, and their package may be missing
-        else:
-            model = load_segmenter(segment)
-        return [segmented_source(source, model) for source in sources]
+        segmenter = find_segmenter(segment, model)
+        return [segmented_source(source, segmenter) for source in sources]
 
     def open_bag(self) -> "Bag":
         """Return the recording, which is not opened yet."""
@@ -208,6 +206,16 @@ class FrameOptions:
         topics = Topics(self.color_topic, self.depth_topic, self.camera_topic)
         intrinsics = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
         return Bag(self.bag, topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
+
+
+def find_segmenter(name: str, model: "Segmenter | None" = None) -> "Segmenter":
+    """Return the segmenter of this name; `model` is the segmenter "model", where the command has one."""
+    from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
+
+    if model is None or name != MODEL:
+        return load_segmenter(name)
+    load_segmenter(TABLE)  # "model" begins with its pieces, and its package may be missing
+    return model
 
 
 def grouped_options(command: Callable[..., None]) -> Callable[..., None]:
