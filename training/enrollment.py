@@ -1,12 +1,11 @@
 """Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
 
 from training.views.mesh_views import mesh_views
-enroll_objects(Path("run"), lambda sigma_s: {"mug": lambda: mesh_views(Path("mug.glb"))}, "mesh")
+enroll_objects(Path("run"), lambda sigma_s: (["mug"], iter([mesh_views(Path("mug.glb"))])), "mesh")
 """
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
@@ -77,7 +76,7 @@ def labelled_views(
 
 def enroll_objects(
     model: Path,
-    read: Callable[[float], Mapping[str, Callable[[], Sequence[PreparedInstance]]]],
+    read: Callable[[float], tuple[Iterable[str], Iterator[Sequence[PreparedInstance]]]],
     source: str,
     *,
     name: str | None = None,
@@ -90,8 +89,7 @@ def enroll_objects(
 
     Args:
         model: the run directory.
-        read: function of sigma_s that returns object -> function that returns its views. While one object is embedded,
-            a second thread calls the function of the next.
+        read: function of sigma_s that returns the objects, and an iterator of their views, in the same order.
         source: "mesh" or "frames".
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
@@ -116,25 +114,22 @@ def enroll_objects(
     config = objects.embedding.config if recognizer is None else recognizer.run.config
     if name is not None:
         objects.check(name, extend=extend, replace=replace)
-    views = read(config.sigma_s)
-    views = {objects.check(each, extend=extend, replace=replace): views_of for each, views_of in views.items()}
+    given, views = read(config.sigma_s)
+    names = [objects.check(each, extend=extend, replace=replace) for each in given]
     added = {}
-    with progress() as report, ThreadPoolExecutor(1) as pool:
-        following = map(pool.submit, views.values())
-        coming = next(following, None)
-        for number, each in enumerate(views):
-            report("enroll", number, len(views), each)
-            assert coming is not None
-            of_object, coming = coming.result(), next(following, None)
+    with progress() as report:
+        for number, each in enumerate(names):
+            report("enroll", number, len(names), each)
+            of_object = next(views)
             if recognizer is not None and source == "frames":
                 of_object = [recognizer.model.corrected(view) for view in of_object]
             added[each] = enrolled_views(objects.embedding, of_object, source)
-        report("enroll", len(views), len(views), "")
+        report("enroll", len(names), len(names), "")
     if is_new:
         _create_run(model, objects, added)
     else:
         objects.add(added, extend=extend, replace=replace)
-    return {each: len(objects.gallery.objects[each].clouds) for each in views}, objects
+    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects
 
 
 def _create_run(model: Path, objects: ObjectGallery, added: Mapping[str, GalleryObject]) -> None:

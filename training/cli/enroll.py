@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -57,8 +57,6 @@ def enroll(
     has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
-    if mesh is None:
-        given.check()
     if name is None and (label_name is not None or instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
     if extend and replace:
@@ -75,25 +73,21 @@ def enroll(
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
+    frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
     skipped: list[str] = []
     with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
-        for path in (given.color, given.depth, given.labels, given.intrinsics):
-            if path is not None and not path.is_file():
-                raise FileNotFoundError(2, "No such file", str(path))
-        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-
         # These take seconds to import.
         from training.enrollment import enroll_objects, labelled_views
 
-        def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
+        def read(sigma_s: float) -> tuple[Iterable[str], Iterator[Sequence["PreparedInstance"]]]:
             if frames is None:
-                return views_of_meshes
+                return meshes, views_of_meshes
             views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
             skipped.extend(f"skipped: {reason}" for reason in unusable)
             views = views if name is None else {name: [view for each in views.values() for view in each]}
-            return {each: partial(list, of_object) for each, of_object in views.items()}
+            return views, iter(views.values())
 
         counts, known = enroll_objects(
             model,
@@ -118,20 +112,19 @@ def enroll(
 @contextlib.contextmanager
 def _rendered(
     meshes: Mapping[str, Path], mesh_scale: float, processes: options.WorkerOptions
-) -> Iterator[Mapping[str, Callable[[], Sequence["PreparedInstance"]]]]:
-    """Yield object -> function that returns its views, to be called in this order; the first ones are rendered now.
+) -> Iterator[Iterator[Sequence["PreparedInstance"]]]:
+    """Yield an iterator of the views of each mesh; the first ones are rendered now.
 
     Several meshes are rendered by other processes, which start while this one imports JAX.
     """
     if not meshes:
-        yield {}
+        yield iter(())
         return
     from training.storage.workers import IN_PROCESS
     from training.views import mesh_views
 
     render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
     pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes))).pool() or IN_PROCESS
-    views = pool(render, meshes.values())
-    with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
+    with contextlib.closing(pool(render, meshes.values())) as views, ThreadPoolExecutor(1) as thread:
         first = thread.submit(next, views)
-        yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}
+        yield (next(views) if number else first.result() for number in range(len(meshes)))

@@ -61,7 +61,7 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
         (("--bag", "b", "--color", "c.png"), "color is c.png and bag is b"),
         (("frames", "--every", 2), "every is 2; it belongs to --bag"),
         (("absent",), "absent"),
-        (("--color", "c.png"), "c.png" if command == "enroll mug" else "--depth"),
+        (("--color", "c.png"), "--depth"),
     ):
         assert expected in refused(*command.split(), *given, "--model", tmp_path / "run", *out)
 

@@ -155,7 +155,6 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "extend and replace"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
-        (("mug", *one_frame(tmp_path / "absent", 1)), "absent"),
     ):
         assert text in refused("enroll", "--model", model, *arguments)
 
