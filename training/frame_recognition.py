@@ -188,10 +188,8 @@ class ResultTables:
         """
         self._categories = result_files.category_numbers(classes, names)
         self._images = dict(zip(frames, result_files.image_numbers(frames), strict=True))
-        scenes = {scene for scene, _ in self._images.values()}
-        # COCO has no scenes: images of several scenes are counted from 1.
-        numbers = [image for _, image in self._images.values()] if len(scenes) == 1 else range(1, len(frames) + 1)
-        self._coco_images = dict(zip(frames, numbers, strict=True))
+        self._has_scenes = len({scene for scene, _ in self._images.values()}) > 1
+        self._places = {name: place for place, name in enumerate(frames, 1)}
         self._coco: list[dict[str, Any]] = []
         self._bop: list[str] = []
         self.n_without_number = 0
@@ -202,8 +200,10 @@ class ResultTables:
         named = [r.name for r in answer.recognitions if r.name is not None]
         self.n_without_number += sum(name not in self._categories for name in named)
         recognized = answer.frame, answer.recognitions, self._categories
-        self._coco += result_files.coco_results(answer.name, self._coco_images[answer.name], *recognized)
         scene, image = self._images[answer.name]
+        # COCO has no scenes: images of several scenes are counted from 1.
+        number = self._places[answer.name] if self._has_scenes else image
+        self._coco += result_files.coco_results(answer.name, number, *recognized)
         self._bop += result_files.bop_lines(scene, image, *recognized, answer.seconds)
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:

@@ -89,16 +89,11 @@ def enroll(
             views = views if name is None else {name: [view for each in views.values() for view in each]}
             return views, iter(views.values())
 
-        counts, known = enroll_objects(
-            model,
-            read,
-            "frames" if mesh is None else "mesh",
-            name=name,
-            extend=extend,
-            replace=replace,
-            gallery=gallery,
-            progress=partial(show_progress, quiet),
-        )
+        source, changes = "frames" if mesh is None else "mesh", {"extend": extend, "replace": replace}
+        with show_progress(quiet) as progress:
+            counts, known = enroll_objects(
+                model, read, source, name=name, gallery=gallery, progress=progress, **changes
+            )
     for line in skipped:
         console.print(line)
     for each, count in counts.items():

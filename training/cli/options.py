@@ -20,7 +20,6 @@ __all__ = [
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
-    "KnownSegmentOption",
     "MAX_WORKERS",
     "ManyFrames",
     "MeshScaleOption",
@@ -57,13 +56,10 @@ AnswerByOption = Annotated[
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
 SegmentOption = Annotated[
     str | None,
-    typer.Option("--segment", help="Segment the frames instead of reading labels: table, or another segmenter."),
-]
-KnownSegmentOption = Annotated[
-    str | None,
     typer.Option(
         "--segment",
-        help="Segment the frames instead of reading labels: table, model (for piles), or another segmenter.",
+        help="Segment the frames instead of reading labels: table, model (for piles; only recognize and explain), or "
+        "another segmenter.",
     ),
 ]
 GalleryOption = Annotated[

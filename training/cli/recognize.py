@@ -31,7 +31,7 @@ def recognize(
     model: options.ModelOption,
     given: options.FrameOptions,
     processes: options.WorkerOptions,
-    segment: options.KnownSegmentOption = None,
+    segment: options.SegmentOption = None,
     unknown_below: options.UnknownOption = None,
     answer_by: options.AnswerByOption = None,
     track: Annotated[

@@ -158,11 +158,10 @@ def train(
         raise InputError("paper and quick are given; expected one of them")
     if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
+    rendering = {"names": names, "azimuth-step": azimuth_step, "polar-step": polar_step}
+    for option, value in (rendering | {"mesh-scale": None if mesh_scale == 1 else mesh_scale}).items():
         if meshes is None and value is not None:
             raise InputError(f"{option} is {value}; expected only with --meshes: other views are not rendered")
-    if meshes is None and mesh_scale != 1:
-        raise InputError(f"mesh-scale is {mesh_scale:g}; expected only with --meshes: other views are not rendered")
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
