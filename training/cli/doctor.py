@@ -60,12 +60,10 @@ def doctor(
     if failed:
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     result = f"frames checked: {len(sources)}"
-    of_meshes = [] if meshes is None else ["--meshes", meshes]
-    of_meshes += [] if mesh_scale == 1 else ["--mesh-scale", f"{mesh_scale:g}"]
     if is_sound and not as_json:
         finish(result, "recognize", "recognize", *given.arguments, "--model", model or "RUN")
     elif not as_json:
-        finish(result, "after a change, check again", "doctor", *given.arguments, *of_meshes)
+        finish(result, "after a change, check again", *sys.argv[1:])
     if not is_sound:
         raise typer.Exit(1)
 

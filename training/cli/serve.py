@@ -52,7 +52,7 @@ def serve(
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
     with ended_by_signals():
-        with needs_extra("serve", "starlette and uvicorn", "serve"):
+        with needs_extra("serve", "FastAPI and uvicorn", "serve"):
             from thor2_jax.service.server import serve as serve_forever
         from thor2_jax.service.settings import Settings, default_segmenter
 
