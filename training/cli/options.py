@@ -25,7 +25,6 @@ __all__ = [
     "MeshScaleOption",
     "ModelOption",
     "QuietOption",
-    "RECORDINGS",
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
@@ -33,6 +32,7 @@ __all__ = [
     "find_segmenter",
     "given_options",
     "grouped_options",
+    "recording_option",
     "split_names",
 ]
 
@@ -80,8 +80,8 @@ AllowHostOption = Annotated[
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
-RECORDINGS = "Recordings"
-"""Panel of the options of recordings in the help."""
+recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
+"""An option of recordings, which the help lists in a panel of its own."""
 
 
 def given_options(record: Any, without: str = "") -> list[str]:
@@ -114,25 +114,13 @@ class FrameOptions:
         float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
     ] = None
     bag: Annotated[
-        Path | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags)."),
+        Path | None, recording_option(help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags).")
     ] = None
-    color_topic: Annotated[
-        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Colour images. Default: the topic that has them.")
-    ] = None
-    depth_topic: Annotated[
-        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Depth that is aligned to colour. Default: likewise.")
-    ] = None
-    camera_topic: Annotated[
-        str | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="camera_info of the colour camera. Default: likewise."),
-    ] = None
-    max_gap: Annotated[
-        float, typer.Option(rich_help_panel=RECORDINGS, help="Longest time between colour and depth, seconds.")
-    ] = DEFAULT_MAX_GAP
-    every: Annotated[
-        int, typer.Option(min=1, max=2**31 - 1, rich_help_panel=RECORDINGS, help="Take the first of so many frames.")
-    ] = 1
+    color_topic: Annotated[str | None, recording_option(help="Colour images. Default: the topic that has them.")] = None
+    depth_topic: Annotated[str | None, recording_option(help="Depth aligned to colour. Default: likewise.")] = None
+    camera_topic: Annotated[str | None, recording_option(help="camera_info of this camera. Default: likewise.")] = None
+    max_gap: Annotated[float, recording_option(help="Seconds between colour and depth, at most.")] = DEFAULT_MAX_GAP
+    every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take the first of so many frames.")] = 1
 
     @property
     def arguments(self) -> list[str]:

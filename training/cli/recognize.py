@@ -54,9 +54,7 @@ def recognize(
     ] = None,
     out_bag: Annotated[
         Path | None,
-        typer.Option(
-            rich_help_panel=options.RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."
-        ),
+        options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
     ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
