@@ -44,10 +44,8 @@ def enable_compilation_cache() -> None:
     if root is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     directory = root / processor()
-    try:
+    with contextlib.suppress(OSError):
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        return
     if os.access(directory, os.W_OK):
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(directory)
         os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))
