@@ -11,13 +11,13 @@ from pathlib import Path
 
 from thor2_jax.adaptation.estimate import Adaptation, Report
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import check_output_directory, read_file, temporary_directory
+from thor2_jax.files import atomic_directory, check_output_directory, read_file
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import FrameSource
 
-__all__ = ["adapt_run", "write_adapted_run"]
+__all__ = ["adapt_run"]
 
 UNFINISHED = ("checkpoints", "views", ".*")
 """Names in a run directory that are not copied."""
@@ -47,26 +47,10 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
             yield frame
 
     adaptation = recognizer.adapt(frames(), report)
-    write_adapted_run(model, adaptation, out)
-    return adaptation
-
-
-def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
-    """Copy a run directory and store a colour transform in the copy's record.
-
-    The copy appears under its name when it is complete.
-
-    Raises:
-        InputError: `out` is not empty, or a file of the run cannot be read.
-        OSError: a file cannot be written; nothing is left behind.
-    """
-    check_output_directory(out)
-    out = out.resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_directory(out.parent) as unfinished:
-        run = unfinished / "run"
+    with atomic_directory(out) as run:
+        ignored = shutil.ignore_patterns(*UNFINISHED)
         try:
-            shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED), copy_function=_copy)
+            shutil.copytree(model, run, ignore=ignored, copy_function=_copy, dirs_exist_ok=True)
         except shutil.Error as error:
             raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
         finally:
@@ -78,10 +62,11 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
             "adapted_to": {"instances": adaptation.instances},
         }
         (run / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
-        run.rename(out)
+    return adaptation
 
 
 def _copy(source: str, target: str) -> None:
+    """Copy a file; one that cannot be read, such as a device, is an InputError."""
     try:
         content = read_file(source)
     except OSError as error:

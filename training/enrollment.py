@@ -1,27 +1,24 @@
 """Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
 
 from training.views.mesh_views import mesh_views
-enroll_objects(Path("run"), lambda sigma_s: {"mug": lambda: mesh_views(Path("mug.glb"))}, "mesh")
+enroll_objects(Path("run"), lambda sigma_s: (["mug"], iter([mesh_views(Path("mug.glb"))])), "mesh")
 """
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import temporary_directory
+from thor2_jax.files import atomic_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import enrolled_views, instance_view
-from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameFolder
-from training.storage.jobs import Display
+from training.storage.jobs import Progress
 
 __all__ = ["enroll_objects", "labelled_views"]
 
@@ -77,27 +74,26 @@ def labelled_views(
 
 def enroll_objects(
     model: Path,
-    read: Callable[[float], Mapping[str, Callable[[], Sequence[PreparedInstance]]]],
+    read: Callable[[float], tuple[Iterable[str], Iterator[Sequence[PreparedInstance]]]],
     source: str,
     *,
     name: str | None = None,
     extend: bool = False,
     replace: bool = False,
     gallery: Path | None = None,
-    progress: Display = lambda: contextlib.nullcontext(lambda stage, done, total, note: None),
+    progress: Progress = lambda stage, done, total, note: None,
 ) -> tuple[dict[str, int], ObjectGallery]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
     Args:
         model: the run directory.
-        read: function of sigma_s that returns object -> function that returns its views. While one object is embedded,
-            a second thread calls the function of the next.
+        read: function of sigma_s that returns the objects, and an iterator of their views, in the same order.
         source: "mesh" or "frames".
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
         gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
-        progress: opens the display, which is called with ("enroll", objects done, number of objects, name).
+        progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
         Object -> number of its views in the gallery, and the gallery.
@@ -111,38 +107,23 @@ def enroll_objects(
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
-    recognizer = None if is_new else Recognizer.load(model, gallery=gallery)
-    objects = ObjectGallery(()) if recognizer is None else recognizer.objects
-    config = objects.embedding.config if recognizer is None else recognizer.run.config
-    if name is not None:
-        objects.check(name, extend=extend, replace=replace)
-    views = read(config.sigma_s)
-    views = {objects.check(each, extend=extend, replace=replace): views_of for each, views_of in views.items()}
     added = {}
-    with progress() as report, ThreadPoolExecutor(1) as pool:
-        following = map(pool.submit, views.values())
-        coming = next(following, None)
-        for number, each in enumerate(views):
-            report("enroll", number, len(views), each)
-            assert coming is not None
-            of_object, coming = coming.result(), next(following, None)
-            if recognizer is not None and source == "frames":
+    with atomic_directory(model) if is_new else contextlib.nullcontext(model) as run:
+        if is_new:
+            embedding = ObjectGallery(()).embedding
+            save_run(TrainedRun(embedding.config, embedding.network, (), {}, {}), run)
+        recognizer = Recognizer.load(run, gallery=gallery)
+        objects = recognizer.objects
+        if name is not None:
+            objects.check(name, extend=extend, replace=replace)
+        given, views = read(recognizer.run.config.sigma_s)
+        names = [objects.check(each, extend=extend, replace=replace) for each in given]
+        for number, each in enumerate(names):
+            progress("enroll", number, len(names), each)
+            of_object = next(views)
+            if source == "frames":
                 of_object = [recognizer.model.corrected(view) for view in of_object]
             added[each] = enrolled_views(objects.embedding, of_object, source)
-        report("enroll", len(views), len(views), "")
-    if is_new:
-        _create_run(model, objects, added)
-    else:
+        progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
-    return {each: len(objects.gallery.objects[each].clouds) for each in views}, objects
-
-
-def _create_run(model: Path, objects: ObjectGallery, added: Mapping[str, GalleryObject]) -> None:
-    """Write a run directory of enrolled objects only. It appears under its name when it is complete."""
-    model.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_directory(model.parent) as unfinished:
-        run = unfinished / "run"
-        save_run(TrainedRun(objects.embedding.config, objects.embedding.network, (), {}, {}), run)
-        objects.open(run / GALLERY_DIRECTORY)
-        objects.add(added)
-        run.rename(model)
+    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects

@@ -1,13 +1,11 @@
 """Recognition of several frames or of a recording, one frame after the other, and the files with all answers.
 
-for answer in recognize_frames(recognizer, find_frames([Path("frames")])):
+for answer in recognize_frames(recognizer.recognize, find_frames([Path("frames")])):
     print(answer.name, answer.error or answer.recognitions)
 """
 
-import contextlib
 import dataclasses
 import functools
-import itertools
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,26 +20,20 @@ from thor2_jax.files import write_text
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.instance_clouds import unit_question
 from thor2_jax.model import result_files
-from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frame_files import FrameSource
-from training.storage.workers import WorkerPool
 
 __all__ = [
     "FrameAnswer",
     "RecognizerArguments",
     "ResultTables",
+    "read_source",
     "recognize_frames",
-    "recognize_frames_in_pool",
-    "recognize_recorded",
     "segmentation_failure",
     "track_frames",
 ]
-
-FRAMES_PER_CHUNK = 4
-"""Frames that a worker recognizes at a time, and that are recognized again if it dies."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +46,7 @@ class FrameAnswer:
         recognitions: one answer for each instance.
         seconds: time for recognition, without reading the files.
         error: why the frame could not be recognized; None if it was.
+        recorded: the frame's place in its recording; None if it is of files.
     """
 
     name: str
@@ -61,37 +54,52 @@ class FrameAnswer:
     recognitions: Sequence[Recognition] = ()
     seconds: float = 0.0
     error: str | None = None
+    recorded: RecordedFrame | None = None
+
+    @functools.cached_property
+    def detections(self) -> list[Detection]:
+        """The answers with the places of the objects; none without a frame."""
+        return [] if self.frame is None else detections_of(self.frame, self.recognitions)
 
     def as_json(self) -> dict[str, Any]:
-        """Return {"frame", "instances"}, or {"frame", "error"}."""
+        """Return {"frame", "instances"}, or {"frame", "error"}; in recordings also "depth_gap", and detections."""
+        line: dict[str, Any] = {"frame": self.name}
+        if self.recorded is not None:
+            line["depth_gap"] = self.recorded.gap / 1e9
         if self.error is not None:
-            return {"frame": self.name, "error": self.error}
-        return {"frame": self.name, "instances": result_files.instances_as_json(self.recognitions)}
+            return {**line, "error": self.error}
+        if self.recorded is not None:
+            return {**line, "instances": detections_as_json(self.detections)}
+        return {**line, "instances": result_files.instances_as_json(self.recognitions)}
 
 
-def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> Iterator[FrameAnswer]:
-    """Read and recognize frames; one that fails has an `error` and does not stop the others."""
-
-    def read(source: FrameSource) -> RGBDFrame:
-        try:
-            return source.read()
-        except OSError as error:
-            raise InputError(f"{error.filename}: {error.strerror or error}") from None
-
-    return (_answer(source.name, functools.partial(read, source), recognizer.recognize) for source in sources)
-
-
-def _answer(
-    name: str, read: Callable[[], RGBDFrame], recognize: Callable[[RGBDFrame], Sequence[Recognition]]
-) -> FrameAnswer:
-    """Read and recognize a frame; the answer has an `error` if that raises InputError."""
+def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
+    """Read a frame; raises InputError, also for a file that cannot be opened."""
     try:
-        frame = read()
-        start = time.perf_counter()
-        recognitions = recognize(frame)
-    except InputError as error:
-        return FrameAnswer(name, error=str(error))
-    return FrameAnswer(name, frame, recognitions, time.perf_counter() - start)
+        return source.read()
+    except OSError as error:
+        raise InputError(f"{error.filename}: {error.strerror or error}") from None
+
+
+def recognize_frames(
+    recognize: Callable[[RGBDFrame], Sequence[Recognition]], sources: Iterable[FrameSource | RecordedFrame]
+) -> Iterator[FrameAnswer]:
+    """Read and recognize frames; one that fails has an `error` and does not stop the others.
+
+    Args:
+        recognize: `Recognizer.recognize`, or `Tracker.update`.
+        sources: the frames, with labels. Errors of their iterator are raised.
+    """
+    for source in sources:
+        recorded = source if isinstance(source, RecordedFrame) else None
+        try:
+            frame = read_source(source)
+            start = time.perf_counter()
+            recognitions = recognize(frame)
+        except InputError as error:
+            yield FrameAnswer(source.name, error=str(error), recorded=recorded)
+        else:
+            yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start, recorded=recorded)
 
 
 def segmentation_failure(answer: FrameAnswer) -> str:
@@ -121,28 +129,12 @@ class RecognizerArguments:
         """Segment a frame by `Recognizer.segment`, in a worker process, which loads the recognizer once."""
         return _loaded(self).segment(frame)
 
-
-def recognize_frames_in_pool(
-    arguments: RecognizerArguments, sources: Sequence[FrameSource], pool: WorkerPool
-) -> Iterator[FrameAnswer]:
-    """Return the answers of `recognize_frames`, which worker processes compute in chunks of frames."""
-    starts = range(0, len(sources), FRAMES_PER_CHUNK)
-    chunks = [(arguments, tuple(sources[start : start + FRAMES_PER_CHUNK])) for start in starts]
-    with contextlib.closing(pool(_recognize_chunk, chunks)) as results:
-        for answers in results:
-            yield from answers
+    def answer(self, source: FrameSource) -> FrameAnswer:
+        """Return the answer of `recognize_frames` for a frame, in a worker process as `segment`."""
+        return next(recognize_frames(_loaded(self).recognize, [source]))
 
 
 _loaded = functools.lru_cache(1)(RecognizerArguments.load)
-
-
-def _recognize_chunk(chunk: tuple[RecognizerArguments, tuple[FrameSource, ...]]) -> list[FrameAnswer]:
-    arguments, sources = chunk
-    answers = recognize_frames(_loaded(arguments), sources)
-    return [
-        answer if answer.frame is None else dataclasses.replace(answer, frame=dataclasses.replace(answer.frame))
-        for answer in answers  # without the cached properties of the frames
-    ]
 
 
 def track_frames(
@@ -195,23 +187,22 @@ class ResultTables:
         """
         self._categories = result_files.category_numbers(classes, names)
         self._images = dict(zip(frames, result_files.image_numbers(frames), strict=True))
-        scenes = {scene for scene, _ in self._images.values()}
-        # COCO has no scenes: images of several scenes are counted from 1.
-        numbers = [image for _, image in self._images.values()] if len(scenes) == 1 else range(1, len(frames) + 1)
-        self._coco_images = dict(zip(frames, numbers, strict=True))
+        self._has_scenes = len({scene for scene, _ in self._images.values()}) > 1
+        self._places = {name: place for place, name in enumerate(frames, 1)}
         self._coco: list[dict[str, Any]] = []
         self._bop: list[str] = []
         self.n_without_number = 0
 
     def add(self, answer: FrameAnswer) -> None:
-        """Add the answers of a frame."""
-        if answer.frame is None:
-            return
+        """Add the answers of a frame, which was recognized."""
+        assert answer.frame is not None
         named = [r.name for r in answer.recognitions if r.name is not None]
         self.n_without_number += sum(name not in self._categories for name in named)
         recognized = answer.frame, answer.recognitions, self._categories
-        self._coco += result_files.coco_results(answer.name, self._coco_images[answer.name], *recognized)
         scene, image = self._images[answer.name]
+        # COCO has no scenes: images of several scenes are counted from 1.
+        number = self._places[answer.name] if self._has_scenes else image
+        self._coco += result_files.coco_results(answer.name, number, *recognized)
         self._bop += result_files.bop_lines(scene, image, *recognized, answer.seconds)
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
@@ -225,27 +216,3 @@ class ResultTables:
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_text(path, content + "\n")
-
-
-def recognize_recorded(
-    recognize: Callable[[RGBDFrame], Sequence[Recognition]],
-    frames: Iterator[RecordedFrame],
-    segmenter: Segmenter,
-    every: int = 1,
-) -> Iterator[tuple[RecordedFrame, FrameAnswer]]:
-    """Segment and recognize recorded frames; one that fails has an `error` and does not stop the others.
-
-    Args:
-        recognize: `Recognizer.recognize`, or `Tracker.update`.
-        frames: the frames, without labels.
-        segmenter: gives them labels.
-        every: recognize the first of so many frames.
-
-    Raises:
-        InputError: as `frames`.
-    """
-
-    def answer(recorded: RecordedFrame) -> FrameAnswer:
-        return _answer(recorded.name, lambda: segmented(recorded.read(), segmenter), recognize)
-
-    return ((recorded, answer(recorded)) for recorded in itertools.islice(frames, 0, None, every))

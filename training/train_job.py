@@ -95,7 +95,12 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
         OSError: A file cannot be written.
     """
     baselines = check_baselines(job.baselines)
-    _check_weights(job, baselines)
+    if job.weights is not None:
+        if not any(pretrained_files(name) for name in baselines):
+            reason = "but none of the baselines reads pretrained weights"
+            raise InputError(f"weights is {job.weights}, {reason}; leave it out")
+        for name in baselines:
+            check_weights(job.weights, name)
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
@@ -131,16 +136,6 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     return runs
 
 
-def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
-    """Raise InputError if files of pretrained weights are missing, unfit, or read by none of the baselines."""
-    if job.weights is None:
-        return
-    if not any(pretrained_files(name) for name in baselines):
-        raise InputError(f"weights is {job.weights}, but none of the baselines reads pretrained weights; leave it out")
-    for name in baselines:
-        check_weights(job.weights, name)
-
-
 def _stages(job: TrainJob) -> dict[str, float]:
     """Return the stages of the training of a run, see `RunSettings.stages`; those of baselines are none of them."""
     if job.meshes is None:
@@ -155,12 +150,10 @@ def _crop_size(job: TrainJob) -> int | None:
 def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
     """Raise InputError if a batch is larger than all samples; the defaults are reduced to their number instead."""
     size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
-    per_view = len(protocol.mirrors) + protocol.orientation_copies
-    n_samples = n_views * per_view
+    n_samples = n_views * (len(protocol.mirrors) + protocol.orientation_copies)
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
         raise InputError(
-            f"batch_size is {size}; expected at most {n_samples}, the number of samples ({n_views} views, "
-            f"{per_view} samples of each)"
+            f"batch_size is {size}; expected at most {n_samples}, the number of samples of {n_views} views"
         )
 
 

@@ -5,10 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import point_bucket
 from thor2_jax.errors import InputError
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.model.inference import infer_clouds
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.next_view import ViewTable
 from training.objects.mesh import TexturedMesh
@@ -20,9 +18,6 @@ __all__ = ["view_table"]
 
 AZIMUTHS, POLARS = 8, (0.6, 1.2)
 """Number of azimuths, and polar angles in radians: cameras around a table look down on it."""
-
-ROWS = 16
-"""Views that are described in one call."""
 
 
 def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> ViewTable:
@@ -54,12 +49,6 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
         raise InputError(
             f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected meshes of the classes"
         )
-    order = np.argsort([len(view.points) for view in views], kind="stable")
-    answers = np.zeros((len(views), len(classes)))
-    for start in range(0, len(views), ROWS):
-        rows = order[start : start + ROWS]
-        clouds = pack_instances([views[k] for k in rows], ROWS, point_bucket(max(len(views[k].points) for k in rows)))
-        inference = infer_clouds(recognizer.model, clouds, answer_by="classifiers")
-        probabilities = {name: np.asarray(values) for name, values in inference.probabilities.items()}
-        answers[rows] = recognizer.model.fused(probabilities)[: len(rows)]
-    return ViewTable(np.array(labels), np.array(rotations), answers)
+    _, inference = recognizer.infer(views, answer_by="classifiers")
+    probabilities = {name: values[: len(views)] for name, values in inference.probabilities.items()}
+    return ViewTable(np.array(labels), np.array(rotations), recognizer.model.fused(probabilities).astype(np.float64))

@@ -44,10 +44,8 @@ def enable_compilation_cache() -> None:
     if root is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     directory = root / processor()
-    try:
+    with contextlib.suppress(OSError):
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        return
     if os.access(directory, os.W_OK):
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(directory)
         os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))
@@ -63,7 +61,7 @@ def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
     """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing."""
     if quiet:
         return contextlib.nullcontext(lambda stage, done, total, note: None)
-    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_Lines())
+    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_lines())
 
 
 @contextlib.contextmanager
@@ -84,21 +82,19 @@ def _bars() -> Iterator[Progress]:
         yield show
 
 
-class _Lines:
-    """Print a line when a stage begins, every few seconds, and when it ends."""
+def _lines() -> Progress:
+    """Return a callback that prints a line when a stage begins, every few seconds, and when it ends."""
+    begun: dict[str, tuple[float, int]] = {}
+    printed, following = ("", 0), 0.0
 
-    def __init__(self) -> None:
-        self._begun: dict[str, tuple[float, int]] = {}
-        self._printed: tuple[str, int] | None = None
-        self._next = 0.0
-
-    def __call__(self, stage: str, done: int, total: int, note: str) -> None:
+    def show(stage: str, done: int, total: int, note: str) -> None:
+        nonlocal printed, following
         now = time.monotonic()
-        begins = stage not in self._begun
-        start, first = self._begun.setdefault(stage, (now, done))
-        if (stage, done) == self._printed or not (begins or done >= total or now >= self._next):
+        begins = stage not in begun
+        start, first = begun.setdefault(stage, (now, done))
+        if (stage, done) == printed or not (begins or done >= total or now >= following):
             return
-        self._printed, self._next = (stage, done), now + SECONDS_PER_LINE
+        printed, following = (stage, done), now + SECONDS_PER_LINE
         elapsed = now - start
         parts = [f"{done:,} of {total:,}", note]
         if elapsed >= 1:
@@ -106,6 +102,8 @@ class _Lines:
             if first < done < total:
                 parts.append(f"about {elapsed * (total - done) / (done - first):.0f} s left")
         print(f"{stage}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+
+    return show
 
 
 app = typer.Typer(
@@ -186,10 +184,6 @@ def main() -> None:
         if package not in TRAINING_PACKAGES:
             raise
         _exit_with(f"{package} is not installed; recognition works without it, this does not: see docs/install.md")
-    except RuntimeError as error:
-        if "Symlink loop" not in str(error):  # of Path.resolve
-            raise
-        _exit_with(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")

@@ -59,14 +59,11 @@ def doctor(
             is_sound &= not diagnosis.findings
     if failed:
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
-    again = ["doctor", *given.arguments]
-    if is_sound:
-        again = ["recognize", *given.arguments, "--model", str(model or "RUN")]
-    elif meshes is not None:
-        again += ["--meshes", str(meshes), *(["--mesh-scale", f"{mesh_scale:g}"] if mesh_scale != 1 else [])]
-    if not as_json:
-        purpose = "recognize" if is_sound else "after a change, check again"
-        finish(f"frames checked: {len(sources)}", purpose, *again)
+    result = f"frames checked: {len(sources)}"
+    if is_sound and not as_json:
+        finish(result, "recognize", "recognize", *given.arguments, "--model", model or "RUN")
+    elif not as_json:
+        finish(result, "after a change, check again", *sys.argv[1:])
     if not is_sound:
         raise typer.Exit(1)
 
@@ -76,11 +73,8 @@ def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None) -> None:
     if as_json:
         print(json.dumps(({} if frame is None else {"frame": frame}) | dataclasses.asdict(diagnosis)), flush=True)
         return
-    if frame is not None:
-        print(f"{escape_characters(frame)}:")
-    for finding in diagnosis.findings:
-        print(escape_characters(f"{finding.code}: {finding.message} {finding.advice}"))
-    for note in diagnosis.notes:
-        print(escape_characters(f"note: {note}"))
-    if not diagnosis.findings:
-        print("nothing found", flush=True)
+    lines = [] if frame is None else [f"{frame}:"]
+    lines += [f"{finding.code}: {finding.message} {finding.advice}" for finding in diagnosis.findings]
+    lines += [f"note: {note}" for note in diagnosis.notes]
+    lines += [] if diagnosis.findings else ["nothing found"]
+    print("\n".join(map(escape_characters, lines)), flush=True)

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import check_name
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
@@ -52,17 +51,12 @@ def enroll(
     folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which an object
     is unknown depends on its number of views; see --unknown-below of `thor2 recognize`.
     """
-    name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
     has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
-    if mesh is None:
-        given.check()
     if name is None and (label_name is not None or instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
-    if extend and replace:
-        raise InputError("extend and replace are both given; choose one")
     for option, value in (("label_name", label_name), ("instance", instance)):
         if mesh is not None and value is not None:
             raise InputError(f"{option} is {value}; it belongs to frames")
@@ -75,36 +69,27 @@ def enroll(
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
+    frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
     skipped: list[str] = []
     with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
-        for path in (given.color, given.depth, given.labels, given.intrinsics):
-            if path is not None and not path.is_file():
-                raise FileNotFoundError(2, "No such file", str(path))
-        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-
         # These take seconds to import.
         from training.enrollment import enroll_objects, labelled_views
 
-        def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
+        def read(sigma_s: float) -> tuple[Iterable[str], Iterator[Sequence["PreparedInstance"]]]:
             if frames is None:
-                return views_of_meshes
+                return meshes, views_of_meshes
             views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
             skipped.extend(f"skipped: {reason}" for reason in unusable)
             views = views if name is None else {name: [view for each in views.values() for view in each]}
-            return {each: partial(list, of_object) for each, of_object in views.items()}
+            return views, iter(views.values())
 
-        counts, known = enroll_objects(
-            model,
-            read,
-            "frames" if mesh is None else "mesh",
-            name=name,
-            extend=extend,
-            replace=replace,
-            gallery=gallery,
-            progress=partial(show_progress, quiet),
-        )
+        source, changes = "frames" if mesh is None else "mesh", {"extend": extend, "replace": replace}
+        with show_progress(quiet) as progress:
+            counts, known = enroll_objects(
+                model, read, source, name=name, gallery=gallery, progress=progress, **changes
+            )
     for line in skipped:
         console.print(line)
     for each, count in counts.items():
@@ -118,20 +103,19 @@ def enroll(
 @contextlib.contextmanager
 def _rendered(
     meshes: Mapping[str, Path], mesh_scale: float, processes: options.WorkerOptions
-) -> Iterator[Mapping[str, Callable[[], Sequence["PreparedInstance"]]]]:
-    """Yield object -> function that returns its views, to be called in this order; the first ones are rendered now.
+) -> Iterator[Iterator[Sequence["PreparedInstance"]]]:
+    """Yield an iterator of the views of each mesh; the first ones are rendered now.
 
     Several meshes are rendered by other processes, which start while this one imports JAX.
     """
     if not meshes:
-        yield {}
+        yield iter(())
         return
     from training.storage.workers import IN_PROCESS
     from training.views import mesh_views
 
     render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
     pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes))).pool() or IN_PROCESS
-    views = pool(render, meshes.values())
-    with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
+    with contextlib.closing(pool(render, meshes.values())) as views, ThreadPoolExecutor(1) as thread:
         first = thread.submit(next, views)
-        yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}
+        yield (next(views) if number else first.result() for number in range(len(meshes)))

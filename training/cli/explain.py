@@ -22,7 +22,7 @@ def explain(
     instance: Annotated[
         list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
     ] = None,
-    segment: options.KnownSegmentOption = None,
+    segment: options.SegmentOption = None,
     unknown_below: options.UnknownOption = None,
     answer_by: options.AnswerByOption = None,
     gallery: options.GalleryOption = None,

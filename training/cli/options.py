@@ -20,19 +20,19 @@ __all__ = [
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
-    "KnownSegmentOption",
     "MAX_WORKERS",
     "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
     "QuietOption",
-    "RECORDINGS",
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
     "WorkersOption",
+    "find_segmenter",
     "given_options",
     "grouped_options",
+    "recording_option",
     "split_names",
 ]
 
@@ -56,13 +56,10 @@ AnswerByOption = Annotated[
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
 SegmentOption = Annotated[
     str | None,
-    typer.Option("--segment", help="Segment the frames instead of reading labels: table, or another segmenter."),
-]
-KnownSegmentOption = Annotated[
-    str | None,
     typer.Option(
         "--segment",
-        help="Segment the frames instead of reading labels: table, model (for piles), or another segmenter.",
+        help="Segment the frames instead of reading labels: table, model (for piles; only recognize and explain), or "
+        "another segmenter.",
     ),
 ]
 GalleryOption = Annotated[
@@ -83,8 +80,8 @@ AllowHostOption = Annotated[
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
-RECORDINGS = "Recordings"
-"""Panel of the options of recordings in the help."""
+recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
+"""An option of recordings, which the help lists in a panel of its own."""
 
 
 def given_options(record: Any, without: str = "") -> list[str]:
@@ -117,25 +114,13 @@ class FrameOptions:
         float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
     ] = None
     bag: Annotated[
-        Path | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags)."),
+        Path | None, recording_option(help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags).")
     ] = None
-    color_topic: Annotated[
-        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Colour images. Default: the topic that has them.")
-    ] = None
-    depth_topic: Annotated[
-        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Depth that is aligned to colour. Default: likewise.")
-    ] = None
-    camera_topic: Annotated[
-        str | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="camera_info of the colour camera. Default: likewise."),
-    ] = None
-    max_gap: Annotated[
-        float, typer.Option(rich_help_panel=RECORDINGS, help="Longest time between colour and depth, seconds.")
-    ] = DEFAULT_MAX_GAP
-    every: Annotated[
-        int, typer.Option(min=1, max=2**31 - 1, rich_help_panel=RECORDINGS, help="Take the first of so many frames.")
-    ] = 1
+    color_topic: Annotated[str | None, recording_option(help="Colour images. Default: the topic that has them.")] = None
+    depth_topic: Annotated[str | None, recording_option(help="Depth aligned to colour. Default: likewise.")] = None
+    camera_topic: Annotated[str | None, recording_option(help="camera_info of this camera. Default: likewise.")] = None
+    max_gap: Annotated[float, recording_option(help="Seconds between colour and depth, at most.")] = DEFAULT_MAX_GAP
+    every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take the first of so many frames.")] = 1
 
     @property
     def arguments(self) -> list[str]:
@@ -169,7 +154,7 @@ class FrameOptions:
             InputError: the options contradict each other, or a folder or a recording cannot be read.
             OSError: a recording cannot be opened.
         """
-        from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
+        from thor2_jax.segmentation.segmenters import TABLE
         from training.readers.frame_files import FrameFiles, find_frames, recorded_sources, segmented_source
 
         self.check()
@@ -193,11 +178,8 @@ class FrameOptions:
             sources = [files.source(self.color.stem, self.depth_scale)]
         if segment is None:
             return sources
-        if model is not None and segment == MODEL:
-            load_segmenter(TABLE)  # it begins with these pieces, and their package may be missing
-        else:
-            model = load_segmenter(segment)
-        return [segmented_source(source, model) for source in sources]
+        segmenter = find_segmenter(segment, model)
+        return [segmented_source(source, segmenter) for source in sources]
 
     def open_bag(self) -> "Bag":
         """Return the recording, which is not opened yet."""
@@ -208,6 +190,16 @@ class FrameOptions:
         topics = Topics(self.color_topic, self.depth_topic, self.camera_topic)
         intrinsics = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
         return Bag(self.bag, topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
+
+
+def find_segmenter(name: str, model: "Segmenter | None" = None) -> "Segmenter":
+    """Return the segmenter of this name; `model` is the segmenter "model", where the command has one."""
+    from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
+
+    if model is None or name != MODEL:
+        return load_segmenter(name)
+    load_segmenter(TABLE)  # "model" begins with its pieces, and its package may be missing
+    return model
 
 
 def grouped_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -1,7 +1,9 @@
 """`thor2 recognize`: recognize the instances of frames."""
 
 import contextlib
+import dataclasses
 import functools
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -15,7 +17,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish
-from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
@@ -30,7 +31,7 @@ def recognize(
     model: options.ModelOption,
     given: options.FrameOptions,
     processes: options.WorkerOptions,
-    segment: options.KnownSegmentOption = None,
+    segment: options.SegmentOption = None,
     unknown_below: options.UnknownOption = None,
     answer_by: options.AnswerByOption = None,
     track: Annotated[
@@ -53,9 +54,7 @@ def recognize(
     ] = None,
     out_bag: Annotated[
         Path | None,
-        typer.Option(
-            rich_help_panel=options.RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."
-        ),
+        options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
     ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
@@ -65,101 +64,134 @@ def recognize(
     """
     from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
     from thor2_jax.model import result_files
-    from thor2_jax.model.recognition import detections_of
+    from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile
+    from thor2_jax.segmentation.segmenters import TABLE
     from training.frame_recognition import (
         RecognizerArguments,
         ResultTables,
         recognize_frames,
-        recognize_frames_in_pool,
         segmentation_failure,
         track_frames,
     )
     from training.readers.bop import read_object_names
-    from training.readers.frame_files import read_poses
+    from training.readers.frame_files import read_poses, segmented_source
 
     given.check()
-    arguments = RecognizerArguments(model, unknown_below, answer_by)
-    if given.bag is not None:
+    frames, recording = given.frames, given.bag
+    if recording is not None:
         refused: dict[str, object] = {"names": names, "coco": coco, "bop": bop, "poses": poses}
         for name, value in {**refused, "workers": processes.workers, "engine": processes.engine}.items():
             if value not in (None, 1, "local"):
-                raise InputError(f"{name} is {value} and bag is {given.bag}; give one of them")
-        recognize_bag(given, arguments, segment, track, out, out_bag, rerun)
-        return
-    if out_bag is not None:
+                raise InputError(f"{name} is {value} and bag is {recording}; give one of them")
+    elif out_bag is not None:
         raise InputError(f"out_bag is {out_bag}; it belongs to --bag")
     if names is not None and coco is None and bop is None:
         raise InputError(f"names is {names}; it belongs to --coco and --bop")
     if poses is not None and not track:
         raise InputError(f"poses is {poses}; it belongs to --track")
     pool = processes.pool()
-    if pool is not None and (track or not given.frames):
+    if pool is not None and (track or not frames):
         reason = "--track, which takes the frames in turn" if track else "one frame"
         raise InputError(
             f"workers is {processes.workers} and engine is {processes.engine}; they are of no use for {reason}: leave "
             "them out"
         )
+    arguments = RecognizerArguments(model, unknown_below, answer_by)
     load = functools.cache(arguments.load)
     by_model = (lambda frame: load().segment(frame)) if pool is None else arguments.segment
-    sources, frames = given.sources(segment, by_model), given.frames
+    if recording is None:
+        bag, sources = None, given.sources(segment, by_model)
+    else:
+        segmenter = options.find_segmenter(segment or TABLE, by_model)
+        bag, sources = given.open_bag(), []
     of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
     if out is not None:
-        first_parts = {source.name.split("/")[0] for source in sources}
-        check_output_directory(out, resumable=first_parts if frames else result_files.RESULT_FILES)
+        resumable = {source.name.split("/")[0] for source in sources} if frames else result_files.RESULT_FILES
+        check_output_directory(out, resumable=() if recording else resumable)
         for directory in [out / source.name for source in sources] if frames else [out]:
             result_files.check_no_foreign_results(directory)
             remove_leftovers(directory)
     if coco is not None and bop is not None and coco.absolute() == bop.absolute():
         raise InputError(f"coco and bop are {coco}; expected two files")
+    detection_bag = None if out_bag is None else DetectionBag(out_bag)
     rerun_file = None if rerun is None else RerunFile(rerun)
     numbers = None if names is None else read_object_names(names)
     check_output_file("coco", coco, result_files.is_coco_file)
     check_output_file("bop", bop, result_files.is_bop_file)
-    segmented = ["--segment", segment] if segment else []
-    recognizer = load()
-    tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
-    failed, without_depth, unknown = [], [], False
-    if pool is not None:
-        answers = recognize_frames_in_pool(arguments, sources, pool)
-    else:
-        answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
-    with rerun_file or contextlib.nullcontext():
-        for answer in answers:
-            if answer.frame is None:
-                failed.append(answer.name)
-                if not frames:
-                    raise InputError(str(answer.error))
-                print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
-            if as_json:
-                print(json.dumps(answer.as_json()), flush=True)
-            if answer.frame is None:
-                continue
-            if rerun_file is not None:
-                rerun_file.write(answer.frame, detections_of(answer.frame, answer.recognitions), name=answer.name)
-            without_depth.append(segment and segmentation_failure(answer))
-            if not as_json:
-                _print_table(answer.name if frames else None, answer.recognitions)
-            unknown |= any(each.name is None for each in answer.recognitions)
-            tables.add(answer)
-            if out is not None:
-                directory = out / answer.name if frames else out
-                result_files.write_recognitions(directory, answer.frame, answer.recognitions)
+    as_json, failed, empty, unknown, damage = as_json or recording is not None, [], [], False, None
+    with contextlib.ExitStack() as stack:
+        if bag is not None:
+            for note in stack.enter_context(bag).notes:
+                print(escape_characters(f"note: {note}"), file=sys.stderr)
+        recognizer = load()
+        tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
+        if bag is not None:
+            recorded = itertools.islice(bag.frames(), 0, None, given.every)
+            segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
+            answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
+        elif track:
+            answers = track_frames(recognizer, sources, of_frames)
+        elif pool is not None:
+            answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
+        else:
+            answers = recognize_frames(recognizer.recognize, sources)
+        stack.enter_context(detection_bag or contextlib.nullcontext())
+        stack.enter_context(rerun_file or contextlib.nullcontext())
+        try:
+            for answer in answers:
+                if answer.frame is None:
+                    failed.append(answer.name)
+                    if not (frames or recording):
+                        raise InputError(str(answer.error))
+                    print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
+                if as_json:
+                    print(json.dumps(answer.as_json()), flush=True)
+                if answer.frame is None:
+                    continue
+                empty.append(segmentation_failure(answer) if segment or recording else "")
+                unknown |= any(each.name is None for each in answer.recognitions)
+                if not as_json:
+                    _print_table(answer.name if frames else None, answer.recognitions)
+                if coco or bop:
+                    tables.add(answer)
+                if out is not None:
+                    directory = out / answer.name if frames or recording else out
+                    result_files.write_recognitions(directory, answer.frame, answer.recognitions)
+                place = answer.recorded
+                if detection_bag is not None and place is not None:
+                    frame_id = place.frame_id
+                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=frame_id)
+                if rerun_file is not None:
+                    stamp = None if place is None else place.stamp
+                    rerun_file.write(answer.frame, answer.detections, name=answer.name, stamp=stamp)
+        except InputError as error:
+            if bag is None:
+                raise
+            damage = str(error)
     tables.write(coco, bop)
-    written = ", ".join(str(path) for path in (out, coco, bop, rerun) if path)
-    result = f"written to {written}" if written else f"frames recognized: {len(sources) - len(failed)}"
+    written = ", ".join(str(path) for path in (out, out_bag, coco, bop, rerun) if path and path.exists())
+    if damage is not None:
+        before = f"; {len(empty)} frames were recognized before" + (f" and are in {written}" if written else "")
+        raise InputError(damage + (before if empty else ""))
+    if bag is not None and bag.counts.color > bag.counts.pairs:
+        unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
+        print(escape_characters(f"{unpaired} have no depth within {given.max_gap:g} s"), file=sys.stderr)
+    result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
     notes = sys.stderr if as_json else None
     if unknown:
         print(escape_characters(f"{model} knows {recognizer.model.union.summary}"), file=notes)
-    next_command = ("explain", *given.arguments, *segmented, *options.given_options(arguments), "--out", "why")
+    segments = ["--segment", segment] if segment else []
+    next_command = ("explain", *given.arguments, *segments, *options.given_options(arguments), "--out", "why")
     finish(result, "see why", *next_command, file=notes)
-    if tables.n_without_number and (coco or bop):
+    if tables.n_without_number:
         print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)
     if failed:
         listed = ", ".join(failed[:MAX_LISTED]) + (", ..." if len(failed) > MAX_LISTED else "")
-        raise InputError(f"{len(failed)} of {len(sources)} frames could not be recognized: {listed}; see above")
-    if all(without_depth):
-        raise InputError(str(without_depth[0]))
+        total = len(failed) + len(empty)
+        raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
+    if empty and all(empty):
+        raise InputError(empty[0])
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

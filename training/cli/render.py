@@ -6,12 +6,8 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.errors import InputError
 from training.cli import options
 from training.cli.app import app, finish, show_progress
-
-MAX_CROP = 2048
-"""Largest side of a crop, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +40,8 @@ def render(
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 5,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     crops: Annotated[
-        int | None, typer.Option(metavar="PIXELS", help="Also write crops of this size, for image networks.")
+        int | None,
+        typer.Option(metavar="PIXELS", min=1, max=2048, help="Also write crops of this size, for image networks."),
     ] = None,
     mesh_scale: options.MeshScaleOption = 1.0,
     quiet: options.QuietOption = False,
@@ -61,8 +58,6 @@ def render(
     from training.storage.workers import IN_PROCESS
     from training.views.render_job import render_crops, render_dataset
 
-    if crops is not None and not 1 <= crops <= MAX_CROP:
-        raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import needs_extra
 from thor2_jax.signals import ended_by_signals
 from training.cli import options
 from training.cli.app import app
@@ -31,9 +31,7 @@ def serve(
     cache: Annotated[
         Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
     ] = None,
-    gallery: Annotated[
-        Path | None, typer.Option(help="Directory of the enrolled objects. Default: gallery in the run directory.")
-    ] = None,
+    gallery: options.GalleryOption = None,
     teach: Annotated[bool, typer.Option("--teach", help="Let callers enroll and forget objects.")] = False,
     segment: Annotated[
         str | None,
@@ -54,14 +52,8 @@ def serve(
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
     with ended_by_signals():
-        try:
+        with needs_extra("serve", "FastAPI and uvicorn", "serve"):
             from thor2_jax.service.server import serve as serve_forever
-        except ModuleNotFoundError as error:
-            if (error.name or "").startswith("thor2_jax"):
-                raise
-            raise InputError(
-                f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
-            ) from None
         from thor2_jax.service.settings import Settings, default_segmenter
 
         settings = Settings(

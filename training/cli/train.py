@@ -3,17 +3,13 @@
 import dataclasses
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from thor2_jax.errors import InputError
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
-
-if TYPE_CHECKING:
-    from training.embedding.run_embedding import Distractors
-    from training.fitting.protocol import Protocol
 
 
 class _TrainCommand(options.ManyFrames):
@@ -158,11 +154,10 @@ def train(
         raise InputError("paper and quick are given; expected one of them")
     if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
+    rendering = {"names": names, "azimuth-step": azimuth_step, "polar-step": polar_step}
+    for option, value in (rendering | {"mesh-scale": None if mesh_scale == 1 else mesh_scale}).items():
         if meshes is None and value is not None:
             raise InputError(f"{option} is {value}; expected only with --meshes: other views are not rendered")
-    if meshes is None and mesh_scale != 1:
-        raise InputError(f"mesh-scale is {mesh_scale:g}; expected only with --meshes: other views are not rendered")
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
@@ -177,7 +172,9 @@ def train(
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.model.classifier import FEATURES, check_features
     from thor2_jax.model.run_record import RUN_FILE
+    from training.embedding.run_embedding import Distractors
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
+    from training.objects.meshes import find_meshes
     from training.storage.workers import keep_freed_memory
     from training.train_job import TrainJob, run_train_job
 
@@ -185,7 +182,14 @@ def train(
     protocol = PAPER if paper else QUICK if quick else DEFAULT
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
     protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
-    others = _distractors(protocol, embedding, distractors, epochs, workers)
+    default = protocol.distractors or Distractors()
+    if embedding is None:
+        embedding = 0 if protocol.distractors is None else default.procedural
+    others = None
+    if embedding or distractors is not None:
+        found = {} if distractors is None else find_meshes(distractors)
+        passes = default.epochs if epochs is None else epochs
+        others = dataclasses.replace(default, procedural=embedding, meshes=found, epochs=passes, workers=workers)
     features = protocol.classifiers if others is not None else FEATURES
     if classifiers is not None:
         features = check_features(options.split_names(classifiers), "classifiers")
@@ -215,19 +219,3 @@ def train(
         model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
         frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
         finish(f"{written} {directory}", "recognize a frame", "recognize", "--model", model, *frame)
-
-
-def _distractors(
-    protocol: "Protocol", procedural: int | None, meshes: Path | None, epochs: int | None, workers: int
-) -> "Distractors | None":
-    """Return the distractors of the protocol with the given values; None fits no embedding."""
-    from training.embedding.run_embedding import Distractors
-    from training.objects.meshes import find_meshes
-
-    default = protocol.distractors or Distractors()
-    if procedural is None:
-        procedural = 0 if protocol.distractors is None else default.procedural
-    if procedural == 0 and meshes is None:
-        return None
-    found, passes = {} if meshes is None else find_meshes(meshes), default.epochs if epochs is None else epochs
-    return dataclasses.replace(default, procedural=procedural, meshes=found, epochs=passes, workers=workers)

@@ -1,13 +1,12 @@
 """`thor2 watch`: a live page with the recognized objects of a recording, a folder or a camera."""
 
 import contextlib
-import os
-import signal
+import functools
 import sys
-import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,9 +15,6 @@ from thor2_jax.printable import escape_characters
 from thor2_jax.recordings.topics import Topics
 from training.cli import options
 from training.cli.app import app, finish
-
-if TYPE_CHECKING:
-    from thor2_jax.frames.frames import RecordedFrame
 
 NOTICE_SECONDS = 1.0
 """Time that pages have to show an error before the server ends."""
@@ -50,14 +46,15 @@ def watch(
     A bag plays at the speed at which it was recorded; frames for which there is no time are left out. All frames of a
     folder are shown.
     """
-    with contextlib.ExitStack() as stack:
-        wait = stack.enter_context(_ctrl_c())
+    # The handler of `main` raises KeyboardInterrupt where JAX does not ignore it.
+    with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
+        from thor2_jax.frames.frames import RecordedFrame
         from thor2_jax.recordings.bags import Bag
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
         from thor2_jax.watch.live import LiveView, paced
         from thor2_jax.watch.server import Broadcast, serve_live
-        from training.frame_recognition import RecognizerArguments
+        from training.frame_recognition import RecognizerArguments, read_source
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in sources.items() if value is not None]
@@ -67,15 +64,17 @@ def watch(
         if bag is None and topics != Topics():
             raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
         segmenter = load_segmenter(segment or TABLE)
+        frames: Iterator[RecordedFrame]
         if folder is not None:
-            frames = _folder_frames(folder, relabel=segment is not None)
+            found = enumerate(options.FrameOptions([folder]).sources(segment))
+            frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in found)
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:
             opened = stack.enter_context(Bag(bag, topics))
             for note in opened.notes:
                 print(escape_characters(f"note: {note}"), file=sys.stderr)
-            frames = paced(opened.frames(), sleep=wait)
+            frames = paced(opened.frames())
         recognizer = RecognizerArguments(model, unknown_below, answer_by).load()
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
@@ -83,64 +82,14 @@ def watch(
         view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
         try:
             for recorded in frames:
-                if wait(0):
-                    return
                 view.show(recorded)
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
-            wait(NOTICE_SECONDS)
+            time.sleep(NOTICE_SECONDS)
             raise
         view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
         shown = f"no more frames, {view.n_frames} were recognized; Ctrl-C ends"
         source = [folder or "FRAME"] if bag is None else ["--bag", bag]
         finish(shown, "keep the names", "recognize", *source, "--model", model, "--out", "answers", file=sys.stderr)
-        wait(None)
-
-
-@contextlib.contextmanager
-def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
-    """Yield a function that waits for Ctrl-C, at most for some seconds, and returns whether it has been pressed.
-
-    Python's own handler raises an exception, which gets lost where JAX ignores those of its callbacks.
-    """
-    awaited = threading.Lock()  # Signal handlers may release it, but not set an Event.
-    awaited.acquire()
-
-    def press(*_: object) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        if awaited.locked():
-            awaited.release()
-        os.write(2, b"ending after this frame; Ctrl-C again ends at once\n")  # A handler may not print.
-
-    def wait(seconds: float | None) -> bool:
-        is_pressed = awaited.acquire(timeout=-1 if seconds is None else seconds)
-        if is_pressed:
-            awaited.release()
-        return is_pressed
-
-    previous = signal.getsignal(signal.SIGINT)
-    if previous is not signal.SIG_IGN:  # Background jobs ignore it.
-        signal.signal(signal.SIGINT, press)
-    try:
-        yield wait
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:
-    """Return the frames of a folder; with `relabel`, without their labels."""
-    import dataclasses
-    import functools
-
-    from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
-    from training.readers.frame_files import FrameSource, find_frames
-
-    def read(source: FrameSource) -> RGBDFrame:
-        try:
-            frame = source.read()
-        except OSError as error:
-            raise InputError(f"{error.filename}: {error.strerror or error}") from None
-        return dataclasses.replace(frame, labels=None) if relabel else frame
-
-    sources = find_frames([folder])
-    return (RecordedFrame(source.name, functools.partial(read, source), k) for k, source in enumerate(sources))
+        while True:
+            time.sleep(60)

@@ -150,21 +150,19 @@ def _check_unit(
 ) -> bool:
     """Check the unit of depth; return whether it is likely wrong."""
     extent = float(np.median(extents)) if extents else None
-    low, high = MIN_EXTENT, MAX_EXTENT
+    low, high, usual, of_meshes = MIN_EXTENT, MAX_EXTENT, USUAL_EXTENT, ""
     if mesh_sides:
         low, high = min(mesh_sides) / EXTENT_MARGIN, max(mesh_sides) * EXTENT_MARGIN
-    is_usual = MIN_ROOM <= median <= MAX_ROOM if extent is None else low <= extent <= high
-    if is_usual:
+        usual = float(np.median(mesh_sides))
+        of_meshes = f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
+    if MIN_ROOM <= median <= MAX_ROOM if extent is None else low <= extent <= high:
         return False
     is_metric = frame.depth.dtype.kind == "f"
     distance = _length(median) + ("" if is_metric else f" with depth_scale {frame.intrinsics.depth_scale:g}")
     measured = f"The median depth would be {distance}"
     if extent is not None:
-        measured = f"The objects would measure {_length(extent)} (median of their longest sides) at a distance of "
-        measured += distance
-        if mesh_sides:
-            measured += f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
-    usual = float(np.median(mesh_sides)) if mesh_sides else USUAL_EXTENT
+        size = f"{_length(extent)} (median of their longest sides)"
+        measured = f"The objects would measure {size} at a distance of {distance}{of_meshes}"
 
     def misfit(factor: float) -> float:
         """Return how badly depth times a factor fits, or infinity."""

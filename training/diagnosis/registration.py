@@ -13,7 +13,7 @@ from scipy import fft, ndimage
 
 from training.diagnosis.checks import Diagnosis
 
-__all__ = ["align_edges", "check_labels_alignment", "check_registration"]
+__all__ = ["check_labels_alignment", "check_registration"]
 
 MAX_SHIFT = 48
 """Largest shift that is searched, pixels of an image of 640 columns."""
@@ -38,7 +38,6 @@ MIN_GAIN = 1.25
 
 WIDTH = 640
 
-FLIPS = {"mirrored": (slice(None), slice(None, None, -1)), "upside down": (slice(None, None, -1), slice(None))}
 SCALES = (0.75, 0.8, 0.85, 0.9, 1.1, 1.15, 1.2, 1.25, 1.35)
 
 Field = NDArray[np.complex128]
@@ -115,12 +114,8 @@ def _spectrum(fixed: Field) -> Field:
     return fft.fft2(np.pad(fixed, MAX_SHIFT).astype(np.complex64), shape)
 
 
-def align_edges(moved: Field, fixed: Field) -> Alignment:
-    """Return the best shift of the edges `moved` [H, W] onto the edges `fixed` [H, W]."""
-    return _align(moved, _spectrum(fixed))
-
-
 def _align(moved: Field, spectrum: Field) -> Alignment:
+    """Return the best shift of the edges `moved` [H, W] onto those with this `_spectrum`."""
     n_edges, reach = int(np.count_nonzero(moved)), MAX_SHIFT
     product = spectrum * np.conj(fft.fft2(moved.astype(np.complex64), spectrum.shape))
     correlation = fft.ifft2(product)[: 2 * reach + 1, : 2 * reach + 1].real / max(n_edges, 1)
@@ -133,10 +128,10 @@ def _align(moved: Field, spectrum: Field) -> Alignment:
     return Alignment(right, down, peak, near, peak / spread, near / spread, n_edges)
 
 
-def _resized(image: NDArray[Any]) -> NDArray[Any]:
-    """Return an image with about `WIDTH` columns, by taking every n-th pixel."""
-    step = max(round(image.shape[1] / WIDTH), 1)
-    return image[::step, ::step]
+def _reduced(color: NDArray[np.uint8], other: NDArray[Any]) -> tuple[int, NDArray[np.uint8], NDArray[Any]]:
+    """Return n, and every n-th pixel of both images, which then have about `WIDTH` columns."""
+    step = max(round(color.shape[1] / WIDTH), 1)
+    return step, color[::step, ::step], other[::step, ::step]
 
 
 def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
@@ -149,8 +144,7 @@ def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
 
 def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: NDArray[np.floating[Any]]) -> None:
     """Check whether depth [H, W] is registered to colour [H, W, 3]."""
-    step = max(round(color.shape[1] / WIDTH), 1)
-    color, depth_m = _resized(color), _resized(depth_m)
+    step, color, depth_m = _reduced(color, depth_m)
     spectrum = _spectrum(color_edges(color))
     plain = _align(depth_edges(depth_m), spectrum)
     if plain.n_edges < MIN_EDGES:
@@ -158,8 +152,11 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
         return
     if plain.distance <= MAX_REGISTERED and plain.height >= MIN_PEAK:
         return
-    candidates = {name: depth_m[flip] for name, flip in FLIPS.items()}
-    candidates["rotated by 180 degrees"] = depth_m[::-1, ::-1]
+    candidates = {
+        "mirrored": depth_m[:, ::-1],
+        "upside down": depth_m[::-1],
+        "rotated by 180 degrees": depth_m[::-1, ::-1],
+    }
     candidates |= {f"enlarged by a factor of {1 / scale:.2f}": _zoomed(depth_m, scale) for scale in SCALES}
     alignments = {name: _align(depth_edges(each), spectrum) for name, each in candidates.items()}
 
@@ -184,8 +181,8 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
 
 def check_labels_alignment(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any]) -> None:
     """Check whether the borders of the instances [H, W] lie on edges of colour [H, W, 3]."""
-    step = max(round(color.shape[1] / WIDTH), 1)
-    alignment = align_edges(label_edges(_resized(labels)), color_edges(_resized(color)))
+    step, color, labels = _reduced(color, labels)
+    alignment = _align(label_edges(labels), _spectrum(color_edges(color)))
     if alignment.n_edges < MIN_EDGES or alignment.height < MIN_PEAK:
         return
     if alignment.distance > MAX_REGISTERED and alignment.peak >= MIN_GAIN * alignment.near:

@@ -160,12 +160,12 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
-def segmented_source(source: FrameSource, segmenter: Segmenter) -> FrameSource:
+def segmented_source(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> FrameSource:
     """Return a frame that is segmented when it is read; labels that it has are replaced."""
     return FrameSource(source.name, functools.partial(_read_segmented, source, segmenter))
 
 
-def _read_segmented(source: FrameSource, segmenter: Segmenter) -> RGBDFrame:
+def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> RGBDFrame:
     return segmented(source.read(), segmenter)
 
 

@@ -144,19 +144,14 @@ def _advice(explanation: Explanation) -> str:
 
 
 def _changes_text(explanation: Explanation) -> str:
-    if not explanation.changes:
-        return (
-            "No other answer was found: neither for colours shifted by up to half of their range, nor for sides from "
-            "half to twice as long."
-        )
     kinds = {"color": "A shift of all colours by", "extent": "A change of the box by"}
     sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
-    missing = {"color", "extent"} - {change.kind for change in explanation.changes}
-    if missing == {"color"}:
-        sentences.append("No shift of the colours by up to half of their range changes the answer.")
-    if missing == {"extent"}:
-        sentences.append("No change of the sides from half to twice their length changes the answer.")
-    return " ".join(sentences)
+    unchanged = {
+        "color": "No shift of the colours by up to half of their range changes the answer.",
+        "extent": "No change of the sides from half to twice their length changes the answer.",
+    }
+    changed = {change.kind for change in explanation.changes}
+    return " ".join([*sentences, *(text for kind, text in unchanged.items() if kind not in changed)])
 
 
 def _answer_table(answer: Recognition) -> Table:

@@ -9,6 +9,7 @@ import pytest
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.segmentation.table import segment_table
 from thor2_jax.service import preparation
@@ -62,7 +63,7 @@ def test_without_labels_of_a_segmenter_the_request_fails(
 ) -> None:
     monkeypatch.setattr(preparation, "_segmenter", lambda name: segmenter)
     with pytest.raises(RequestError, match=words) as caught:
-        preparation.prepare_frame(unlabelled, 2.5, False, segmenter and "chosen")
+        preparation.prepare_frame(unlabelled, DescriptorConfig(), False, segmenter and "chosen")
     assert (caught.value.status, caught.value.field) == (status, "labels")
 
 

@@ -1,6 +1,7 @@
 """`thor2 adapt`, and the commands that use the adapted run; the run's weights are random."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
-from training.camera_adaptation import write_adapted_run
 from training.evaluation.runs import load_runs
 from training.readers.frame_files import frame_files
 
@@ -97,9 +97,12 @@ def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, refu
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "unlabelled"]
 
 
-def test_a_device_in_a_run_is_not_copied(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "metrics.jsonl").symlink_to("/dev/zero")
-    adaptation = Adaptation(ColorTransform(), 12, 0.5, 0.4)
-    assert_refused("metrics", write_adapted_run, tmp_path / "run", adaptation, tmp_path / "out")
+def test_a_device_in_a_run_is_not_copied(
+    model: Path, video: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(model, tmp_path / "run")
+    (tmp_path / "run" / "curves.png").symlink_to("/dev/zero")
+    monkeypatch.setattr(Recognizer, "adapt", lambda *_: Adaptation(ColorTransform(), 12, 0.5, 0.4))
+    command = ("adapt", "--model", tmp_path / "run", video, "--out", tmp_path / "out", "--quiet")
+    assert "curves.png cannot be copied" in refused(*command)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -48,7 +48,7 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("explain '' --model m --out o", "the argument after explain is empty"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
         ("render --meshes m --out o --sensor --copies 0", "copies is 0; expected"),
-        ("render --meshes m --out o --sensor --crops 99999999", "crops is 99999999; expected"),
+        ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
     ):
         assert expected in refused(*shlex.split(command))
 
@@ -61,7 +61,7 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
         (("--bag", "b", "--color", "c.png"), "color is c.png and bag is b"),
         (("frames", "--every", 2), "every is 2; it belongs to --bag"),
         (("absent",), "absent"),
-        (("--color", "c.png"), "c.png" if command == "enroll mug" else "--depth"),
+        (("--color", "c.png"), "--depth"),
     ):
         assert expected in refused(*command.split(), *given, "--model", tmp_path / "run", *out)
 
@@ -72,12 +72,6 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
     line = capsys.readouterr().out
     assert line.startswith("done; see why with: thor2 explain ") and line.count("\n") == 1
     assert shlex.split(line)[-6:] == ["a b", "c", "--depth-scale", "100.0", "--max-gap", "0.5"]
-
-
-def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
-    (tmp_path / "a").symlink_to("b")
-    (tmp_path / "b").symlink_to("a")
-    assert str(tmp_path / "a") in refused("forget", "mug", "--model", tmp_path / "a")
 
 
 def test_version(printed: Command) -> None:
@@ -171,6 +165,8 @@ def test_ctrl_c_in_a_callback_of_jax() -> None:
 def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
+    with show_progress(quiet=True) as show:
+        show("render", 0, 10, "")
     with show_progress() as show:
         for done in range(41):
             show("describe", done, 40, "views")
@@ -202,13 +198,6 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
         ("fit thor", 1, 2, ""),
         ("stage 3 of 3: fit", 2, 4, "loss 1, about 38 s left of all stages"),
     ]
-
-
-def test_a_line_is_written_at_once_unless_quiet(capsys: pytest.CaptureFixture[str]) -> None:
-    for quiet, expected in ((False, "render: 0 of 10\n"), (True, "")):
-        with show_progress(quiet=quiet) as show:
-            show("render", 0, 10, "")
-            assert capsys.readouterr() == ("", expected)
 
 
 def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

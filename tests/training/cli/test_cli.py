@@ -205,6 +205,7 @@ def test_options_replace_values_of_the_protocols(
     assert job("--embedding", 0).protocol == replace(DEFAULT, classifiers=FEATURES, distractors=None)
     assert job("--paper").protocol == PAPER and PAPER.classifiers == FEATURES and PAPER.distractors is None
     assert (PAPER.fit.epochs, *PAPER.fit.learning_rates, PAPER.azimuth_step) == (100, 0.01, 0.001, 5)
+    assert (PAPER.fit.batch_size, len(PAPER.mirrors), PAPER.augmentations) == (128, 4, None)
     paper = job("--paper", "--embedding", 20, "--epochs", 3).protocol
     assert paper.distractors == replace(distractors, procedural=20, epochs=3) and paper.classifiers == FEATURES
     assert job("--folds", 3).protocol == replace(default, folds=3)
@@ -284,20 +285,6 @@ def test_rendered_views_are_kept_for_another_attempt(meshes: Path, tmp_path: Pat
     assert [p.name for p in out.iterdir()] == ["views"]
     last = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--embedding", 0)
     assert run_thor2(*command, *last) == 0
-
-
-@UNFITTED
-def test_paper_protocol(meshes: Path, views: Path, tmp_path: Path) -> None:
-    """The paper's protocol uses plain views in four mirrors; options replace values of the protocol."""
-    cases = {"paper": ("--meshes", meshes, "--paper", *STEPS), "default": ("--dataset", views, "--embedding", 0)}
-    for name, options in cases.items():
-        assert run_thor2("train", *options, "--out", tmp_path / name, "--epochs", 1, "--classifiers", "ce") == 0
-    of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
-    assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 2 * 3
-    assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
-    # Augmented copies with too few points are left out.
-    assert 5 * 3 * 2 * 3 < of["default"]["samples"] / 2 <= 6 * 3 * 2 * 3
-    assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
 def test_colornet(tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:

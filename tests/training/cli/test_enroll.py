@@ -142,20 +142,16 @@ def test_arguments_are_checked_before_anything_is_loaded(
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged.ply").write_text("ply")
     for arguments, text in (
-        (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
-        (("mug\u200b", "--frames", frames), "visible"),
         (("--mesh", tmp_path / "one.ply"), "name is missing"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
         (("mug", "--mesh", tmp_path / "damaged.ply"), "damaged.ply"),
         (("mug", "--mesh", tmp_path / "empty"), "no .glb"),
         (("mug", "--mesh", tmp_path / "two"), "none of a, b is 'mug'"),
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "--mesh-scale"),
-        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "extend and replace"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
-        (("mug", *one_frame(tmp_path / "absent", 1)), "absent"),
     ):
         assert text in refused("enroll", "--model", model, *arguments)
 
@@ -172,20 +168,13 @@ def test_names_that_are_invalid_are_skipped_and_few_views_noted(tmp_path: Path, 
     assert report["instances"]["no_class"] == {"unknown": 1} and report["instances"]["scored"] == 1
 
 
-def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, printed: Command, refused: Command) -> None:
+def test_a_lost_index_is_rebuilt_by_the_command(model: Path, printed: Command, refused: Command) -> None:
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
-    before = files_of(gallery)
-    for command in (("enroll", "new", *one_frame(frames / "000", 5)), ("objects",), ("forget", "brick")):
-        error = refused(*command, "--model", model)
-        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files_of(gallery) == before
+    for command in (("objects",), ("forget", "brick")):
+        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in refused(*command, "--model", model)
     table = printed("objects", "--reembed", "--model", model, "--gallery", gallery)
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table) for name in ("brick", "book"))
-    after = files_of(gallery)
-    assert all(after[name] == before[name] for name in before if name.startswith("objects/"))
-    assert run_thor2("enroll", "new", "--model", model, *one_frame(frames / "000", 5)) == 0
-    objects = Recognizer.load(model).gallery.objects
-    assert set(objects) == {"brick", "book", "new"} and len(objects["new"].clouds) == 1
 
 
 def test_a_gallery_outside_the_run_directory(
@@ -213,6 +202,8 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--frames", frames), "'new'", True),
         (("new", *frame_options(frames / "000")), "--instance", True),
         (("new", *one_frame(frames / "000", 4)), "instance is 4", True),
+        (("mug\u200b", "--frames", frames), "visible", True),
+        (("brick", "--frames", frames, "--extend", "--replace"), "extend and replace", True),
     ):
         assert words in refused("enroll", *given, "--model", model)
         if is_bad_for_any_run:

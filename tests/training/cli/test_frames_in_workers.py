@@ -14,8 +14,8 @@ from recording_files import table_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
-from training.frame_recognition import FRAMES_PER_CHUNK, RecognizerArguments, recognize_frames, recognize_frames_in_pool
+from training.evaluation.job import FRAMES_PER_CHUNK, answer_frames, answer_frames_in_pool, load_evaluated
+from training.frame_recognition import RecognizerArguments, recognize_frames
 from training.readers.frame_files import find_frames, segmented_source
 from training.readers.frames import FrameFolder
 from training.storage.workers import IN_PROCESS
@@ -38,14 +38,13 @@ def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_chunks_of_segmented_frames_have_the_same_answers(model: Path, tmp_path: Path) -> None:
+def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path: Path) -> None:
     arguments = RecognizerArguments(model)
     for number in range(2):
         write_frame_files(tmp_path / f"{number}", table_frame(3 * number))
-    segment = pickle.loads(pickle.dumps(arguments.segment))
-    sources = [segmented_source(source, segment) for source in find_frames([tmp_path])]
-    expected = list(recognize_frames(arguments.load(), sources))
-    answers = list(recognize_frames_in_pool(arguments, sources, IN_PROCESS))
+    sources = [segmented_source(source, arguments.segment) for source in find_frames([tmp_path])]
+    expected = list(recognize_frames(arguments.load().recognize, sources))
+    answers = [pickle.loads(pickle.dumps(arguments.answer))(source) for source in pickle.loads(pickle.dumps(sources))]
     assert [answer.as_json() for answer in answers] == [answer.as_json() for answer in expected]
     for one, other in zip(answers, expected, strict=True):
         assert one.frame is not None and other.frame is not None

@@ -96,8 +96,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --unknown-below 1.5", "unknown_below is 1.5"),
         ("frames --segment sam --out out", "error: segmenter is 'sam'"),
         ("frames --track --workers 2", "workers is 2"),
-        ("frames --address head:6379", "address is head:6379"),
-        ("frames --max-gap 0.1", "max_gap is 0.1; it belongs to --bag"),
         ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
         ("FILES --segment table --out out", "error: labels is "),
         ("FILES --out out --color absent.png", "absent.png"),

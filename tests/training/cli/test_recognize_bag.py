@@ -155,7 +155,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     for arguments, expected in (
         ("--coco c.json", "coco is c.json and bag is"),
         ("--workers 2", "workers is 2 and bag is"),
-        ("--engine ray", "engine is ray and bag is"),
         ("--out-bag a.bag", "expected an MCAP file"),
         ("--out-bag .", "which exists"),
         ("--out-bag none/a.mcap", "No such file"),
@@ -166,7 +165,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("--out-bag in.mcap/a.mcap", "a.mcap: Not a directory"),
         ("--depth-scale 0", "depth_scale is 0"),
         ("--max-gap 0.001 --out-bag out", "expected at most 0.001 s"),
-        ("--segment sam", "segmenter is 'sam'"),
         ("--rerun a.mcap", "the suffix .rrd"),
     ):
         assert expected in refused("recognize", "--model", model, "--bag", path, *arguments.split()), arguments

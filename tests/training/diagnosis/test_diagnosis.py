@@ -247,13 +247,10 @@ def test_units_of_meshes(tmp_path: Path) -> None:
 
 def copy_of(folder: Path, **contents: bytes) -> FrameFiles:
     """Copy a sample; `contents` replaces files by name."""
-    files = frame_files(SAMPLES / "crockery")
-    paths = {}
-    for field in dataclasses.fields(files):
-        source = getattr(files, field.name)
-        paths[field.name] = folder / source.name
-        paths[field.name].write_bytes(contents.get(field.name, source.read_bytes()))
-    return FrameFiles(**paths)
+    files = frame_files(Path(shutil.copytree(SAMPLES / "crockery", folder, dirs_exist_ok=True)))
+    for name, content in contents.items():
+        getattr(files, name).write_bytes(content)
+    return files
 
 
 def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:

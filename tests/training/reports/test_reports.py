@@ -64,12 +64,6 @@ def test_plots_draw_any_name(tmp_path: Path) -> None:
     assert plain_text("$x$ a\u202eb") == r"\$x\$ a\u202eb"
 
 
-def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
-    with pytest.raises(OSError):
-        plots.draw_curves({"ce": []}, tmp_path / "absent" / "curves.png")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
