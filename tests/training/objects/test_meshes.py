@@ -172,8 +172,8 @@ def test_damaged_lines_of_an_obj(tmp_path: Path) -> None:
     path.write_text(content)
     assert len(load_mesh(path).faces) == 1
     for line, other, message in (
-        ("vt 1.0 1.0", "vt 1.0", r"shape \(1, 3, 1\)"),
-        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"shape \(3, 2\)"),
+        ("vt 1.0 1.0", "vt 1.0", r"shape \(1,3,2\)"),
+        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"shape \(3,3\)"),
         ("v 0.1 0.1 0.0", "v", "cannot be read"),
         ("3/3", "9/3", "cannot be read|faces"),
     ):
