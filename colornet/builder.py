@@ -10,7 +10,7 @@ from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS, map_colors
 from colornet.network import ColorNetwork
 
-__all__ = ["build_network", "mean_color", "merge_redundant", "relabel", "similarity"]
+__all__ = ["build_network", "merge_redundant", "relabel", "similarity"]
 
 _MIN_SHARED = 0.95
 """Share of the smaller node's colours above which two nodes can be redundant."""
@@ -19,15 +19,14 @@ _MIN_SHARED = 0.95
 def build_network() -> ColorNetwork:
     """Build the colour network from the colour grid; the result is the same on every call."""
     colors = grid_colors()
-    graph = map_colors(to_lab(colors, GRID_WHITE))
-    members, region = merge_redundant(colors, graph.members, EPS)
+    nodes, *pairs = map_colors(to_lab(colors, GRID_WHITE))
+    members, region = merge_redundant(colors, nodes, EPS)
 
-    nerve = relabel(graph.nerve, region)
-    cyclic = relabel(graph.cyclic, region)
+    nerve, cyclic = (relabel(edges, region) for edges in pairs)
     edges = np.unique(np.concatenate([nerve, cyclic]), axis=0)
     in_nerve = (edges[:, None] == nerve).all(axis=-1).any(axis=1)
 
-    means = np.array([mean_color(colors, m) for m in members])
+    means = np.array([colors[rows].mean(axis=0) for rows in members])
     lab = to_lab(means, MEAN_WHITE)
     weights = hyab(lab[edges[:, 0]], lab[edges[:, 1]])
 
@@ -42,21 +41,8 @@ def build_network() -> ColorNetwork:
         cyclic=~in_nerve,
         similarity=similarity(len(members), edges, weights),
         region_bits=bits,
-        n_raw_nodes=len(graph.members),
+        n_raw_nodes=len(nodes),
     )
-
-
-def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the arithmetic mean of sRGB colours.
-
-    Args:
-        colors: [n, 3] uint8, sRGB.
-        members: [m] int64, the rows of `colors` to average.
-
-    Returns:
-        [3] float64, 0..255.
-    """
-    return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
 
 
 def merge_redundant(
@@ -77,7 +63,7 @@ def merge_redundant(
         int64.
     """
     n = len(members)
-    means = to_lab(np.array([mean_color(colors, m) for m in members]), MEAN_WHITE)
+    means = to_lab(np.array([colors[rows].mean(axis=0) for rows in members]), MEAN_WHITE)
     redundant = np.zeros((n, n), bool)
     for i in range(n):
         for j in range(i + 1, n):

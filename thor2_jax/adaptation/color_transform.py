@@ -1,8 +1,6 @@
 """A camera's colour transform: gamma, gain, saturation and warmth, which correct colours before recognition."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,6 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.run_record import stored_value
 
 __all__ = ["LUMA", "MAX_PARAMETER", "ColorTransform", "transform_colors"]
 
@@ -63,15 +60,6 @@ class ColorTransform:
                 f"color_transform is {values}; expected gamma, gain, saturation and warmth from {-MAX_PARAMETER} to "
                 f"{MAX_PARAMETER}: adapt the run again"
             )
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> "ColorTransform | None":
-        """Return the colour transform in the record of a run; None if it has none.
-
-        Raises:
-            InputError: it is damaged.
-        """
-        return stored_value(cls, "color_transform", record, "adapt the run again")
 
     def __call__(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the corrected colours of colours [..., 3] uint8 sRGB."""

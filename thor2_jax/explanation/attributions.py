@@ -74,14 +74,10 @@ class Attributions:
 
     Attributes:
         values: [n] float32; the margin lost with each point, to first order. Negative values speak against the answer.
-        steps: number of steps of the path that were averaged, one of `PATHS`.
-        smoothing: standard deviation of the average over neighbouring points, metres, one of `SMOOTHING`.
         faithfulness: exact check.
     """
 
     values: NDArray[np.float32]
-    steps: int
-    smoothing: float
     faithfulness: Faithfulness
 
 
@@ -175,12 +171,7 @@ def attribute_points(scores: ClassScores, cloud: OrientedCloud, instance: Prepar
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
-    return Attributions(
-        candidates[best].astype(np.float32),
-        PATHS[best % len(PATHS)],
-        SMOOTHING[best // len(PATHS)],
-        Faithfulness(float(margins[0]), float(losses[best]), random),
-    )
+    return Attributions(candidates[best], Faithfulness(float(margins[0]), float(losses[best]), random))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -188,8 +179,6 @@ class LeftOut:
     """Losses of the exact margin of an answer without each slice and each strip.
 
     Attributes:
-        slice_of: [n] int, slice of each point in the first look.
-        strip_of: [n] int, strip of each point.
         slices: [S] float32, loss without the slice; NaN if it is empty.
         strips: [S, J] float32, loss without the strip; NaN if it is empty.
         predicted: [S, J] float32, sum of the attributions of the strip; NaN if it is empty.
@@ -197,8 +186,6 @@ class LeftOut:
             there are fewer than three strips or all are equal.
     """
 
-    slice_of: NDArray[np.intp]
-    strip_of: NDArray[np.intp]
     slices: NDArray[np.float32]
     strips: NDArray[np.float32]
     predicted: NDArray[np.float32]
@@ -215,9 +202,9 @@ def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attribution
         attributions: [n] attributions of the points.
     """
     config, n = scores.config, len(attributions)
-    points = cloud.aligned.points[0, :n]
-    numbers = slices_and_strips(points[:, 0], points[:, 2], cloud.aligned.mask[0, :n], config)
-    slice_of, strip_of = (np.asarray(number).astype(np.intp) for number in numbers)
+    x, _, z = cloud.aligned.points[0, :n].T
+    numbers = slices_and_strips(x, z, cloud.aligned.mask[0, :n], config)
+    slice_of, strip_of = (np.asarray(number) for number in numbers)
     inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
     cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])
@@ -233,4 +220,4 @@ def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attribution
     varies = len(cells) > 2 and np.ptp(predicted[cells]) > 0 and np.ptp(strips[cells]) > 0
     agreement = float(spearmanr(predicted[cells], strips[cells]).statistic) if varies else None
     grid = config.n_slices, config.n_strips
-    return LeftOut(slice_of, strip_of, slices, strips.reshape(grid), predicted.reshape(grid), agreement)
+    return LeftOut(slices, strips.reshape(grid), predicted.reshape(grid), agreement)

@@ -95,7 +95,7 @@ class ClassScores:
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
             clouds = pack_instances(rows, ROWS, capacity)
-            return self._with_colors(describe_looks(clouds, self.network, self.config, self.count), clouds)
+            return describe_looks(clouds, self.network, self.config, self.count).with_balanced(clouds)
 
         return self._of_rows(instances, describe)
 
@@ -120,10 +120,7 @@ class ClassScores:
     ) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
         first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        return self._with_colors(describe_aligned_looks(aligned, weights, cut, self.network, config), first)
-
-    def _with_colors(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
-        return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
+        return describe_aligned_looks(aligned, weights, cut, self.network, config).with_balanced(first)
 
     def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
         """Return the scores [B, n] of items, described `ROWS` at a time."""

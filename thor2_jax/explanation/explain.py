@@ -241,12 +241,11 @@ def _scores_of(model: Model, name: str) -> ClassScores:
 
 
 def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
-    shown = jax.tree.map(lambda a: a[:1], cloud.aligned)
-    cut = strips(shown, scores.network, scores.config)
+    cut = strips(jax.tree.map(lambda a: a[:1], cloud.aligned), scores.network, scores.config)
     diagrams = diagrams_of_strips(cut, scores.config)
     images = describe_strips(cut, scores.network, scores.config).images
-    first = jax.tree.map(lambda a: np.asarray(a[0]), (shown.points, diagrams, images, cut.color))
-    return DescribedSlices(first[0][:n], *first[1:])
+    first = jax.tree.map(lambda a: np.asarray(a[0]), (diagrams, images, cut.color))
+    return DescribedSlices(np.asarray(cloud.aligned.points[0, :n]), *first)
 
 
 def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:

@@ -25,6 +25,7 @@ from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy, check_answer_by
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.model.run_record import stored_value
 
 __all__ = ["Model"]
 
@@ -72,7 +73,7 @@ class Model:
         """
         wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
         classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
-        transform = ColorTransform.of_record(run.record)
+        transform = stored_value(ColorTransform, "color_transform", run.record, "adapt the run again")
         return cls(
             run, classifiers, unknown_below=unknown_below, rule=rule, answer_by=wanted, color_transform=transform
         )

@@ -29,7 +29,6 @@ __all__ = [
     "embedding_rounding",
     "image_lipschitz",
     "image_rounding",
-    "joined",
     "map_points",
     "taken",
     "with_points",
@@ -138,7 +137,9 @@ def assert_within(
     assert (off <= bound).all(), f"{name}: off by {off.max():.3g}; expected at most {np.max(bound):.3g}"
 
 
-def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float = 0.0) -> None:
+def assert_near(
+    actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None = 0.0
+) -> None:
     """Assert that descriptors are equal up to rounding, if each aligned point moved by at most `drift` in its strip.
 
     Births and counts are then equal, and each persistence changes by at most 2 `drift`. An image, summed over its
@@ -149,8 +150,10 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
         actual: descriptors.
         expected: descriptors with a non-negative similarity.
         config: the config of both.
-        drift: scaled units.
+        drift: scaled units; None requires equal bits.
     """
+    if drift is None:
+        return assert_equal(actual, expected)
     np.testing.assert_array_equal(actual.overflow, expected.overflow, err_msg="overflow")
     images = np.asarray(expected.images, np.float64)
     persistence = images.sum(axis=(-2, -1)) / 0.47
@@ -160,15 +163,10 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
     assert_within("embeddings", actual.embeddings, colors, 2 * embedding_rounding(colors.shape[-2]) * np.abs(colors))
 
 
-def map_points(function: Callable[..., jax.Array], *batches: PointClouds) -> PointClouds:
-    """Return the first batch with the result of a function of each array that has an entry for every point."""
+def map_points(function: Callable[[jax.Array], jax.Array], clouds: PointClouds) -> PointClouds:
+    """Return clouds with the result of a function of each array that has an entry for every point."""
     names = ("points", "colors", "mask", "boundary")
-    return dataclasses.replace(batches[0], **{name: function(*(getattr(b, name) for b in batches)) for name in names})
-
-
-def joined(*batches: PointClouds) -> PointClouds:
-    """Unite the points of batches: cloud b has the points of cloud b of each batch."""
-    return map_points(lambda *arrays: jnp.concatenate(arrays, axis=1), *batches)
+    return dataclasses.replace(clouds, **{name: function(getattr(clouds, name)) for name in names})
 
 
 def taken(clouds: PointClouds, order: NDArray[np.intp]) -> PointClouds:

@@ -1,4 +1,4 @@
-"""Invariances of descriptors and of instance clouds: one assertion for each, for any function that computes them.
+"""Laws of descriptors and of instance clouds: one assertion for each, for any function that computes them.
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
@@ -7,34 +7,47 @@
 Each docstring states whether the property holds bit by bit. Otherwise the assertion takes a `drift`, the distance by
 which rounding may move an aligned point (`alignment_drift`), from which the bounds on images and embeddings follow
 (`assert_near`). The default `drift=None`, for functions of aligned clouds, requires equal bits.
+
+`reference_descriptor` computes the equations in NumPy and float64; `assert_follows_equations` compares with it.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
-from colornet import ColorNetwork
+from colornet import ColorNetwork, grid_index
+from colornet.grid import grid_colors
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.instance_clouds import InstanceCloud
-from thor2_jax.testing.comparing import UNIT, assert_equal, assert_near, joined, map_points, taken, with_points
-from thor2_jax.testing.strategies import settled
-from thor2_jax.types import Descriptors, PointClouds, Strips
+from thor2_jax.testing.comparing import (
+    UNIT,
+    assert_equal,
+    assert_near,
+    assert_within,
+    cloud_of,
+    embedding_rounding,
+    image_lipschitz,
+    image_rounding,
+    map_points,
+    taken,
+    with_points,
+)
+from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
-    "assert_backends_agree",
     "assert_batch_size_invariant",
     "assert_company_invariant",
     "assert_depth_units_agree",
     "assert_duplicates_count_twice",
-    "assert_flip_follows_rule",
+    "assert_follows_equations",
     "assert_labels_are_names",
-    "assert_mirrored_strips",
     "assert_object_unity",
     "assert_padding_invariant",
     "assert_permutation_invariant",
@@ -42,17 +55,11 @@ __all__ = [
     "assert_same_regions_alike",
     "assert_scale_invariant",
     "assert_translation_invariant",
+    "reference_descriptor",
 ]
 
 Describe = Callable[[PointClouds], Descriptors]
 InstanceClouds = Callable[[RGBDFrame], Sequence[InstanceCloud]]
-
-
-def _compare(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
-    if drift is None:
-        assert_equal(actual, expected)
-    else:
-        assert_near(actual, expected, config, drift)
 
 
 def assert_permutation_invariant(
@@ -64,7 +71,7 @@ def assert_permutation_invariant(
     2^24, exact in any order. In view normalization the order of sums changes the last bits.
     """
     order = np.argsort(np.random.default_rng(seed).random(clouds.mask.shape), axis=1)
-    _compare(describe(taken(clouds, order)), describe(clouds), config, drift)
+    assert_near(describe(taken(clouds, order)), describe(clouds), config, drift)
 
 
 def assert_padding_invariant(
@@ -181,7 +188,7 @@ def assert_duplicates_count_twice(
     """Assert that duplicating every point keeps the images and doubles the embeddings.
 
     Holds bit by bit for functions of aligned clouds: extremes stay, and doubled counts double every sum and product
-    exactly. Overflow counts points as well as pairs, and is left to `assert_overflow_told`.
+    exactly. Overflow counts points as well as pairs, and is not compared.
 
     Args:
         describe: any function with the paper's convention; the released one divides by the number of points.
@@ -189,24 +196,10 @@ def assert_duplicates_count_twice(
         config: config of the descriptor.
         drift: drift of the alignment, if `describe` aligns.
     """
-    half = clouds.mask.shape[1] // 2
-    if np.asarray(clouds.mask[:, half:]).any():
-        raise ValueError(
-            f"clouds has points beyond half of the capacity, {half}; expected clouds that are at most half full"
-        )
-    first = taken(clouds, np.arange(half))
-    once, twice = describe(clouds), describe(joined(first, first))
+    half = np.arange(clouds.mask.shape[1] // 2)
+    once, twice = describe(clouds), describe(taken(clouds, np.tile(half, 2)))
     halved = dataclasses.replace(twice, embeddings=twice.embeddings / 2, overflow=once.overflow)
-    _compare(halved, once, config, drift)
-
-
-def assert_backends_agree(first: Describe, second: Describe, clouds: PointClouds) -> None:
-    """Assert that the closed form and gudhi give equal descriptors on every input, bit by bit.
-
-    gudhi returns indices, from which both take the same values. Within one larger program, XLA may fuse differently
-    around the callback; compare the stages separately in this case.
-    """
-    assert_equal(second(clouds), first(clouds))
+    assert_near(halved, once, config, drift)
 
 
 def assert_same_regions_alike(describe: Describe, clouds: PointClouds, network: ColorNetwork, seed: int) -> None:
@@ -217,10 +210,9 @@ def assert_same_regions_alike(describe: Describe, clouds: PointClouds, network: 
     rng = np.random.default_rng(seed)
     _, of_color, counts = np.unique(network.region_bits, return_inverse=True, return_counts=True)
     by_set, first = np.argsort(of_color, kind="stable"), np.cumsum(counts) - counts
-    levels = (np.floor(np.asarray(clouds.colors) * 255 + 0.5).astype(np.int64) + 2) // 5
-    region_set = of_color[(levels[..., 0] * 52 + levels[..., 1]) * 52 + levels[..., 2]]
+    region_set = of_color[grid_index(np.floor(np.asarray(clouds.colors) * 255 + 0.5).astype(np.uint8))]
     other = by_set[first[region_set] + (rng.random(region_set.shape) * counts[region_set]).astype(np.int64)]
-    rgb = np.stack([other // 52**2, other // 52 % 52, other % 52], axis=-1) * 5
+    rgb = grid_colors()[other].astype(np.int64)
     # Every 8-bit colour within two steps of a grid colour has its regions.
     rgb = np.clip(rgb + rng.integers(-2, 3, rgb.shape), 0, 255)
     recolored = dataclasses.replace(clouds, colors=jnp.asarray(rgb, jnp.float32) / np.float32(255))
@@ -234,7 +226,7 @@ def assert_object_unity(describe: Describe, aligned: PointClouds, config: Descri
 
     Args:
         describe: function of aligned clouds, with the paper's convention.
-        aligned: `settled` clouds.
+        aligned: clouds of `aligned_clouds`.
         config: config of the descriptor.
         m: first slice that is removed.
     """
@@ -244,83 +236,6 @@ def assert_object_unity(describe: Describe, aligned: PointClouds, config: Descri
         whole, cut = (np.asarray(getattr(d, name)) for d in (expected, descriptors))
         np.testing.assert_array_equal(cut[:, :m], whole[:, :m], err_msg=name)
         assert not cut[:, m:].any(), f"{name} of removed slices"
-
-
-def assert_flip_follows_rule(
-    normalize: Callable[[PointClouds], PointClouds], clouds: PointClouds, seed: int
-) -> NDArray[np.int64]:
-    """Assert that a cloud is turned by pi about z exactly if its first two x-bins hold more boundary points.
-
-    The points are counted in NumPy on the cloud normalized without a boundary. The turned cloud equals that cloud
-    mirrored in x and y, up to rounding by 8 units of the sides of the box. Boundary points are drawn on both ends, none
-    within 1e-4 of the border of a bin; clouds whose last bin is ambiguous by as little are skipped.
-
-    Args:
-        normalize: `view_normalize` with a config.
-        clouds: any clouds without a boundary.
-        seed: seed for the boundary points.
-
-    Returns:
-        [B]: 1 flipped, 0 not flipped, -1 skipped.
-    """
-    rng = np.random.default_rng(seed)
-    normal = normalize(clouds)
-    points, mask = np.asarray(normal.points, np.float64), np.asarray(normal.mask)
-    x = points[..., 0] / OCCLUSION_BIN
-    last = np.floor(x.max(axis=1, initial=0))
-    clear = np.abs(x - np.round(x)) > 1e-4 / OCCLUSION_BIN
-    end = np.where(rng.random((len(mask), 1)) < 0.5, x <= 2, x >= last[:, None] - 1)
-    boundary = mask & clear & (end | (rng.random(mask.shape) < 0.1)) & (rng.random(mask.shape) < 0.7)
-    bins = np.floor(x)
-    flips = (boundary & (bins <= 1)).sum(axis=1) > (boundary & (bins >= last[:, None] - 1)).sum(axis=1)
-    with_boundary = normalize(dataclasses.replace(clouds, boundary=jnp.asarray(boundary)))
-    sides = points.max(axis=1, keepdims=True)
-    turned = np.where(mask[..., None], sides * [1, 1, 0] - points * [1, 1, -1], 0)
-    longest = x.max(axis=1)
-    ambiguous = (longest > 0.5) & (np.abs(longest - np.round(longest)) <= 1e-4 / OCCLUSION_BIN)
-    for b in np.flatnonzero(~ambiguous):
-        expected = turned[b] if flips[b] else points[b]
-        np.testing.assert_allclose(with_boundary.points[b], expected, rtol=0, atol=8 * UNIT * float(sides[b].max()))
-    return np.where(ambiguous, -1, flips)
-
-
-def assert_mirrored_strips(
-    strips: Callable[[PointClouds], Strips], aligned: PointClouds, config: DescriptorConfig, axis: str
-) -> None:
-    """Assert that mirroring reverses the strips (x) or the slices (z), or exchanges low and high (y).
-
-    Clouds are mirrored in x and z about the middle of the grid of slices and strips. Holds bit by bit except for y,
-    whose extremes are rounded twice, 2 units of the height of the cloud.
-
-    Args:
-        strips: function of aligned clouds.
-        aligned: clouds within the grid of slices and strips.
-        config: config of the descriptor, with the paper's convention.
-        axis: "x", "y" or "z".
-    """
-    k = "xyz".index(axis)
-    points = np.asarray(aligned.points, np.float64)
-    mask = np.asarray(aligned.mask)[..., None]
-    # Mirrored, points on the border at 0 would leave the grid; they are settled like the others.
-    spread = np.stack([settled(p + [1e-9, 0, 1e-9], config) for p in points])
-    height = float(np.where(mask, points, 0).max(initial=0))
-    size = (config.n_strips * config.sigma_2, height, config.n_slices * config.sigma_1)[k]
-    plain = strips(with_points(aligned, spread))
-    flipped = spread.copy()
-    flipped[..., k] = size - spread[..., k]
-    mirrored = strips(with_points(aligned, flipped))
-    if axis == "y":
-        low, high = (np.where(plain.occupied, size - np.asarray(a, np.float64), 0) for a in (plain.high, plain.low))
-        expected = plain
-    else:
-        reversed_axis = 2 if axis == "x" else 1
-        expected = jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain)
-        low, high = (np.asarray(a) for a in (expected.low, expected.high))
-    for name in ("occupied", "color", "overflow"):
-        np.testing.assert_array_equal(getattr(mirrored, name), getattr(expected, name), err_msg=name)
-    atol = 2 * UNIT * size if axis == "y" else 0
-    np.testing.assert_allclose(mirrored.low, low, rtol=0, atol=atol)
-    np.testing.assert_allclose(mirrored.high, high, rtol=0, atol=atol)
 
 
 def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
@@ -341,3 +256,86 @@ def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) 
     for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
         for name in ("reason", "points", "colors"):
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+
+
+class Reference(NamedTuple):
+    """The reference descriptor of one cloud.
+
+    Attributes:
+        images: [S, P, P].
+        embeddings: [S, R, J].
+        persistence: [S, J], 0 for empty strips.
+        overflow: number of points outside plus number of strips whose persistence exceeds the window.
+    """
+
+    images: NDArray[np.float64]
+    embeddings: NDArray[np.float64]
+    persistence: NDArray[np.float64]
+    overflow: int
+
+
+def _cells(points: NDArray[np.floating], config: DescriptorConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the slice and strip of each point [n, 3] of an aligned cloud; numbers may lie outside the descriptor."""
+    x, _, z = points.astype(np.float64).T
+    if config.convention == "released":
+        level, edges = np.round(z, 1), np.arange(config.n_strips) * config.sigma_2
+        return np.searchsorted(np.unique(level), level), np.digitize(np.round(x, 2), edges, right=True)
+    i, j = (np.clip(np.floor(at / width), -1, 2**31) for at, width in ((z, config.sigma_1), (x, config.sigma_2)))
+    return i.astype(np.int64), j.astype(np.int64)
+
+
+def reference_descriptor(
+    points: NDArray[np.floating], rgb: NDArray[np.uint8], network: ColorNetwork, config: DescriptorConfig
+) -> Reference:
+    """Compute the hard descriptor of one aligned cloud in NumPy and float64.
+
+    Args:
+        points: [n, 3], scaled units, first octant.
+        rgb: [n, 3].
+        network: the colour network.
+        config: of either convention, without relaxation.
+    """
+    i, j = _cells(points, config)
+    y = points[:, 1].astype(np.float64)
+    released = config.convention == "released"
+    y = np.round(y, 2) if released else y
+    weights = network.membership(rgb).astype(np.float64)
+    shape = (config.n_slices, config.n_strips)
+    images = np.zeros((shape[0], config.image_size, config.image_size))
+    embeddings = np.zeros((shape[0], network.n_regions, shape[1]))
+    persistence, edges = np.zeros(shape), (np.arange(config.image_size + 1) - 1) * config.sigma_2
+    inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1])
+    for a, b in set(zip(i[inside].tolist(), j[inside].tolist(), strict=True)):
+        here = (i == a) & (j == b)
+        persistence[a, b] = np.ptp(y[here])
+        centres = (b * config.sigma_2, persistence[a, b])
+        births, deaths = (np.diff(ndtr((edges - centre) / np.sqrt(config.image_variance))) for centre in centres)
+        images[a] += persistence[a, b] ** config.persistence_weight * np.outer(births, deaths)
+        embeddings[a, :, b] = weights[here].sum(axis=0) / (here.sum() if released else 1) @ network.similarity
+    overflow = int((~inside).sum()) + int((persistence > config.window).sum())
+    return Reference(images, embeddings, persistence, overflow)
+
+
+def assert_follows_equations(
+    describe: Describe, aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
+) -> None:
+    """Assert that descriptors equal those of `reference_descriptor` up to rounding.
+
+    Holds for every cloud in the released convention and for `aligned_clouds` in the paper's convention: a quotient
+    rounded to float32 can cross the border of a strip. Coordinates below 2 add 2 units to the error of a persistence.
+
+    Args:
+        describe: function of aligned clouds.
+        aligned: aligned clouds.
+        network: the colour network.
+        config: without relaxation.
+    """
+    descriptors = describe(aligned)
+    for b in range(aligned.mask.shape[0]):
+        expected = reference_descriptor(*cloud_of(aligned, b), network, config)
+        assert int(descriptors.overflow[b]) == expected.overflow
+        drift = 8 * UNIT * image_lipschitz(expected.persistence, config).sum(axis=-1)
+        bound = image_rounding(expected.persistence.sum(axis=-1), config) + drift
+        assert_within("images", descriptors.images[b], expected.images, bound, summed=(-2, -1))
+        bound = 2 * embedding_rounding(network.n_regions) * expected.embeddings
+        assert_within("embeddings", descriptors.embeddings[b], expected.embeddings, bound)

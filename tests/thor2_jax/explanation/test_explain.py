@@ -177,9 +177,6 @@ def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: Cla
         each = dataclasses.replace(oriented.each, **blanked)
         expected = float(margin(oriented) - margin(dataclasses.replace(oriented, each=each)))
         assert left.slices[number] == pytest.approx(expected, abs=1e-3)
-    aligned = np.asarray(thor2.align(pack_instances([instance], 1), SMALL_CONFIG).points[0])[: len(instance.points)]
-    np.testing.assert_array_equal(left.slice_of, np.floor(aligned[:, 2] / 0.1))
-    np.testing.assert_array_equal(left.strip_of, np.floor(aligned[:, 0] / 0.025))
     assert left.agreement is None  # all attributions are equal
 
 
