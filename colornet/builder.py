@@ -62,21 +62,16 @@ def merge_redundant(
         The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes]
         int64.
     """
-    n = len(members)
+    has = np.zeros((len(members), len(colors)))
+    for row, indices in zip(has, members, strict=True):
+        row[indices] = 1
+    shared, sizes = has @ has.T, has.sum(axis=1)
     means = to_lab(np.array([colors[rows].mean(axis=0) for rows in members]), MEAN_WHITE)
-    redundant = np.zeros((n, n), bool)
-    for i in range(n):
-        for j in range(i + 1, n):
-            shared = np.intersect1d(members[i], members[j], assume_unique=True).size
-            overlaps = shared > _MIN_SHARED * min(members[i].size, members[j].size)
-            redundant[i, j] = overlaps and hyab(means[i], means[j]) <= eps
-    n_regions, component = connected_components(csr_array(redundant), directed=False)
+    overlap = shared > _MIN_SHARED * np.minimum.outer(sizes, sizes)
+    n_regions, component = connected_components(overlap & (hyab(means[:, None], means) <= eps), directed=False)
     _, first = np.unique(component, return_index=True)
     region = np.argsort(np.argsort(first))[component].astype(np.int64)
-    merged = [
-        np.unique(np.concatenate([m for m, r in zip(members, region, strict=True) if r == k])) for k in range(n_regions)
-    ]
-    return merged, region
+    return [np.flatnonzero(has[region == k].any(axis=0)) for k in range(n_regions)], region
 
 
 def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:

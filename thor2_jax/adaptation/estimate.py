@@ -178,14 +178,13 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
         InputError: the frames have different sizes.
     """
     instances: list[PreparedInstance] = []
-    size: tuple[int, ...] = ()
+    first = ""
     for number, frame in enumerate(frames):
-        size = size or frame.depth.shape
-        if frame.depth.shape != size:
-            (height, width), (rows, columns) = frame.depth.shape, size
+        size = f"{frame.depth.shape[1]} x {frame.depth.shape[0]}"
+        first = first or size
+        if size != first:
             raise InputError(
-                f"frames[{number}] has {width} x {height} pixels; expected {columns} x {rows}, as the first frame: "
-                "adapt to one camera at a time"
+                f"frames[{number}] has {size} pixels; expected {first}, as the first: adapt to one camera at a time"
             )
         instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
     return instances

@@ -23,7 +23,7 @@ from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets, region_sets
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.descriptor.slicing import slices_and_strips
-from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
+from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
@@ -106,26 +106,24 @@ def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets,
     return flat
 
 
-def path_gradients(scores: ClassScores, cloud: OrientedCloud, index: int) -> NDArray[np.float32]:
+def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArray[np.float32]:
     """Return the gradients [STEPS, N] of the relaxed margin of a name with respect to the points' weights on the path.
 
     Args:
         scores: class scores.
-        cloud: the cloud.
+        looks: the looks at the instance, see `ClassScores.orient`.
         index: number of the name.
     """
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
     sets = region_sets(scores.network)
-    aligned = repeat_cloud(cloud.aligned, STEPS)
-    look_weights = jnp.tile(cloud.weights, (STEPS, 1))
+    repeated = repeat_cloud(looks, STEPS)
 
     def total(weights: jax.Array) -> jax.Array:
-        cut = _weighted_strips(cloud.aligned, weights, sets, config)
-        oriented = scores.describe(aligned, look_weights, cut, config)
+        oriented = scores.describe(repeated, _weighted_strips(looks, weights, sets, config), config)
         return scores.margin(scores.of_descriptors(oriented), index).sum()
 
     levels = (1 + (np.arange(STEPS) + 0.5) / STEPS) / 2
-    weights = np.repeat(levels[:, None], cloud.aligned.mask.shape[1], axis=1)
+    weights = np.repeat(levels[:, None], looks.mask.shape[1], axis=1)
     return np.asarray(jax.grad(total)(jnp.asarray(weights, jnp.float32)))
 
 
@@ -147,17 +145,17 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     return (sums[:, :-1] / sums[:, -1:]).T.astype(np.float32)
 
 
-def attribute_points(scores: ClassScores, cloud: OrientedCloud, instance: PreparedInstance, index: int) -> Attributions:
+def attribute_points(scores: ClassScores, looks: PointClouds, instance: PreparedInstance, index: int) -> Attributions:
     """Attribute the margin of a name to the points of an instance.
 
     Args:
         scores: class scores.
-        cloud: the looks at the instance, see `ClassScores.orient`.
+        looks: the looks at the instance, see `ClassScores.orient`.
         instance: the instance.
         index: number of the name in `scores.names`.
     """
     n = len(instance.points)
-    gradients = path_gradients(scores, cloud, index)[:, :n]
+    gradients = path_gradients(scores, looks, index)[:, :n]
     averages = np.stack([gradients[-count:].mean(axis=0) for count in PATHS])
     candidates = np.concatenate([smooth(instance.points, averages, deviation) for deviation in SMOOTHING])
     kept = np.ones((1 + len(candidates) + RANDOM_TENTHS, n), bool)
@@ -192,24 +190,24 @@ class LeftOut:
     agreement: float | None
 
 
-def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attributions: NDArray[np.float32]) -> LeftOut:
+def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions: NDArray[np.float32]) -> LeftOut:
     """Leave out each slice and each strip of an instance in turn.
 
     Args:
         scores: class scores.
-        cloud: the looks at the instance.
+        looks: the looks at the instance.
         index: number of the answer in `scores.names`.
         attributions: [n] attributions of the points.
     """
     config, n = scores.config, len(attributions)
-    x, _, z = cloud.aligned.points[0, :n].T
-    numbers = slices_and_strips(x, z, cloud.aligned.mask[0, :n], config)
+    x, _, z = looks.points[0, :n].T
+    numbers = slices_and_strips(x, z, looks.mask[0, :n], config)
     slice_of, strip_of = (np.asarray(number) for number in numbers)
     inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
     cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])
     masks = [np.ones(n, bool), *(slice_of != k for k in used_slices), *(cell_of != k for k in cells)]
-    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(cloud, np.array(masks))), index))
+    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(looks, np.array(masks))), index))
     losses = (margins[0] - margins[1:]).astype(np.float32)
 
     slices = np.full(config.n_slices, np.nan, np.float32)

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -25,13 +24,11 @@ __all__ = [
     "assert_equal",
     "assert_near",
     "assert_within",
-    "cloud_of",
     "embedding_rounding",
     "image_lipschitz",
     "image_rounding",
     "map_points",
     "taken",
-    "with_points",
 ]
 
 UNIT = 2.0**-24
@@ -106,19 +103,6 @@ def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
         reach = float(np.linalg.norm(centred, axis=1).max())
         worst = max(worst, 4 * (reach * (angle + 16 * UNIT) + off))
     return worst
-
-
-def with_points(clouds: PointClouds, points: NDArray[np.floating]) -> PointClouds:
-    """Replace the points [B, N, 3] of clouds, rounded to float32, with padding set to 0."""
-    kept = np.where(np.asarray(clouds.mask)[..., None], points, 0)
-    return dataclasses.replace(clouds, points=jnp.asarray(kept, jnp.float32))
-
-
-def cloud_of(clouds: PointClouds, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return points [n, 3] and 8-bit colours [n, 3] of one cloud, without padding."""
-    mask = np.asarray(clouds.mask[index])
-    colors = np.asarray(clouds.colors[index])[mask]
-    return np.asarray(clouds.points[index])[mask], np.floor(colors * 255 + 0.5).astype(np.uint8)
 
 
 def assert_equal(actual: Descriptors, expected: Descriptors) -> None:

@@ -118,12 +118,26 @@ def _download(address: str, archive: Path, name: str, progress: Progress | None)
 
 
 def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, also on an error."""
+    """Move the files of the archive to `directory / name` and remove the archive, also on an error.
+
+    The files are the regular ones in `google_16k`, under their last names. The archive is read to its end, so that the
+    checksum of gzip covers all of it.
+    """
+    total = 0
     try:
         with temporary_directory(directory) as temporary:
             folder = temporary / name
             folder.mkdir()
-            _extract_files(archive, folder)
+            with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
+                for member in content:
+                    path = PurePosixPath(member.name)
+                    total += member.size
+                    if total > MAX_BYTES:
+                        raise InputError(f"more than {MAX_BYTES:,} bytes")
+                    if member.isfile() and path.parent.name == "google_16k" and not path.name.startswith("."):
+                        content.extract(member.replace(name=path.name), folder, set_attrs=False, filter="data")
+                while stream.read(CHUNK_BYTES):
+                    pass
             load_mesh(folder / MESH_FILE)
             folder.chmod(0o755)
             folder.rename(directory / name)
@@ -136,22 +150,3 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         ) from None
     finally:
         archive.unlink()
-
-
-def _extract_files(archive: Path, folder: Path) -> None:
-    """Write the regular files in `google_16k` to a folder under their last names; links and other folders are left out.
-
-    The archive is read to its end, so that the checksum of gzip covers all of it.
-    """
-    total = 0
-    with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
-        for member in content:
-            path = PurePosixPath(member.name)
-            total += member.size
-            if total > MAX_BYTES:
-                raise InputError(f"more than {MAX_BYTES:,} bytes")
-            if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
-                continue
-            content.extract(member.replace(name=path.name), folder, set_attrs=False, filter="data")
-        while stream.read(CHUNK_BYTES):
-            pass

@@ -86,16 +86,13 @@ class _Placed:
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 
-SIDES = tuple(
-    np.array(turn, np.float64)
-    for turn in (
-        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-    )
-)
-"""Rotations [3, 3] that put each of the four sides down."""
+SIDES: Array = np.array([
+    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+], np.float64)  # fmt: skip
+"""Rotations [4, 3, 3] that put each of the four sides down."""
 
 
 def _rests(hull: Array) -> bool:

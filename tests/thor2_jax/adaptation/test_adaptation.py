@@ -75,7 +75,7 @@ def test_the_objective_is_the_entropy_of_the_answers() -> None:
     criterion = adaptation_criterion(recognizer.model)
     total = objective(made, criterion)
     for transform in (ColorTransform(), WARM):
-        corrected = [transform.corrected(each) for each in made]
+        corrected = [dataclasses.replace(each, colors=transform(each.colors)) for each in made]
         oriented = describe_looks(pack_instances(corrected, 16), criterion.network, criterion.config, 2)
         fused = recognizer.model.fused(class_probabilities(recognizer, oriented, ("tops", "tops2")))[: len(made)]
         expected = sum(scipy_entropy(row) for row in fused)

@@ -14,7 +14,7 @@ from scipy.special import logit
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.descriptor.looks import LookDescriptors, describe_aligned_looks, describe_looks
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.explanation import attributions, class_scores
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
@@ -183,14 +183,14 @@ def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: Cla
 def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> float:
     """Return the relaxed margin of name 1 with a weight for all points."""
     config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
-    cloud = scores.orient(instance)
-    aligned, weights = cloud.aligned, jnp.full(cloud.aligned.mask.shape[1], weight, jnp.float32)
+    aligned = scores.orient(instance)
+    weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
     constant = region_sets(NETWORK), config, jnp.zeros((), jnp.int32), weights
     cut = [
         relaxed_strips(aligned.points[k].T, aligned.colors[k], aligned.mask[k], *constant) for k in range(scores.count)
     ]
     together = jax.tree.map(lambda *a: jnp.stack(a), *cut)
-    oriented = describe_aligned_looks(aligned, cloud.weights[None], together, NETWORK, config)
+    oriented = scores.describe(aligned, together, config)
     return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
 
 
@@ -228,7 +228,7 @@ def test_points_of_the_decisive_color_are_found(instance: PreparedInstance, red:
     cloud = red.orient(instance)
     attributed = attributions.attribute_points(red, cloud, instance, 1)
     is_red = instance.colors[:, 0] > instance.colors[:, 2]
-    aligned = np.asarray(cloud.aligned.points[0])[: len(instance.points)]
+    aligned = np.asarray(cloud.points[0])[: len(instance.points)]
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
     assert attributed.values[is_red & inside].min() > 5 * np.abs(attributed.values[~is_red]).max()
     assert attributed.faithfulness.holds and attributed.faithfulness.most_attributed > 0
