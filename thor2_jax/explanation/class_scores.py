@@ -165,12 +165,13 @@ def classifier_scores(model: Model) -> ClassScores:
 def gallery_scores(model: Model) -> ClassScores:
     """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each.
 
+    Args:
+        model: at least one object is enrolled.
+
     Raises:
-        InputError: no object is enrolled, or the embedding's descriptor has the convention of the released code.
+        InputError: the embedding's descriptor has the convention of the released code.
     """
     objects = model.gallery.objects
-    if not objects:
-        raise InputError("no object is enrolled; enroll one, or train a run")
     embedding, each = model.embedding, [views.embeddings for views in objects.values()]
     views: Any = jnp.asarray(np.concatenate(each), jnp.float32)
     ends = np.cumsum([len(one) for one in each])

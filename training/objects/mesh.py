@@ -102,8 +102,6 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     Raises:
         InputError: Some meshes have textures and others corner colours.
     """
-    if len(parts) == 1:
-        return parts[0]
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(np.int32)

@@ -145,7 +145,7 @@ def _parsed(path: Path) -> TexturedMesh:
 
     try:
         # Processing would silently drop vertices that are not finite.
-        scene = trimesh.load_scene(path, resolver=Files(path), process=False)
+        scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing")
         parts = []
@@ -220,8 +220,6 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
         return _named(folder, scans)
-    if not names:
-        raise InputError("names is empty; expected at least one object")
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
@@ -266,17 +264,14 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read a table of object name -> scan from a JSON or YAML file.
+    """Read a table of object name -> scan from a file, JSON if its name ends with .json and YAML otherwise.
 
     Raises:
-        InputError: The file is missing, neither JSON nor YAML, empty, or not a flat table of strings.
+        InputError: The file is missing, damaged, empty, or not a flat table of strings.
         OSError: The file cannot be opened.
     """
-    path = Path(path)
     with with_context(f"names file {path}"):
-        if path.suffix.lower() not in (".json", ".yaml", ".yml"):
-            raise InputError("the extension must be .json, .yaml or .yml")
-        table = read_table(path)
+        table = read_table(Path(path))
         if not table:
             raise InputError("it is empty; expected a table of object name: scan")
         for name, scan in table.items():
