@@ -328,11 +328,6 @@ class OnlineAdaptation:
         self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)
         self._thread.start()
 
-    def join(self) -> None:
-        """Return when no estimate is running."""
-        if self._thread is not None:
-            self._thread.join()
-
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
             adaptation = estimate_transform(instances, self._criterion, capacity=CAPACITY)

@@ -13,7 +13,6 @@ which rounding may move an aligned point (`alignment_drift`), from which the bou
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -241,25 +240,9 @@ def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) 
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
 
 
-class Reference(NamedTuple):
-    """The reference descriptor of one cloud.
-
-    Attributes:
-        images: [S, P, P].
-        embeddings: [S, R, J].
-        persistence: [S, J], 0 for empty strips.
-        overflow: number of points outside plus number of strips whose persistence exceeds the window.
-    """
-
-    images: NDArray[np.float64]
-    embeddings: NDArray[np.float64]
-    persistence: NDArray[np.float64]
-    overflow: int
-
-
 def reference_descriptor(
     points: NDArray[np.floating], rgb: NDArray[np.uint8], network: ColorNetwork, config: DescriptorConfig
-) -> Reference:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
     """Compute the hard descriptor of one aligned cloud in NumPy and float64.
 
     Args:
@@ -267,6 +250,10 @@ def reference_descriptor(
         rgb: [n, 3].
         network: the colour network.
         config: of either convention, without relaxation.
+
+    Returns:
+        Images [S, P, P]; embeddings [S, R, J]; the persistence [S, J] of each strip, 0 for empty ones; and the overflow,
+        the number of points outside plus the number of strips whose persistence exceeds the window.
     """
     x, y, z = points.astype(np.float64).T
     released = config.convention == "released"
@@ -290,7 +277,7 @@ def reference_descriptor(
         images[a] += persistence[a, b] ** config.persistence_weight * np.outer(births, deaths)
         embeddings[a, :, b] = weights[here].sum(axis=0) / (here.sum() if released else 1) @ network.similarity
     overflow = int((~inside).sum()) + int((persistence > config.window).sum())
-    return Reference(images, embeddings, persistence, overflow)
+    return images, embeddings, persistence, overflow
 
 
 def assert_follows_equations(
@@ -310,10 +297,11 @@ def assert_follows_equations(
     descriptors = describe(aligned)
     for b, mask in enumerate(np.asarray(aligned.mask)):
         points, colors = (np.asarray(array[b])[mask] for array in (aligned.points, aligned.colors))
-        expected = reference_descriptor(points, np.floor(colors * 255 + 0.5).astype(np.uint8), network, config)
-        assert int(descriptors.overflow[b]) == expected.overflow
-        drift = 8 * UNIT * image_lipschitz(expected.persistence, config).sum(axis=-1)
-        bound = image_rounding(expected.persistence.sum(axis=-1), config) + drift
-        assert_within("images", descriptors.images[b], expected.images, bound, summed=(-2, -1))
-        bound = 2 * embedding_rounding(network.n_regions) * expected.embeddings
-        assert_within("embeddings", descriptors.embeddings[b], expected.embeddings, bound)
+        rgb = np.floor(colors * 255 + 0.5).astype(np.uint8)
+        images, embeddings, persistence, overflow = reference_descriptor(points, rgb, network, config)
+        assert int(descriptors.overflow[b]) == overflow
+        drift = 8 * UNIT * image_lipschitz(persistence, config).sum(axis=-1)
+        bound = image_rounding(persistence.sum(axis=-1), config) + drift
+        assert_within("images", descriptors.images[b], images, bound, summed=(-2, -1))
+        bound = 2 * embedding_rounding(network.n_regions) * embeddings
+        assert_within("embeddings", descriptors.embeddings[b], embeddings, bound)
