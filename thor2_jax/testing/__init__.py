@@ -12,13 +12,12 @@
         assert_permutation_invariant(describe, clouds, seed, config)
 
 Requires the extra `testing`: pip install -c constraints.txt '.[testing]'. All batches of a strategy have the same
-shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances (`comparing`).
+shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances.
 """
 
 from thor2_jax.testing import damage, laws, strategies
-from thor2_jax.testing.comparing import alignment_drift, assert_equal
 from thor2_jax.testing.damage import *
 from thor2_jax.testing.laws import *
 from thor2_jax.testing.strategies import *
 
-__all__ = ["alignment_drift", "assert_equal", *damage.__all__, *laws.__all__, *strategies.__all__]
+__all__ = [*damage.__all__, *laws.__all__, *strategies.__all__]

@@ -1,4 +1,4 @@
-"""Laws of descriptors and of instance clouds: one assertion for each, for any function that computes them.
+"""Laws of descriptors: one assertion for each, for any function that computes them.
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
@@ -7,44 +7,30 @@
 Each docstring states whether the property holds bit by bit. Otherwise the assertion takes a `drift`, the distance by
 which rounding may move an aligned point (`alignment_drift`), from which the bounds on images and embeddings follow
 (`assert_near`). The default `drift=None`, for functions of aligned clouds, requires equal bits.
-
-`reference_descriptor` computes the equations in NumPy and float64; `assert_follows_equations` compares with it.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from colornet import ColorNetwork, grid_index
 from colornet.grid import grid_colors
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import InstanceCloud
-from thor2_jax.testing.comparing import (
-    UNIT,
-    assert_equal,
-    assert_near,
-    assert_within,
-    embedding_rounding,
-    image_lipschitz,
-    image_rounding,
-    map_points,
-    taken,
-)
+from thor2_jax.descriptor.bounding_box import ROWS
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
+    "alignment_drift",
     "assert_batch_size_invariant",
     "assert_company_invariant",
-    "assert_depth_units_agree",
     "assert_duplicates_count_twice",
+    "assert_equal",
     "assert_follows_equations",
-    "assert_labels_are_names",
     "assert_object_unity",
     "assert_padding_invariant",
     "assert_permutation_invariant",
@@ -55,7 +41,134 @@ __all__ = [
 ]
 
 Describe = Callable[[PointClouds], Descriptors]
-InstanceClouds = Callable[[RGBDFrame], Sequence[InstanceCloud]]
+
+UNIT = 2.0**-24
+"""Unit roundoff u of float32. Tolerances bound the difference of two float32 computations of a quantity: a sum of n
+terms has a relative error of at most n u in any order, to first order in u (Higham, Accuracy and Stability of Numerical
+Algorithms, chapter 4)."""
+
+_TABLE_ERROR = 8 * UNIT
+"""Error of an entry of the tables of an image, half a difference of two error functions: erf in float32 is accurate to
+5 units, and the rounding of its argument, 3 units relative, adds 3 max z erf'(z) < 1.5."""
+
+
+def image_rounding(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
+    """Return a bound on the rounding error of an image, summed over its pixels.
+
+    A pixel is the sum over J pairs of weight x entry x entry. Over a row of P pixels the entries sum to at most 1, and
+    so do their errors to at most P table errors: 2 P of these a pair for both axes, and J + 2 units for the sum and the
+    products. Two computations differ by twice as much.
+
+    Args:
+        persistence: [...], sum of the weights of the pairs.
+        config: gives P and J.
+
+    Returns:
+        [...], as `persistence`.
+    """
+    return persistence * (2 * config.image_size * _TABLE_ERROR + (config.n_strips + 2) * UNIT)
+
+
+def image_lipschitz(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
+    """Return the largest change of an image, summed over its pixels, per change of the persistence of a pair.
+
+    The weight p changes by 1 and the Gaussian by the total variation of its shift, sqrt(2 / pi) / sigma, of which there
+    is p. The theorem for Gaussians of Adams et al. (JMLR 2017, "Stability of persistence surfaces and images") allows
+    births to move as well and bounds the change by sqrt(5) times as much for a move of 1 in the 1-Wasserstein distance.
+
+    Args:
+        persistence: [...], the larger persistence of each pair before and after the change.
+        config: gives the variance.
+    """
+    return 1 + np.sqrt(2 / np.pi / config.image_variance) * persistence
+
+
+def embedding_rounding(n_regions: int) -> float:
+    """Return the relative rounding error of an embedding of non-negative counts and similarities.
+
+    A product with the weights of at most 2^7 sets of regions, and one with the similarity; weights are rounded once.
+    """
+    return (2**7 + n_regions + 3) * UNIT
+
+
+def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
+    """Return the distance by which rounding may move an aligned point, between two poses or orders of the same clouds.
+
+    For `decided_clouds`, whose box has the principal axes. Rounded and scaled, a coordinate of size D is off by 2 u D:
+    a point by d = 2 sqrt(3) u D. So second moments, of largest eigenvalue l, are off by at most 2 d sqrt(l), and by the
+    rounding of their sums over N points, N / 16 + 16 u times the trace; the symmetric eigensolver adds some ten units.
+    An axis turns by at most sqrt(2) times that over the gap of the eigenvalues (Davis and Kahan), and a point at a
+    distance R by R times the angle, by d, and by the rounding of two rotations, 16 u R. The shift to the first octant
+    is that of some point, hence twice as much, and both computations may err: four times.
+
+    Args:
+        clouds: metres, in the pose farther from the origin.
+        config: gives sigma_s.
+    """
+    worst = 0.0
+    for points, mask in zip(np.asarray(clouds.points, np.float64), np.asarray(clouds.mask), strict=True):
+        scaled = points[mask] * config.sigma_s
+        centred = scaled - scaled.mean(axis=0)
+        values = np.linalg.eigvalsh(centred.T @ centred / len(centred))
+        off = 2 * np.sqrt(3) * UNIT * float(np.abs(scaled).max())
+        sums = (len(mask) / ROWS + ROWS + 10) * UNIT * float(values.sum())
+        angle = np.sqrt(2) * (2 * off * np.sqrt(values[2]) + sums) / float(np.diff(values).min())
+        reach = float(np.linalg.norm(centred, axis=1).max())
+        worst = max(worst, 4 * (reach * (angle + 16 * UNIT) + off))
+    return worst
+
+
+def assert_equal(actual: Descriptors, expected: Descriptors) -> None:
+    """Assert that descriptors are finite and equal bit by bit."""
+    for field in dataclasses.fields(Descriptors):
+        a, b = (np.asarray(getattr(d, field.name)) for d in (actual, expected))
+        assert np.isfinite(b).all(), f"{field.name}: {int((~np.isfinite(b)).sum())} numbers are not finite"
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+
+
+def assert_within(
+    name: str, actual: ArrayLike, expected: ArrayLike, bound: ArrayLike, summed: tuple[int, ...] = ()
+) -> None:
+    """Assert that arrays differ by at most `bound`, where absolute differences are summed over the axes `summed`."""
+    off = np.abs(np.asarray(actual, np.float64) - np.asarray(expected, np.float64)).sum(axis=summed)
+    assert (off <= bound).all(), f"{name}: off by {off.max():.3g}; expected at most {np.max(bound):.3g}"
+
+
+def assert_near(
+    actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None = 0.0
+) -> None:
+    """Assert that descriptors are equal up to rounding, if each aligned point moved by at most `drift` in its strip.
+
+    Births and counts are then equal, and each persistence changes by at most 2 `drift`. An image, summed over its
+    pixels, changes by that times its Lipschitz constant plus twice its rounding error; an embedding changes by rounding
+    only. The sum of persistences is estimated from the image, which has at least 0.47 of the mass of each pair.
+
+    Args:
+        actual: descriptors.
+        expected: descriptors with a non-negative similarity.
+        config: the config of both.
+        drift: scaled units; None requires equal bits.
+    """
+    if drift is None:
+        return assert_equal(actual, expected)
+    np.testing.assert_array_equal(actual.overflow, expected.overflow, err_msg="overflow")
+    images = np.asarray(expected.images, np.float64)
+    persistence = images.sum(axis=(-2, -1)) / 0.47
+    moved = 2 * drift * (config.n_strips - 1 + image_lipschitz(persistence, config))
+    assert_within("images", actual.images, images, moved + 2 * image_rounding(persistence, config), summed=(-2, -1))
+    colors = np.asarray(expected.embeddings, np.float64)
+    assert_within("embeddings", actual.embeddings, colors, 2 * embedding_rounding(colors.shape[-2]) * np.abs(colors))
+
+
+def map_points(function: Callable[[jax.Array], jax.Array], clouds: PointClouds) -> PointClouds:
+    """Return clouds with the result of a function of each array that has an entry for every point."""
+    names = ("points", "colors", "mask", "boundary")
+    return dataclasses.replace(clouds, **{name: function(getattr(clouds, name)) for name in names})
+
+
+def taken(clouds: PointClouds, order: NDArray[np.intp]) -> PointClouds:
+    """Select the points of each cloud with the indices `order`, [M] or [B, M]; cameras are unchanged."""
+    return map_points(lambda a: a[np.arange(len(a))[:, None], order], clouds)
 
 
 def assert_permutation_invariant(
@@ -220,26 +333,6 @@ def assert_object_unity(describe: Describe, aligned: PointClouds, config: Descri
         assert not cut[:, m:].any(), f"{name} of removed slices"
 
 
-def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
-    """Assert that other label numbers give the same clouds, bit by bit."""
-    numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
-    other = np.concatenate([[0], numbers]).astype(np.uint16)
-    clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=other[frame.label_image]))}
-    for cloud in instance_clouds(frame):
-        same = clouds.pop(int(other[cloud.label]))
-        for name in ("n_pixels", "kept_by_fallback", "reason", "points", "colors"):
-            np.testing.assert_array_equal(getattr(same, name), getattr(cloud, name), err_msg=name)
-    assert not clouds
-
-
-def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) -> None:
-    """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
-    other = dataclasses.replace(frame, depth=frame.depth_m)
-    for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
-        for name in ("reason", "points", "colors"):
-            np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
-
-
 def reference_descriptor(
     points: NDArray[np.floating], rgb: NDArray[np.uint8], network: ColorNetwork, config: DescriptorConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
@@ -252,8 +345,8 @@ def reference_descriptor(
         config: of either convention, without relaxation.
 
     Returns:
-        Images [S, P, P]; embeddings [S, R, J]; the persistence [S, J] of each strip, 0 for empty ones; and the overflow,
-        the number of points outside plus the number of strips whose persistence exceeds the window.
+        Images [S, P, P]; embeddings [S, R, J]; the persistence [S, J] of each strip, 0 for empty ones; and the number
+        of points outside plus the number of strips whose persistence exceeds the window.
     """
     x, y, z = points.astype(np.float64).T
     released = config.convention == "released"
