@@ -10,7 +10,7 @@ from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS, map_colors
 from colornet.network import ColorNetwork
 
-__all__ = ["build_network", "mean_color", "merge_redundant", "relabel", "similarity"]
+__all__ = ["build_network", "merge_redundant", "relabel", "similarity"]
 
 _MIN_SHARED = 0.95
 """Share of the smaller node's colours above which two nodes can be redundant."""
@@ -19,15 +19,14 @@ _MIN_SHARED = 0.95
 def build_network() -> ColorNetwork:
     """Build the colour network from the colour grid; the result is the same on every call."""
     colors = grid_colors()
-    graph = map_colors(to_lab(colors, GRID_WHITE))
-    members, region = merge_redundant(colors, graph.members, EPS)
+    nodes, *pairs = map_colors(to_lab(colors, GRID_WHITE))
+    members, region = merge_redundant(colors, nodes, EPS)
 
-    nerve = relabel(graph.nerve, region)
-    cyclic = relabel(graph.cyclic, region)
+    nerve, cyclic = (relabel(edges, region) for edges in pairs)
     edges = np.unique(np.concatenate([nerve, cyclic]), axis=0)
     in_nerve = (edges[:, None] == nerve).all(axis=-1).any(axis=1)
 
-    means = np.array([mean_color(colors, m) for m in members])
+    means = np.array([colors[rows].mean(axis=0) for rows in members])
     lab = to_lab(means, MEAN_WHITE)
     weights = hyab(lab[edges[:, 0]], lab[edges[:, 1]])
 
@@ -42,21 +41,8 @@ def build_network() -> ColorNetwork:
         cyclic=~in_nerve,
         similarity=similarity(len(members), edges, weights),
         region_bits=bits,
-        n_raw_nodes=len(graph.members),
+        n_raw_nodes=len(nodes),
     )
-
-
-def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the arithmetic mean of sRGB colours.
-
-    Args:
-        colors: [n, 3] uint8, sRGB.
-        members: [m] int64, the rows of `colors` to average.
-
-    Returns:
-        [3] float64, 0..255.
-    """
-    return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
 
 
 def merge_redundant(
@@ -76,21 +62,16 @@ def merge_redundant(
         The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes]
         int64.
     """
-    n = len(members)
-    means = to_lab(np.array([mean_color(colors, m) for m in members]), MEAN_WHITE)
-    redundant = np.zeros((n, n), bool)
-    for i in range(n):
-        for j in range(i + 1, n):
-            shared = np.intersect1d(members[i], members[j], assume_unique=True).size
-            overlaps = shared > _MIN_SHARED * min(members[i].size, members[j].size)
-            redundant[i, j] = overlaps and hyab(means[i], means[j]) <= eps
-    n_regions, component = connected_components(csr_array(redundant), directed=False)
+    has = np.zeros((len(members), len(colors)))
+    for row, indices in zip(has, members, strict=True):
+        row[indices] = 1
+    shared, sizes = has @ has.T, has.sum(axis=1)
+    means = to_lab(np.array([colors[rows].mean(axis=0) for rows in members]), MEAN_WHITE)
+    overlap = shared > _MIN_SHARED * np.minimum.outer(sizes, sizes)
+    n_regions, component = connected_components(overlap & (hyab(means[:, None], means) <= eps), directed=False)
     _, first = np.unique(component, return_index=True)
     region = np.argsort(np.argsort(first))[component].astype(np.int64)
-    merged = [
-        np.unique(np.concatenate([m for m, r in zip(members, region, strict=True) if r == k])) for k in range(n_regions)
-    ]
-    return merged, region
+    return [np.flatnonzero(has[region == k].any(axis=0)) for k in range(n_regions)], region
 
 
 def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -38,7 +38,9 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     axes = figure.add_axes((0.08, 0.07, 0.72, 0.88))
     plot_network(axes, network)
     axes.set_title(f"Colour network: {network.n_regions} regions, {len(network.edges)} edges")
-    sizes = [_legend_disc(count) for count in (100, 5_000, 20_000)]
+    disc: dict[str, Any] = {"linestyle": "", "marker": "o", "markerfacecolor": "white", "markeredgecolor": _TEXT_COLOR}
+    counts = (100, 5_000, 20_000)
+    sizes = [Line2D([], [], markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **disc) for count in counts]
     figure.legend(
         handles=sizes,
         title="grid colours",
@@ -119,11 +121,6 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
 def _area(counts: NDArray[np.int64] | int) -> NDArray[np.float64]:
     """Return the marker area in points squared; the smallest marker still holds a two-digit number."""
     return np.asarray(190 + 0.03 * np.asarray(counts, np.float64))
-
-
-def _legend_disc(count: int) -> Line2D:
-    style: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _TEXT_COLOR}
-    return Line2D([], [], linestyle="", markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **style)
 
 
 def _width(weight: float) -> float:

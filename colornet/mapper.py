@@ -6,8 +6,6 @@ exactly and sparsely: HyAB is never smaller than the Euclidean distance, so that
 contains every HyAB neighbour.
 """
 
-import dataclasses
-import re
 from typing import Any
 
 import kmapper
@@ -20,7 +18,7 @@ from sklearn.neighbors import sort_graph_by_row_values
 
 from colornet.lab import hyab
 
-__all__ = ["EPS", "HUE_SHIFT", "MIN_SAMPLES", "HyabDBSCAN", "MapperGraph", "hyab_neighbors", "lens", "map_colors"]
+__all__ = ["EPS", "HUE_SHIFT", "MIN_SAMPLES", "HyabDBSCAN", "hyab_neighbors", "lens", "map_colors"]
 
 HUE_SHIFT = np.pi / 8
 """Shift xi of the lens, which moves the cut of the hue circle away from the reds."""
@@ -33,23 +31,6 @@ MIN_SAMPLES = 6
 
 _N_CUBES = (3, 8)  # chroma, hue
 _OVERLAP = (0.10, 0.25)
-
-
-@dataclasses.dataclass(frozen=True)
-class MapperGraph:
-    """The graph that Mapper returns, before redundant nodes are merged.
-
-    Attributes:
-        names: kmapper's name of each node, in kmapper's order.
-        members: for each node, the sorted grid indices of its colours, int64 [n].
-        nerve: [e, 2] int64, pairs of nodes i < j that share a colour.
-        cyclic: [c, 2] int64, pairs of nodes i < j that are neighbours across the cut of the hue circle.
-    """
-
-    names: list[str]
-    members: list[NDArray[np.int64]]
-    nerve: NDArray[np.int64]
-    cyclic: NDArray[np.int64]
 
 
 def lens(lab: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -94,46 +75,36 @@ class HyabDBSCAN:
         return np.asarray(clusterer.fit_predict(graph), np.int64)
 
 
-def map_colors(lab: NDArray[np.float64]) -> MapperGraph:
+def map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDArray[np.int64], NDArray[np.int64]]:
     """Run Mapper on CIELAB colours, and connect the nodes across the cut of the hue circle.
 
     Args:
         lab: [n, 3] float64, the colours of the grid in CIELAB.
+
+    Returns:
+        For each node, in kmapper's order, the sorted grid indices of its colours, int64 [n]; the nerve [e, 2] int64,
+        pairs of nodes that share a colour; and pairs of nodes [c, 2] int64 that are neighbours across the cut.
     """
     values = lens(lab)
     cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=list(_OVERLAP))
     graph = kmapper.KeplerMapper(verbose=0).map(values, lab, clusterer=HyabDBSCAN(), cover=cover)
     names = list(graph["nodes"])
-    position = {name: k for k, name in enumerate(names)}
-    nerve = [sorted((position[i], position[j])) for i, others in graph["links"].items() for j in others]
-    return MapperGraph(
-        names=names,
-        members=[np.sort(np.asarray(graph["nodes"][name], np.int64)) for name in names],
-        nerve=_pairs(nerve),
-        cyclic=_pairs(_cyclic_pairs(names, cover, values)),
-    )
+    members = [np.sort(np.asarray(graph["nodes"][name], np.int64)) for name in names]
+    nerve = [(names.index(i), names.index(j)) for i, others in graph["links"].items() for j in others]
+    return members, np.array(nerve, np.int64), np.array(_cyclic_pairs(names, cover, values), np.int64)
 
 
-def _cyclic_pairs(names: list[str], cover: Any, values: NDArray[np.float64]) -> list[list[int]]:
+def _cyclic_pairs(names: list[str], cover: Any, values: NDArray[np.float64]) -> list[tuple[int, int]]:
     """Return all pairs of a node in the first and one in the last hue interval of the same chroma interval."""
-    # Names of nodes number non-empty cubes only; the position of a cube among all centres gives its intervals.
+    # Names of nodes (cube3_cluster0) number non-empty cubes only; the position of a cube among all centres gives its
+    # intervals.
     rows = np.column_stack([np.arange(len(values)), values])
     occupied = [k for k, center in enumerate(cover.centers_) if len(cover.transform_single(rows, center))]
-    intervals = [divmod(occupied[_cube_number(name)], _N_CUBES[1]) for name in names]
+    cubes = [int(name.removeprefix("cube").split("_")[0]) for name in names]
+    intervals = [divmod(occupied[cube], _N_CUBES[1]) for cube in cubes]
     return [
-        sorted((i, j))
+        (i, j)
         for i, (chroma_i, hue_i) in enumerate(intervals)
         for j, (chroma_j, hue_j) in enumerate(intervals)
         if chroma_i == chroma_j and hue_i == 0 and hue_j == _N_CUBES[1] - 1
     ]
-
-
-def _cube_number(name: str) -> int:
-    match = re.fullmatch(r"cube(\d+)_cluster\d+", name)
-    if match is None:
-        raise ValueError(f"kmapper returned a node {name!r}; expected cube<number>_cluster<number>")
-    return int(match[1])
-
-
-def _pairs(pairs: list[list[int]]) -> NDArray[np.int64]:
-    return np.array(sorted(pairs), np.int64).reshape(-1, 2)

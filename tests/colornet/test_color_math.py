@@ -8,7 +8,7 @@ from sklearn.cluster import DBSCAN
 
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, to_lab
-from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, _cube_number, hyab_neighbors, lens
+from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
@@ -71,9 +71,3 @@ def test_lens() -> None:
     values = lens(np.array([[50.0, 3.0, 4.0], [50.0, -1.0, 0.0], [0.0, 0.0, 0.0]]))
     expected = [[5.0, np.pi / 8 + np.arctan(4 / 3)], [1.0, np.pi / 8 + np.pi], [0.0, np.pi / 8]]
     np.testing.assert_allclose(values, expected, atol=1e-15)
-
-
-def test_unexpected_kmapper_node_names_are_rejected() -> None:
-    assert _cube_number("cube12_cluster3") == 12
-    with pytest.raises(ValueError, match="'cube_12'"):
-        _cube_number("cube_12")

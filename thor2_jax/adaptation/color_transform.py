@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["LUMA", "MAX_PARAMETER", "ColorTransform", "transform_colors"]
 
@@ -69,7 +68,3 @@ class ColorTransform:
         values = powers[colors] * np.exp(gain + warmth * np.array([1, 0, -1]))
         grey = (values @ LUMA)[..., None]
         return np.rint(255 * (grey + np.exp(saturation) * (values - grey))).clip(0, 255).astype(np.uint8)
-
-    def corrected(self, instance: PreparedInstance) -> PreparedInstance:
-        """Return an instance with corrected colours."""
-        return dataclasses.replace(instance, colors=self(instance.colors))

@@ -47,12 +47,12 @@ __all__ = [
     "Criterion",
     "MAX_INSTANCES",
     "MIN_INSTANCES",
-    "Objective",
     "OnlineAdaptation",
     "adaptation_criterion",
     "camera_instances",
     "entropy",
     "estimate_transform",
+    "objective",
 ]
 
 ROWS = 8
@@ -91,43 +91,40 @@ def _uncertainties(probabilities: jax.Array, known_before: jax.Array) -> jax.Arr
     return entropy(probabilities) - known_before * jnp.log(known)
 
 
-class Objective:
-    """The uncertainties of instances under colour transforms."""
+def objective(
+    instances: Sequence[PreparedInstance], criterion: Criterion, capacity: int | None = None
+) -> Callable[[NDArray[np.floating]], float]:
+    """Return the sum of the uncertainties of instances as a function of the parameters [4] of a colour transform.
 
-    def __init__(
-        self, instances: Sequence[PreparedInstance], criterion: Criterion, capacity: int | None = None
-    ) -> None:
-        """Pack the instances, and classify them without a transform.
+    Args:
+        instances: usable instances with the camera's colours.
+        criterion: what computes the answers.
+        capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default each
+            chunk has the point bucket of its largest cloud.
+    """
+    network, config, classify = criterion
+    config = dataclasses.replace(config, homology="closed_form", relaxation=None)
 
-        Args:
-            instances: usable instances with the camera's colours.
-            criterion: what computes the answers.
-            capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default
-                each chunk has the point bucket of its largest cloud.
-        """
-        config = dataclasses.replace(criterion.config, homology="closed_form", relaxation=None)
-        self._criterion = criterion._replace(config=config)
-        fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
-        ordered = sorted(fitting, key=lambda each: len(each.points))
-        self._chunks = []
-        for start in range(0, len(ordered), ROWS):
-            part = ordered[start : start + ROWS]
-            clouds = pack_instances(part, ROWS, capacity or point_bucket(len(part[-1].points)))
-            known = jnp.minimum(self._probabilities(clouds).sum(axis=1), 1)
-            self._chunks.append((len(part), clouds, known))
-
-    def _probabilities(self, clouds: PointClouds) -> jax.Array:
-        network, config, classify = self._criterion
+    def probabilities(clouds: PointClouds) -> jax.Array:
         return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
 
-    def total(self, parameters: NDArray[np.floating]) -> float:
-        """Return the sum of the uncertainties for parameters [4] of a colour transform."""
+    fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
+    ordered = sorted(fitting, key=lambda each: len(each.points))
+    chunks = []
+    for start in range(0, len(ordered), ROWS):
+        part = ordered[start : start + ROWS]
+        clouds = pack_instances(part, ROWS, capacity or point_bucket(len(part[-1].points)))
+        chunks.append((len(part), clouds, jnp.minimum(probabilities(clouds).sum(axis=1), 1)))
+
+    def total(parameters: NDArray[np.floating]) -> float:
         transform = jnp.asarray(parameters, jnp.float32)
         values = [
-            (count, _uncertainties(self._probabilities(_transformed(clouds, transform)), known))
-            for count, clouds, known in self._chunks
+            (count, _uncertainties(probabilities(_transformed(clouds, transform)), known_before))
+            for count, clouds, known_before in chunks
         ]
         return float(sum(np.asarray(value)[:count].sum() for count, value in values))
+
+    return total
 
 
 PRIOR = 0.085
@@ -160,7 +157,7 @@ class Adaptation:
     Attributes:
         transform: the colour transform.
         instances: number of instances that it was estimated from.
-        uncertainty_before: mean uncertainty of their answers without it, nats, as in `Objective`.
+        uncertainty_before: mean uncertainty of their answers without it, nats, as in `objective`.
         uncertainty_after: mean uncertainty with it.
     """
 
@@ -181,14 +178,13 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
         InputError: the frames have different sizes.
     """
     instances: list[PreparedInstance] = []
-    size: tuple[int, ...] = ()
+    first = ""
     for number, frame in enumerate(frames):
-        size = size or frame.depth.shape
-        if frame.depth.shape != size:
-            (height, width), (rows, columns) = frame.depth.shape, size
+        size = f"{frame.depth.shape[1]} x {frame.depth.shape[0]}"
+        first = first or size
+        if size != first:
             raise InputError(
-                f"frames[{number}] has {width} x {height} pixels; expected {columns} x {rows}, as the first frame: "
-                "adapt to one camera at a time"
+                f"frames[{number}] has {size} pixels; expected {first}, as the first: adapt to one camera at a time"
             )
         instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
     return instances
@@ -216,6 +212,11 @@ def adaptation_criterion(model: Model) -> Criterion:
     return Criterion(model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused))
 
 
+def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most `most` of the numbers 0 .. count - 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.intp))
+
+
 def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
 
@@ -226,26 +227,20 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
         embedding: the embedding of its views.
     """
     views, owner, ridge = dataclasses.replace(gallery, references=None).regression
-    kept = np.unique(np.linspace(0, len(owner) - 1, min(len(owner), MAX_VIEWS)).round().astype(int))
+    kept = evenly_spread(len(owner), MAX_VIEWS)
     views = views[kept].astype(np.float64)
     kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge[kept])
     duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(gallery.objects))[owner[kept]]), jnp.float32)
     fixed = jnp.asarray(views, jnp.float32)
 
     def classify(oriented: LookDescriptors) -> jax.Array:
-        # `Objective` adds the balanced colours.
+        # `objective` adds the balanced colours.
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
         mean = (oriented.weights[..., None] * scores).sum(axis=1)
         return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
 
     return classify
-
-
-def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:
-    """Return at most `count` of the instances, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(instances) - 1, min(count, len(instances))).round().astype(int))
-    return [instances[index] for index in chosen]
 
 
 def estimate_transform(
@@ -260,7 +255,7 @@ def estimate_transform(
         instances: unlabelled instances with the camera's colours; those that cannot be used are left out.
         criterion: what computes the answers, see `adaptation_criterion`.
         report: function that shows the progress.
-        capacity: see `Objective`.
+        capacity: see `objective`.
 
     Raises:
         InputError: there are fewer than `MIN_INSTANCES` usable instances.
@@ -271,15 +266,15 @@ def estimate_transform(
             f"frames have {len(usable)} usable instances; expected at least {MIN_INSTANCES}: give more frames of this "
             "camera"
         )
-    chosen = spread(usable)
-    objective = Objective(chosen, criterion, capacity)
+    chosen = [usable[index] for index in evenly_spread(len(usable), MAX_INSTANCES)]
+    total = objective(chosen, criterion, capacity)
     totals = np.zeros(len(GRID))
     for number, parameters in enumerate(GRID):
         report(number, len(GRID))
-        totals[number] = objective.total(parameters)
+        totals[number] = total(parameters)
     parameters = posterior_mean(totals)
     report(len(GRID), len(GRID))
-    before, after = (objective.total(each) / len(chosen) for each in (np.zeros(4), parameters))
+    before, after = (total(each) / len(chosen) for each in (np.zeros(4), parameters))
     return Adaptation(ColorTransform(*parameters.round(4).tolist()), len(chosen), before, after)
 
 
@@ -314,7 +309,7 @@ class OnlineAdaptation:
 
     def compile(self) -> None:
         """Compile everything that an estimate needs, by evaluating an instance."""
-        Objective([EMPTY_INSTANCE], self._criterion, CAPACITY).total(np.zeros(4))
+        objective([EMPTY_INSTANCE], self._criterion, CAPACITY)(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
         """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""
@@ -327,11 +322,6 @@ class OnlineAdaptation:
         self._new = 0
         self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)
         self._thread.start()
-
-    def join(self) -> None:
-        """Return when no estimate is running."""
-        if self._thread is not None:
-            self._thread.join()
 
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:

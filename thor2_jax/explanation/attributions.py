@@ -22,7 +22,7 @@ from scipy.stats import spearmanr
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.descriptor.slicing import RegionSets, region_sets, slices_and_strips
-from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
+from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
@@ -73,14 +73,10 @@ class Attributions:
 
     Attributes:
         values: [n] float32; the margin lost with each point, to first order. Negative values speak against the answer.
-        steps: number of steps of the path that were averaged, one of `PATHS`.
-        smoothing: standard deviation of the average over neighbouring points, metres, one of `SMOOTHING`.
         faithfulness: exact check.
     """
 
     values: NDArray[np.float32]
-    steps: int
-    smoothing: float
     faithfulness: Faithfulness
 
 
@@ -109,26 +105,24 @@ def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets,
     return flat
 
 
-def path_gradients(scores: ClassScores, cloud: OrientedCloud, index: int) -> NDArray[np.float32]:
+def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArray[np.float32]:
     """Return the gradients [STEPS, N] of the relaxed margin of a name with respect to the points' weights on the path.
 
     Args:
         scores: class scores.
-        cloud: the cloud.
+        looks: the looks at the instance, see `ClassScores.orient`.
         index: number of the name.
     """
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
     sets = region_sets(scores.network)
-    aligned = repeat_cloud(cloud.aligned, STEPS)
-    look_weights = jnp.tile(cloud.weights, (STEPS, 1))
+    repeated = repeat_cloud(looks, STEPS)
 
     def total(weights: jax.Array) -> jax.Array:
-        cut = _weighted_strips(cloud.aligned, weights, sets, config)
-        oriented = scores.describe(aligned, look_weights, cut, config)
+        oriented = scores.describe(repeated, _weighted_strips(looks, weights, sets, config), config)
         return scores.margin(scores.of_descriptors(oriented), index).sum()
 
     levels = (1 + (np.arange(STEPS) + 0.5) / STEPS) / 2
-    weights = np.repeat(levels[:, None], cloud.aligned.mask.shape[1], axis=1)
+    weights = np.repeat(levels[:, None], looks.mask.shape[1], axis=1)
     return np.asarray(jax.grad(total)(jnp.asarray(weights, jnp.float32)))
 
 
@@ -150,17 +144,17 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     return (sums[:, :-1] / sums[:, -1:]).T.astype(np.float32)
 
 
-def attribute_points(scores: ClassScores, cloud: OrientedCloud, instance: PreparedInstance, index: int) -> Attributions:
+def attribute_points(scores: ClassScores, looks: PointClouds, instance: PreparedInstance, index: int) -> Attributions:
     """Attribute the margin of a name to the points of an instance.
 
     Args:
         scores: class scores.
-        cloud: the looks at the instance, see `ClassScores.orient`.
+        looks: the looks at the instance, see `ClassScores.orient`.
         instance: the instance.
         index: number of the name in `scores.names`.
     """
     n = len(instance.points)
-    gradients = path_gradients(scores, cloud, index)[:, :n]
+    gradients = path_gradients(scores, looks, index)[:, :n]
     averages = np.stack([gradients[-count:].mean(axis=0) for count in PATHS])
     candidates = np.concatenate([smooth(instance.points, averages, deviation) for deviation in SMOOTHING])
     kept = np.ones((1 + len(candidates) + RANDOM_TENTHS, n), bool)
@@ -174,12 +168,7 @@ def attribute_points(scores: ClassScores, cloud: OrientedCloud, instance: Prepar
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
-    return Attributions(
-        candidates[best].astype(np.float32),
-        PATHS[best % len(PATHS)],
-        SMOOTHING[best // len(PATHS)],
-        Faithfulness(float(margins[0]), float(losses[best]), random),
-    )
+    return Attributions(candidates[best], Faithfulness(float(margins[0]), float(losses[best]), random))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -187,8 +176,6 @@ class LeftOut:
     """Losses of the exact margin of an answer without each slice and each strip.
 
     Attributes:
-        slice_of: [n] int, slice of each point in the first look.
-        strip_of: [n] int, strip of each point.
         slices: [S] float32, loss without the slice; NaN if it is empty.
         strips: [S, J] float32, loss without the strip; NaN if it is empty.
         predicted: [S, J] float32, sum of the attributions of the strip; NaN if it is empty.
@@ -196,32 +183,30 @@ class LeftOut:
             there are fewer than three strips or all are equal.
     """
 
-    slice_of: NDArray[np.intp]
-    strip_of: NDArray[np.intp]
     slices: NDArray[np.float32]
     strips: NDArray[np.float32]
     predicted: NDArray[np.float32]
     agreement: float | None
 
 
-def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attributions: NDArray[np.float32]) -> LeftOut:
+def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions: NDArray[np.float32]) -> LeftOut:
     """Leave out each slice and each strip of an instance in turn.
 
     Args:
         scores: class scores.
-        cloud: the looks at the instance.
+        looks: the looks at the instance.
         index: number of the answer in `scores.names`.
         attributions: [n] attributions of the points.
     """
     config, n = scores.config, len(attributions)
-    points = cloud.aligned.points[0, :n]
-    numbers = slices_and_strips(points[:, 0], points[:, 2], cloud.aligned.mask[0, :n], config)
-    slice_of, strip_of = (np.asarray(number).astype(np.intp) for number in numbers)
+    x, _, z = looks.points[0, :n].T
+    numbers = slices_and_strips(x, z, looks.mask[0, :n], config)
+    slice_of, strip_of = (np.asarray(number) for number in numbers)
     inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
     cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])
     masks = [np.ones(n, bool), *(slice_of != k for k in used_slices), *(cell_of != k for k in cells)]
-    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(cloud, np.array(masks))), index))
+    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(looks, np.array(masks))), index))
     losses = (margins[0] - margins[1:]).astype(np.float32)
 
     slices = np.full(config.n_slices, np.nan, np.float32)
@@ -232,4 +217,4 @@ def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attribution
     varies = len(cells) > 2 and np.ptp(predicted[cells]) > 0 and np.ptp(strips[cells]) > 0
     agreement = float(spearmanr(predicted[cells], strips[cells]).statistic) if varies else None
     grid = config.n_slices, config.n_strips
-    return LeftOut(slice_of, strip_of, slices, strips.reshape(grid), predicted.reshape(grid), agreement)
+    return LeftOut(slices, strips.reshape(grid), predicted.reshape(grid), agreement)

@@ -28,7 +28,7 @@ from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.types import PointClouds, Strips
 
-__all__ = ["ClassScores", "OrientedCloud", "Unit", "classifier_scores", "gallery_scores"]
+__all__ = ["ClassScores", "Unit", "classifier_scores", "gallery_scores"]
 
 Unit = Literal["log-odds", "similarity"]
 
@@ -37,19 +37,6 @@ ROWS = 8
 
 MIN_CAPACITY = 2048
 """Least padded number of points: smaller clouds are hardly faster, and every further size takes long to compile."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class OrientedCloud:
-    """The looks at a cloud, whose frames are held constant.
-
-    Attributes:
-        aligned: [K, N] aligned clouds in scaled units, that of the paper first; each has its own mask.
-        weights: [K] float32, weights of the looks.
-    """
-
-    aligned: PointClouds
-    weights: jax.Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,10 +71,9 @@ class ClassScores:
             return own
         return own - (jax.nn.logsumexp(others, axis=1) if self.unit == "log-odds" else others.max(axis=1))
 
-    def orient(self, instance: PreparedInstance) -> OrientedCloud:
-        """Return the aligned clouds of an instance."""
-        aligned, weights = aligned_looks(packed(instance), self.config, self.count)
-        return OrientedCloud(aligned, weights[0])
+    def orient(self, instance: PreparedInstance) -> PointClouds:
+        """Return the K looks at an instance, [K, N] aligned clouds, that of the paper first; each has its own mask."""
+        return aligned_looks(packed(instance), self.config, self.count)[0]
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
@@ -95,35 +81,31 @@ class ClassScores:
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
             clouds = pack_instances(rows, ROWS, capacity)
-            return self._with_colors(describe_looks(clouds, self.network, self.config, self.count), clouds)
+            return describe_looks(clouds, self.network, self.config, self.count).with_balanced(clouds)
 
         return self._of_rows(instances, describe)
 
-    def of_masks(self, cloud: OrientedCloud, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def of_masks(self, looks: PointClouds, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Return the exact scores [B, n] of parts of a cloud; its frames are those of the whole cloud.
 
         Args:
-            cloud: the cloud.
+            looks: [K, N] looks at the cloud, from `orient`.
             masks: [B, n] bool, points of each part.
         """
-        repeated, weights = repeat_cloud(cloud.aligned, ROWS), jnp.tile(cloud.weights, (ROWS, 1))
+        repeated = repeat_cloud(looks, ROWS)
 
         def describe(rows: NDArray[np.bool_]) -> LookDescriptors:
             padded = np.pad(rows, ((0, ROWS - len(rows)), (0, repeated.mask.shape[1] - rows.shape[1])))
             part = dataclasses.replace(repeated, mask=repeated.mask & jnp.repeat(padded, self.count, axis=0))
-            return self.describe(part, weights, strips(part, self.network, self.config), self.config)
+            return self.describe(part, strips(part, self.network, self.config), self.config)
 
         return self._of_rows(masks, describe)
 
-    def describe(
-        self, aligned: PointClouds, weights: jax.Array, cut: Strips, config: DescriptorConfig
-    ) -> LookDescriptors:
+    def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
         first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        return self._with_colors(describe_aligned_looks(aligned, weights, cut, self.network, config), first)
-
-    def _with_colors(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
-        return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
+        weights = jnp.full((len(first.mask), self.count), 1 / self.count)
+        return describe_aligned_looks(aligned, weights, cut, self.network, config).with_balanced(first)
 
     def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
         """Return the scores [B, n] of items, described `ROWS` at a time."""
@@ -183,12 +165,13 @@ def classifier_scores(model: Model) -> ClassScores:
 def gallery_scores(model: Model) -> ClassScores:
     """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each.
 
+    Args:
+        model: at least one object is enrolled.
+
     Raises:
-        InputError: no object is enrolled, or the embedding's descriptor has the convention of the released code.
+        InputError: the embedding's descriptor has the convention of the released code.
     """
     objects = model.gallery.objects
-    if not objects:
-        raise InputError("no object is enrolled; enroll one, or train a run")
     embedding, each = model.embedding, [views.embeddings for views in objects.values()]
     views: Any = jnp.asarray(np.concatenate(each), jnp.float32)
     ends = np.cumsum([len(one) for one in each])

@@ -23,7 +23,7 @@ from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_points, leave_out
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
-from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
+from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 from thor2_jax.gallery.enrollment import embed_looks, instance_view
@@ -31,7 +31,7 @@ from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.types import Diagrams
+from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
     "DescribedSlices",
@@ -182,15 +182,15 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
     scored = scores.of_instances([instance])[0]
     others = [k for k in np.argsort(-scored, kind="stable") if k != index]
     yield "runner_up", scores.names[others[0]] if others else None
-    cloud = scores.orient(instance)
-    attributions = attribute_points(scores, cloud, instance, index)
+    looks = scores.orient(instance)
+    attributions = attribute_points(scores, looks, instance, index)
     yield "attributions", attributions
-    yield "left_out", leave_out(scores, cloud, index, attributions.values)
+    yield "left_out", leave_out(scores, looks, index, attributions.values)
     # Where classifiers and gallery answer together, the best score need not be that of the answer.
     kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)
-    yield "described", _described(scores, cloud, len(instance.points))
+    yield "described", _described(scores, looks, len(instance.points))
     yield "nearest", tuple(_nearest_views(model, instance))
 
 
@@ -222,8 +222,12 @@ def explained_kinds(model: Model) -> dict[bool, str]:
 
     A kind that no name has is left out.
     """
-    by_classifiers = model.union.has_output & (model.answers_by() != "gallery")
-    return dict(zip(by_classifiers.tolist(), model.names, strict=True))
+    return dict(zip(_by_classifiers(model).tolist(), model.names, strict=True))
+
+
+def _by_classifiers(model: Model) -> NDArray[np.bool_]:
+    """Return which names are explained by the classifiers."""
+    return model.union.has_output & (model.answers_by() != "gallery")
 
 
 def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:
@@ -236,17 +240,15 @@ def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]
 
 
 def _scores_of(model: Model, name: str) -> ClassScores:
-    has_output = model.union.has_output[model.names.index(name)]
-    return classifier_scores(model) if has_output and model.answers_by() != "gallery" else gallery_scores(model)
+    return classifier_scores(model) if _by_classifiers(model)[model.names.index(name)] else gallery_scores(model)
 
 
-def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
-    shown = jax.tree.map(lambda a: a[:1], cloud.aligned)
-    cut = strips(shown, scores.network, scores.config)
+def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlices:
+    cut = strips(jax.tree.map(lambda a: a[:1], looks), scores.network, scores.config)
     diagrams = diagrams_of_strips(cut, scores.config)
     images = describe_strips(cut, scores.network, scores.config).images
-    first = jax.tree.map(lambda a: np.asarray(a[0]), (shown.points, diagrams, images, cut.color))
-    return DescribedSlices(first[0][:n], *first[1:])
+    first = jax.tree.map(lambda a: np.asarray(a[0]), (diagrams, images, cut.color))
+    return DescribedSlices(np.asarray(looks.points[0, :n]), *first)
 
 
 def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:

@@ -82,12 +82,6 @@ def _color_bar(figure: Figure, axes: Any, explanation: Explanation, below: bool 
     bar.set_label(plain_text(explanation.name), **name_style())
 
 
-def _spread(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Return the value of the largest magnitude within a square of pixels, so that single points are seen."""
-    high, low = maximum_filter(values, size), minimum_filter(values, size)
-    return np.where(high > -low, high, low)
-
-
 def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     mask = frame.label_image == explanation.instance.label
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -97,8 +91,11 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     grey = 0.55 * color.mean(axis=2, keepdims=True) / 255 + 0.35
     shown = np.repeat(grey, 3, axis=2)
     known = np.isfinite(painted)
-    spread = _spread(np.nan_to_num(painted), max(3, color.shape[1] // 60))
-    shown[known] = plot.attribution_colors(explanation.attributions.values).to_rgba(spread[known])[:, :3]
+    # Each pixel has the value of the largest magnitude around it, so that single points are seen.
+    size = max(3, color.shape[1] // 60)
+    high, low = (extreme(np.nan_to_num(painted), size)[known] for extreme in (maximum_filter, minimum_filter))
+    colored = plot.attribution_colors(explanation.attributions.values).to_rgba(np.where(high > -low, high, low))
+    shown[known] = colored[:, :3]
     wide = color.shape[1] > 1.5 * color.shape[0]
     figure = Figure(figsize=(_SIZE[0], 5.4 if wide else 3.8), layout="constrained")
     first, second = figure.subplots(2, 1) if wide else figure.subplots(1, 2)

@@ -154,7 +154,9 @@ class Model:
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
         """Return an instance with the colours that `color_transform` makes of those of the camera."""
-        return instance if self.color_transform is None else self.color_transform.corrected(instance)
+        if self.color_transform is None:
+            return instance
+        return dataclasses.replace(instance, colors=self.color_transform(instance.colors))
 
     def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
         """Return the fused class probabilities [B, C] of the classifiers.

@@ -21,7 +21,6 @@ from training.objects.mesh import (
     moved,
     revolved_surface,
     standing,
-    superellipse,
     texel_centres,
     tube_surface,
 )
@@ -45,7 +44,7 @@ ORANGE, BROWN, TAN, IVORY = (238, 112, 20), (116, 68, 30), (206, 160, 108), (238
 LIME, TEAL, STEEL, DARK = (186, 214, 52), (20, 150, 152), (152, 152, 192), (30, 32, 66)
 
 SECTIONS = 48
-"""Number of vertices of a ring."""
+"""Number of sides of a surface of revolution."""
 
 TEXELS = 192
 
@@ -73,7 +72,7 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
     r, z = (np.interp(height, v, line[:, k]) for k in (0, 1))
     share = np.cumsum(r[:, :1], axis=0)
     share = np.broadcast_to((share - r[:, :1] / 2) / share[-1], r.shape)
-    return revolved_surface(line, _texture(base, marks, turn, r, z, share), superellipse(SECTIONS))
+    return revolved_surface(line, _texture(base, marks, turn, r, z, share), SECTIONS)
 
 
 def _sweep(
@@ -87,9 +86,9 @@ def _sweep(
         across: [3] unit normal of the plane.
         base: colour.
         marks: functions of the angle (turns; 0 in the plane, 0.25 across it) and of the share [0, 1] of the length.
-        sides: vertices of a ring.
+        sides: sides of the cross-section.
     """
-    return tube_surface(path, radii, across, _texture(base, marks, *texel_centres(TEXELS)), superellipse(sides))
+    return tube_surface(path, radii, across, _texture(base, marks, *texel_centres(TEXELS)), sides)
 
 
 def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> TexturedMesh:
@@ -111,19 +110,20 @@ def _arc(radius: float, start: float, stop: float, n: int) -> Array:
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
+def _ellipse(x: Array, y: Array, centre: tuple[float, float], radii: tuple[float, float]) -> Any:
+    """Return where coordinates lie in an ellipse."""
+    return ((x - centre[0]) / radii[0]) ** 2 + ((y - centre[1]) / radii[1]) ** 2 < 1
+
+
 def _soup_can(label: Color) -> TexturedMesh:
     profile = [(0, 0.002), (0.031, 0.002), (0.033, 0), (0.033, 0.101), (0.031, 0.099), (0, 0.099)]
+    across = 0.104  # of half of the label, metres
     return _lathe(
         profile,
         STEEL,
         (label, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.097)),
         (IVORY, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.030)),
-        (
-            YELLOW,
-            lambda u, r, z, s: (
-                (r > 0.0325) & (((u * 2 % 1 - 0.5) * 0.104 / 0.014) ** 2 + ((z - 0.062) / 0.014) ** 2 < 1)
-            ),
-        ),
+        (YELLOW, lambda u, r, z, s: (r > 0.0325) & _ellipse((u * 2 % 1 - 0.5) * across, z, (0, 0.062), (0.014, 0.014))),
     )
 
 
@@ -145,17 +145,17 @@ def _cereal_box(ground: Color, panel: Color, bowl: Color) -> TexturedMesh:
     def front(k: Array) -> Any:
         return (k == 0) | (k == 2)
 
+    def facts(k: Array, u: Array, v: Array) -> Any:
+        return ((k == 1) | (k == 3)) & (v > 0.1) & (v < 0.5) & (u > 0.2) & (u < 0.8) & (v * 30 % 1 < 0.5)
+
     return _box(
         (0.16, 0.055, 0.235),
         ground,
         (IVORY, lambda k, u, v: (k < 4) & (v > 0.80) & (v < 0.92)),
         (panel, lambda k, u, v: front(k) & (v > 0.83) & (v < 0.89) & (u > 0.12) & (u < 0.88) & (u * 8 % 1 < 0.72)),
-        (bowl, lambda k, u, v: front(k) & (((u - 0.5) / 0.34) ** 2 + ((v - 0.36) / 0.23) ** 2 < 1) & (v < 0.40)),
-        (IVORY, lambda k, u, v: front(k) & (((u - 0.5) / 0.34) ** 2 + ((v - 0.40) / 0.05) ** 2 < 1)),
-        (
-            panel,
-            lambda k, u, v: ((k == 1) | (k == 3)) & (v > 0.1) & (v < 0.5) & (u > 0.2) & (u < 0.8) & (v * 30 % 1 < 0.5),
-        ),
+        (bowl, lambda k, u, v: front(k) & _ellipse(u, v, (0.5, 0.36), (0.34, 0.23)) & (v < 0.40)),
+        (IVORY, lambda k, u, v: front(k) & _ellipse(u, v, (0.5, 0.40), (0.34, 0.05))),
+        (panel, facts),
     )
 
 
@@ -224,7 +224,7 @@ def _apple() -> TexturedMesh:
         np.stack([r.clip(0), z], axis=1),
         RED,
         (LIME, lambda u, r, z, s: s > 0.94 + 0.02 * np.sin(u * 4 * np.pi)),
-        (ORANGE, lambda u, r, z, s: ((u - 0.35) / 0.16) ** 2 + ((s - 0.6) / 0.22) ** 2 < 1),
+        (ORANGE, lambda u, r, z, s: _ellipse(u, s, (0.35, 0.6), (0.16, 0.22))),
     )
     line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041]])
     stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2], (0, 1, 0), BROWN, sides=8)
@@ -234,20 +234,16 @@ def _apple() -> TexturedMesh:
 def _tennis_ball() -> TexturedMesh:
     phi = np.radians(np.linspace(-90, 90, 33))
     profile = 0.0335 * np.stack([np.cos(phi).clip(0), np.sin(phi)], axis=1)
-    seam = lambda u, r, z, s: abs(np.arctan2(z, r) - 0.75 * np.sin(4 * np.pi * u)) < 0.085  # noqa: E731
-    return standing(_lathe(profile, LIME, (IVORY, seam)))
+    seam: Mark = (IVORY, lambda u, r, z, s: abs(np.arctan2(z, r) - 0.75 * np.sin(4 * np.pi * u)) < 0.085)
+    return standing(_lathe(profile, LIME, seam))
 
 
 def _sponge() -> TexturedMesh:
-    return _box(
-        (0.115, 0.070, 0.042),
-        ORANGE,
-        (TEAL, lambda k, u, v: (k == 4) | ((k < 4) & (v > 0.70))),
-        (
-            BROWN,
-            lambda k, u, v: (k != 4) & ((u * 9 + 0.5 * np.floor(v * 4)) % 1 < 0.16) & (v * 4 % 1 < 0.35) & (v < 0.66),
-        ),
-    )
+    def holes(k: Array, u: Array, v: Array) -> Any:
+        return (k != 4) & ((u * 9 + 0.5 * np.floor(v * 4)) % 1 < 0.16) & (v * 4 % 1 < 0.35) & (v < 0.66)
+
+    scourer: Mark = (TEAL, lambda k, u, v: (k == 4) | ((k < 4) & (v > 0.70)))
+    return _box((0.115, 0.070, 0.042), ORANGE, scourer, (BROWN, holes))
 
 
 def _screwdriver() -> TexturedMesh:
@@ -281,8 +277,8 @@ def _wooden_spoon() -> TexturedMesh:
     half = np.where(bowl > 0, 0.0045 + 0.0205 * np.sqrt(np.clip(np.sin(np.pi * bowl**0.8), 0, 1)), 0.0055)
     thick = np.where(bowl > 0, 0.0045, 0.0055)
     path = np.stack([x, np.zeros_like(x), z], axis=1)
-    hollow = lambda u, t: (((t - 0.855) / 0.105) ** 2 + ((u - 0.5) / 0.17) ** 2 < 1) | (t < 0.06)  # noqa: E731
-    return standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, (BROWN, hollow)))
+    hollow: Mark = (BROWN, lambda u, t: _ellipse(t, u, (0.855, 0.5), (0.105, 0.17)) | (t < 0.06))
+    return standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, hollow))
 
 
 def builtin_objects() -> dict[str, TexturedMesh]:

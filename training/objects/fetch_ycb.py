@@ -5,15 +5,13 @@ written to `<directory>/<object>`, where `find_meshes` finds `textured.obj`.
 """
 
 import gzip
-import http.client
 import re
-import shutil
 import tarfile
-import urllib.error
-import urllib.request
 import zlib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+
+import httpx
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers, temporary_directory
@@ -63,8 +61,6 @@ def fetch_ycb(
     if wrong or not objects:
         given = f"has {wrong[0]!r}" if wrong else "is empty"
         raise InputError(f"objects {given}; expected names of YCB objects, such as 003_cracker_box")
-    if not re.match(r"https?://[^/]", url):
-        raise InputError(f"url is {url!r}; expected an address that begins with http:// or https://")
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
@@ -92,64 +88,56 @@ def _download(address: str, archive: Path, name: str, progress: Progress | None)
         with archive.open("rb") as stream:
             if stream.read(2) != b"\x1f\x8b":
                 raise InputError(f"out: {archive} is not a download of this command (gzip); move it")
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
     try:
-        request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
-        with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
-            if answer.status != 206:  # the server sends the whole archive
+        with httpx.stream("GET", address, headers=headers, timeout=TIMEOUT, follow_redirects=True) as answer:
+            if answer.status_code == 416:  # nothing is missing; a damaged archive is removed by `_extract`
+                return
+            if answer.status_code in (403, 404):
+                raise InputError(f"objects has {name!r}, but there is no {address}; see the names at ycbbenchmarks.com")
+            answer.raise_for_status()
+            if answer.status_code != 206:  # the server sends the whole archive
                 have = 0
-            missing = int(answer.headers.get("Content-Length") or 0)
-            _check_bytes(have + missing, archive)
+            total = have + int(answer.headers.get("Content-Length", 0))
             with archive.open("ab" if have else "wb") as stream:
-                received = 0
-                while block := answer.read(CHUNK_BYTES):
-                    received += len(block)
-                    _check_bytes(have + received, archive)
+                for block in answer.iter_raw():
+                    have += len(block)
+                    if max(have, total) > MAX_BYTES:
+                        archive.unlink()
+                        size = f"more than {MAX_BYTES:,} bytes"
+                        raise InputError(f"url: {archive.name[1:]} has {size}; expected an archive of the YCB set")
                     stream.write(block)
                     if progress:
-                        progress(name, (have + received) // 1000, (have + max(missing, received)) // 1000, "kB")
-            if received < missing:
-                raise http.client.IncompleteRead(b"", missing - received)
-    except InputError:
-        raise
-    except (http.client.InvalidURL, ValueError) as error:
-        raise InputError(f"url: {address!r} is no address ({error}); expected one such as {YCB_URL}") from None
-    except urllib.error.HTTPError as error:
-        error.close()
-        if error.code == 416:  # nothing is missing; a damaged archive is removed by `_extract`
-            return
-        if error.code in (403, 404):
-            raise InputError(
-                f"objects has {name!r}, but there is no {address}; see the names at ycbbenchmarks.com"
-            ) from None
-        raise InputError(f"url: {address} answers with status {error.code}; try again later, it resumes") from None
-    except http.client.HTTPException as error:
+                        progress(name, have // 1000, max(have, total) // 1000, "kB")
+    except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as error:  # the last from the resolution of names
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"url: {address} is incomplete ({type(error).__name__}); repeat the command, it resumes"
+            f"url: {address} cannot be read ({reason}); expected an address such as {YCB_URL}; check the network, then "
+            "repeat the command, it resumes"
         ) from None
-    except urllib.error.URLError as error:
-        raise InputError(f"url: {address} cannot be reached ({error.reason}); {_ADVICE}") from None
-    except (TimeoutError, ConnectionError) as error:
-        raise InputError(f"url: the connection to {address} broke ({error}); {_ADVICE}") from None
-
-
-_ADVICE = "check the network, then repeat the command, it resumes; everything else works without a network"
-
-
-def _check_bytes(size: int, archive: Path) -> None:
-    if size > MAX_BYTES:
-        archive.unlink(missing_ok=True)
-        raise InputError(
-            f"url: {archive.name[1:]} has more than {MAX_BYTES:,} bytes; expected an archive of the YCB set"
-        )
 
 
 def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, also on an error."""
+    """Move the files of the archive to `directory / name` and remove the archive, also on an error.
+
+    The files are the regular ones in `google_16k`, under their last names. The archive is read to its end, so that the
+    checksum of gzip covers all of it.
+    """
+    total = 0
     try:
         with temporary_directory(directory) as temporary:
             folder = temporary / name
             folder.mkdir()
-            _extract_files(archive, folder)
+            with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
+                for member in content:
+                    path = PurePosixPath(member.name)
+                    total += member.size
+                    if total > MAX_BYTES:
+                        raise InputError(f"more than {MAX_BYTES:,} bytes")
+                    if member.isfile() and path.parent.name == "google_16k" and not path.name.startswith("."):
+                        content.extract(member.replace(name=path.name), folder, set_attrs=False, filter="data")
+                while stream.read(CHUNK_BYTES):
+                    pass
             load_mesh(folder / MESH_FILE)
             folder.chmod(0o755)
             folder.rename(directory / name)
@@ -162,25 +150,3 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         ) from None
     finally:
         archive.unlink()
-
-
-def _extract_files(archive: Path, folder: Path) -> None:
-    """Write the regular files in `google_16k` to a folder under their last names; links and other folders are left out.
-
-    The archive is read to its end, so that the checksum of gzip covers all of it.
-    """
-    total = 0
-    with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
-        for member in content:
-            path = PurePosixPath(member.name)
-            total += member.size
-            if total > MAX_BYTES:
-                raise InputError(f"more than {MAX_BYTES:,} bytes")
-            if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
-                continue
-            source = content.extractfile(member)
-            assert source is not None  # of a regular file
-            with source, (folder / path.name).open("xb") as target:
-                shutil.copyfileobj(source, target)
-        while stream.read(CHUNK_BYTES):
-            pass

@@ -102,8 +102,6 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     Raises:
         InputError: Some meshes have textures and others corner colours.
     """
-    if len(parts) == 1:
-        return parts[0]
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(np.int32)
@@ -155,21 +153,25 @@ def superellipse(sides: int, exponent: float = 2.0) -> Array:
     return np.sign(ring) * np.abs(ring) ** (2 / exponent)
 
 
-def revolved_surface(profile: ArrayLike, texture: NDArray[np.uint8], ring: Array) -> TexturedMesh:
+def revolved_surface(
+    profile: ArrayLike, texture: NDArray[np.uint8], sides: int, exponent: float = 2.0, ratio: float = 1.0
+) -> TexturedMesh:
     """Return a surface of revolution about z.
 
     Args:
         profile: [k, 2] radius and height, metres; runs up the outside, and for a vessel down the inside.
         texture: image; u is the angle, v the arc length of the profile.
-        ring: [n, 2] cross-section of radius 1, from `superellipse`.
+        sides: sides of the cross-section.
+        exponent: exponent of the cross-section, see `superellipse`.
+        ratio: width of the cross-section along y, as a multiple of that along x.
     """
-    line = np.asarray(profile, np.float64)
+    line, ring = np.asarray(profile, np.float64), superellipse(sides, exponent) * [1, ratio]
     section = np.concatenate([ring, np.ones((len(ring), 1))], axis=1)
     return _ring_surface(line[:, [0, 0, 1]][:, None, :] * section, arc_lengths(line), texture)
 
 
 def tube_surface(
-    path: ArrayLike, radii: ArrayLike, across: ArrayLike, texture: NDArray[np.uint8], ring: Array
+    path: ArrayLike, radii: ArrayLike, across: ArrayLike, texture: NDArray[np.uint8], sides: int
 ) -> TexturedMesh:
     """Return a tube along a path in a plane, with flat ends.
 
@@ -178,14 +180,14 @@ def tube_surface(
         radii: [k, 2] metres, in the plane and across it.
         across: [3] unit normal of the plane.
         texture: image; u is the angle (0 in the plane, 0.25 across it), v the arc length.
-        ring: [n, 2] cross-section of radius 1, from `superellipse`.
+        sides: sides of the cross-section, an ellipse.
     """
     line, size, normal = (np.asarray(values, np.float64) for values in (path, radii, across))
     tangent = np.gradient(line, axis=0)
     inward = np.cross(normal, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
-    x, y = ring.T[:, None, :, None]
+    x, y = superellipse(sides).T[:, None, :, None]
     around = size[:, None, :1] * x * inward[:, None] + size[:, None, 1:] * y * normal
-    ends = np.broadcast_to(line[[0, -1], None], (2, len(ring), 3))
+    ends = np.broadcast_to(line[[0, -1], None], (2, sides + 1, 3))
     points = np.concatenate([ends[:1], line[:, None] + around, ends[1:]])
     return _ring_surface(points, np.concatenate([[0.0], arc_lengths(line), [1.0]]), texture)
 

@@ -1,16 +1,15 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file, read_table
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
+from thor2_jax.files import read_table
+from thor2_jax.frames.image_files import check_size
 from thor2_jax.printable import check_name
 from training.objects.mesh import TexturedMesh, merge_meshes
 
@@ -38,39 +37,17 @@ MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
-TEXTURES = (
-    "image",
-    "baseColorTexture",
-    "normalTexture",
-    "emissiveTexture",
-    "occlusionTexture",
-    "metallicRoughnessTexture",
-)
-"""Attributes of trimesh's materials that hold images."""
-
-
-def _check_textures(geometry: Any) -> None:
-    """Check the sizes of a geometry's textures, which are decoded only when they are copied or read.
-
-    Raises:
-        InputError: A texture is too large.
-    """
-    material = getattr(getattr(geometry, "visual", None), "material", None)
-    for name in TEXTURES:
-        image = getattr(material, name, None)
-        if isinstance(image, Image.Image) and image.width * image.height > MAX_IMAGE_PIXELS:
-            raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS} are read")
-
-
 def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
     """Convert one geometry of a file.
 
     Raises:
-        InputError: The geometry has no colour, or faces with invalid vertex indices.
+        InputError: The geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
+        ValueError: It is inconsistent.
     """
     from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
-    vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
+    vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
+    faces = np.reshape(np.asarray(geometry.faces, np.int32), (-1, 3))
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
@@ -86,66 +63,26 @@ def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
         image, factor = material.baseColorTexture, material.baseColorFactor
     elif isinstance(material, SimpleMaterial):
         image, factor = material.image, None if material.image is not None else material.diffuse
-        if not material.kwargs and image is not None and np.array_equal(image, empty_material().image):
-            raise InputError("texture coordinates, but no material with a texture or a colour")
     else:
         raise InputError(f"unsupported material {type(material).__name__}")
+    if image is not None:
+        check_size(image.width, image.height)  # before it is decoded
+        is_simple = isinstance(material, SimpleMaterial)
+        if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
+            raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None or visual.uv is None:
         uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
     else:
-        uv = np.asarray(visual.uv, np.float32)[faces]
-        texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
+        uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
+        texture = np.asarray(image.convert("RGB"))
         if (factor < 255).any():
             texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
-def _check(mesh: TexturedMesh) -> None:
-    """Check the shapes and values of a parsed mesh.
-
-    Raises:
-        InputError: The mesh is inconsistent.
-    """
-    vertices, faces, n = mesh.vertices, mesh.faces, len(mesh.faces)
-    shapes: list[tuple[str, NDArray[Any] | None, tuple[int, ...]]] = [
-        ("vertices", vertices, (len(vertices), 3)),
-        ("faces", faces, (n, 3)),
-        ("texture coordinates", mesh.uv, (n, 3, 2)),
-        ("colours", mesh.corner_colors, (n, 3, 3)),
-        *(("a texture", texture, (*texture.shape[:2], 3)) for texture in mesh.textures),
-    ]
-    for name, array, shape in shapes:
-        if array is not None and array.shape != shape:
-            raise InputError(f"{name} of the shape {array.shape}; expected {shape}")
-    if not np.isfinite(vertices).all():
-        raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
-    if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
-        raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
-
-
 def _longest(mesh: TexturedMesh) -> float:
     return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-
-
-def _check_obj_references(path: Path) -> None:
-    """Check that an OBJ file's materials and textures exist; without them it would be loaded as grey.
-
-    Raises:
-        InputError: A file that `path` refers to is missing.
-    """
-
-    def arguments(file: Path, keyword: str) -> list[str]:
-        lines = read_file(file).decode("utf-8", "replace").splitlines()
-        return [line.split(None, 1)[1].strip() for line in lines if line.lower().startswith(keyword + " ")]
-
-    for library in arguments(path, "mtllib"):
-        if not (path.parent / library).is_file():
-            raise InputError(f"its material file {library!r} is missing")
-        for entry in arguments(path.parent / library, "map_kd"):
-            image = entry.split()[-1] if entry.startswith("-") else entry
-            if not (path.parent / image).is_file():
-                raise InputError(f"its texture {image!r} is missing")
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -194,18 +131,38 @@ def _parsed(path: Path) -> TexturedMesh:
         raise InputError(f"mesh {path}: no such file")
     import trimesh
 
+    missing: list[str] = []
+
+    class Files(trimesh.resolvers.FilePathResolver):
+        """Remembers missing files: without its material or texture, trimesh loads a mesh as grey."""
+
+        def get(self, name: str) -> bytes:
+            try:
+                return super().get(name)
+            except OSError:
+                missing.append(name)
+                raise
+
     try:
-        if path.suffix.lower() == ".obj":
-            _check_obj_references(path)
         # Processing would silently drop vertices that are not finite.
-        scene = trimesh.load_scene(path, process=False)
-        for geometry in scene.geometry.values():
-            _check_textures(geometry)
-        parts = [part for part in scene.dump(concatenate=False) if isinstance(part, trimesh.Trimesh)]
-        if not any(len(part.faces) for part in parts):
+        scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
+        if missing:
+            raise InputError(f"its file {missing[0]!r} is missing")
+        parts = []
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+                part = _part(geometry)
+                vertices = trimesh.transform_points(part.vertices, transform)
+                parts.append(dataclasses.replace(part, vertices=vertices))
+        if not parts:
             raise InputError("no faces")
-        mesh = merge_meshes([_part(part) for part in parts if len(part.faces)])
-        _check(mesh)
+        mesh = merge_meshes(parts)
+        if not np.isfinite(mesh.vertices).all():
+            raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
+        if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
+            raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
     # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
@@ -253,22 +210,16 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
     requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
-        if entry.is_dir():
-            # Subdirectories that are not requested may be in any state.
-            name, path = entry.name, _mesh_in(entry) if requested is None or entry.name in requested else None
-        else:
-            name, path = entry.stem, entry if entry.suffix.lower() in MESH_SUFFIXES else None
-        if path is None or (requested is not None and name not in requested):
+        name = entry.name if entry.is_dir() else entry.stem
+        if requested is not None and name not in requested:  # it may be in any state
             continue
-        if name in scans:
+        path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
+        if path is not None and scans.setdefault(name, path) != path:
             raise InputError(f"mesh folder {folder}: scan {name!r} is there twice ({scans[name].name}, {path.name})")
-        scans[name] = path
     if names is None:
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
         return _named(folder, scans)
-    if not names:
-        raise InputError("names is empty; expected at least one object")
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
@@ -313,17 +264,14 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read a table of object name -> scan from a JSON or YAML file.
+    """Read a table of object name -> scan from a file, JSON if its name ends with .json and YAML otherwise.
 
     Raises:
-        InputError: The file is missing, neither JSON nor YAML, empty, or not a flat table of strings.
+        InputError: The file is missing, damaged, empty, or not a flat table of strings.
         OSError: The file cannot be opened.
     """
-    path = Path(path)
     with with_context(f"names file {path}"):
-        if path.suffix.lower() not in (".json", ".yaml", ".yml"):
-            raise InputError("the extension must be .json, .yaml or .yml")
-        table = read_table(path)
+        table = read_table(Path(path))
         if not table:
             raise InputError("it is empty; expected a table of object name: scan")
         for name, scan in table.items():

@@ -8,11 +8,10 @@ another shape, so that neither shape nor colour alone separates all objects.
 
 import colorsys
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from training.objects.mesh import (
@@ -29,7 +28,8 @@ from training.objects.mesh import (
 
 __all__ = ["procedural_object"]
 
-TEXELS = 128
+TEXELS, SIDES = 128, 40
+"""Side of a texture, and number of sides of a surface of revolution."""
 
 SIZES = (0.03, 0.32)
 """Range of the longest side, metres."""
@@ -75,13 +75,13 @@ def _paint(seed: int) -> "Paint":
     rng = np.random.default_rng([_PALETTE, seed])
     palette, is_uniform = _palette(rng), rng.random() < 0.5
 
-    @functools.cache
     def texture(part: int) -> Image:
-        rng = np.random.default_rng([_TEXTURE, seed, part])
-        rotate = part > 0 and rng.random() < 0.5
+        number = min(part, 1) if is_uniform else part
+        rng = np.random.default_rng([_TEXTURE, seed, number])
+        rotate = number > 0 and rng.random() < 0.5
         return _texture(rng, palette[1:] + palette[:1] if rotate else palette)
 
-    return lambda part: texture(min(part, 1) if is_uniform else part)
+    return texture
 
 
 def _palette(rng: Rng) -> list[Array]:
@@ -174,12 +174,6 @@ Paint = Callable[[int], Image]
 """The texture of a part of an object."""
 
 
-def _revolved(
-    profile: ArrayLike, texture: Image, exponent: float = 2.0, ratio: float = 1.0, sides: int = 40
-) -> TexturedMesh:
-    return revolved_surface(profile, texture, superellipse(sides, exponent) * [1, ratio])
-
-
 def _closed(profile: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return a profile with a flat bottom and top."""
     return [(0, profile[0][1]), *profile, (0, profile[-1][1])]
@@ -204,7 +198,7 @@ def _box(rng: Rng, paint: Paint) -> TexturedMesh:
 def _can(rng: Rng, paint: Paint) -> TexturedMesh:
     r = _log_uniform(rng, 0.018, 0.06)
     h = min(r * _log_uniform(rng, 0.6, 5), 0.28)
-    return _revolved(_closed([(0.93 * r, 0), (r, 0.003), (r, h - 0.003), (0.93 * r, h)]), paint(0))
+    return revolved_surface(_closed([(0.93 * r, 0), (r, 0.003), (r, h - 0.003), (0.93 * r, h)]), paint(0), SIDES)
 
 
 def _bottle(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -213,7 +207,7 @@ def _bottle(rng: Rng, paint: Paint) -> TexturedMesh:
     neck, shoulder, slope = rng.uniform(0.25, 0.6) * r, rng.uniform(0.5, 0.85), rng.uniform(0.04, 0.15)
     profile = [(0.9 * r, 0), (r, 0.01 * h), (r * rng.uniform(0.85, 1.05), shoulder * h / 2), (r, shoulder * h)]
     profile += [(1.2 * neck, (shoulder + slope) * h), (neck, (shoulder + slope + 0.02) * h), (neck, h)]
-    return _revolved(_closed(profile), paint(0), rng.choice([2, 2, 3.5]), _squashed(rng, 0.5))
+    return revolved_surface(_closed(profile), paint(0), SIDES, rng.choice([2, 2, 3.5]), _squashed(rng, 0.5))
 
 
 def _vessel(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -224,14 +218,14 @@ def _vessel(rng: Rng, paint: Paint) -> TexturedMesh:
     outside = np.stack([base + (r - base) * t ** rng.uniform(0.4, 1.2), h * t], axis=1)
     inside = outside[::-1] - [wall, 0]
     inside[-1, 1] = wall
-    vessel = _revolved(np.concatenate([[[0, 0]], outside, inside, [[0, wall]]]), paint(0))
+    vessel = revolved_surface(np.concatenate([[[0, 0]], outside, inside, [[0, wall]]]), paint(0), SIDES)
     if rng.random() < 0.5:
         return vessel
     angle = np.radians(np.linspace(-85, 85, 13))
     reach = h * rng.uniform(0.25, 0.38)
     path = np.stack([0.9 * reach * np.cos(angle), 0 * angle, reach * np.sin(angle)], axis=1) + [0.93 * r, 0, h / 2]
     texture = paint(0 if rng.random() < 0.7 else 1)
-    handle = tube_surface(path, np.tile([0.005, 0.007], (13, 1)), (0, 1, 0), texture, superellipse(10))
+    handle = tube_surface(path, np.tile([0.005, 0.007], (13, 1)), (0, 1, 0), texture, 10)
     return merge_meshes([vessel, handle])
 
 
@@ -243,7 +237,7 @@ def _ball(rng: Rng, paint: Paint) -> TexturedMesh:
     half = np.concatenate([ring[-13:], ring[1:13]])  # from the lowest point to the highest
     pear = 1 + rng.uniform(0, 0.25) * half[:, 1]
     profile = np.stack([r * half[:, 0].clip(0) * pear, height * r * half[:, 1]], axis=1)
-    return _revolved(profile, paint(0), rng.choice([2, 2, 3]), _squashed(rng, 0.55))
+    return revolved_surface(profile, paint(0), SIDES, rng.choice([2, 2, 3]), _squashed(rng, 0.55))
 
 
 def _rod(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -259,7 +253,7 @@ def _rod(rng: Rng, paint: Paint) -> TexturedMesh:
         lambda: 0.5 + rng.uniform(0.5, 3) * np.sin(np.clip((t - 0.55) / 0.45, 0, 1) * np.pi),
     ][rng.integers(4)]()
     radii = radius * np.stack([thickness, thickness * rng.uniform(0.6, 2)], axis=1)
-    return tube_surface(path, radii, (0, 1, 0), paint(0), superellipse(14))
+    return tube_surface(path, radii, (0, 1, 0), paint(0), 14)
 
 
 def _tool(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -270,14 +264,15 @@ def _tool(rng: Rng, paint: Paint) -> TexturedMesh:
         parts = [moved(box_surface(size, [paint(0)] * 6), (0, 0, -size[2] / 2))]
     else:
         path = np.linspace([-length / 2, 0, 0], [length / 2, 0, 0], 6)
-        parts = [tube_surface(path, np.full((6, 2), width / 2), (0, 1, 0), paint(0), superellipse(20))]
+        parts = [tube_surface(path, np.full((6, 2), width / 2), (0, 1, 0), paint(0), 20)]
     for index in range(rng.integers(1, 4)):
         long, wide = length * rng.uniform(0.25, 0.9), _log_uniform(rng, 0.01, 0.05)
         if rng.random() < 0.5:
             part = box_surface((long, wide, wide * rng.uniform(0.4, 1.3)), [paint(1)] * 6)
         else:
             top = wide / 2 * rng.uniform(0.4, 1)
-            part = _revolved(_closed([(wide / 2, -long / 2), (wide / 2, 0), (top, long / 2)]), paint(1 + index))
+            profile = _closed([(wide / 2, -long / 2), (wide / 2, 0), (top, long / 2)])
+            part = revolved_surface(profile, paint(1 + index), SIDES)
         part = moved(part, -part.centre, "y", rng.choice([0, 90, rng.uniform(0, 90)]))
         position = rng.uniform(-0.5, 0.5) * length, rng.uniform(-0.5, 0.5) * width, rng.uniform(-1, 1) * width
         parts.append(moved(part, position, "z", rng.choice([0, 90, rng.uniform(0, 180)])))
@@ -288,7 +283,7 @@ def _plate(rng: Rng, paint: Paint) -> TexturedMesh:
     r = _log_uniform(rng, 0.03, 0.13)
     h = r * rng.uniform(0.06, 0.25)
     profile = _closed([(0.6 * r, 0), (r, 0.7 * h), (r, h), (0.6 * r, h / 2)])
-    return _revolved(profile, paint(0), ratio=_squashed(rng, 0.5))
+    return revolved_surface(profile, paint(0), SIDES, ratio=_squashed(rng, 0.5))
 
 
 def _scissors(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -303,14 +298,14 @@ def _scissors(rng: Rng, paint: Paint) -> TexturedMesh:
         shift = side * rng.uniform(0, 0.4) * length * np.sin(np.radians(angle))
         parts.append(moved(bar, (0, shift, 0), "z", side * angle / 2))
         if with_rings:
-            ring = tube_surface(loop, np.full((15, 2), 0.4 * width), (0, 0, 1), paint(1), superellipse(8))
+            ring = tube_surface(loop, np.full((15, 2), 0.4 * width), (0, 0, 1), paint(1), 8)
             parts.append(moved(ring, (-length / 2, side * 1.1 * reach, 0)))
     return merge_meshes(parts)
 
 
 def _prism(rng: Rng, paint: Paint) -> TexturedMesh:
     r, h = _log_uniform(rng, 0.02, 0.07), _log_uniform(rng, 0.03, 0.2)
-    return _revolved(_closed([(r, 0), (r * rng.uniform(0.3, 1), h)]), paint(0), sides=int(rng.choice([3, 5, 6])))
+    return revolved_surface(_closed([(r, 0), (r * rng.uniform(0.3, 1), h)]), paint(0), int(rng.choice([3, 5, 6])))
 
 
 _FAMILIES = {

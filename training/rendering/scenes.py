@@ -86,16 +86,13 @@ class _Placed:
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 
-SIDES = tuple(
-    np.array(turn, np.float64)
-    for turn in (
-        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-    )
-)
-"""Rotations [3, 3] that put each of the four sides down."""
+SIDES: Array = np.array([
+    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+], np.float64)  # fmt: skip
+"""Rotations [4, 3, 3] that put each of the four sides down."""
 
 
 def _rests(hull: Array) -> bool:
@@ -212,7 +209,8 @@ def compose_scene(
         camera: camera of the frame.
         clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
             occludes the other.
-        noise: factor of the sensor noise; 1 is a consumer depth camera and a standard deviation of 2 in colour, 0 none.
+        noise: factor of the sensor noise, at least 0; 1 is a consumer depth camera and a standard deviation of 2 in
+            colour, 0 none.
         light: colours are multiplied by a gain within 1 +- light, and each channel by another within 1 +- light / 4.
 
     Returns:
@@ -220,15 +218,9 @@ def compose_scene(
         there may be fewer than `n_objects` labels.
 
     Raises:
-        InputError: A number is out of range, or there are fewer than `n_objects` objects.
+        InputError: there are fewer than `n_objects` objects.
     """
-    names = _choose(objects, n_objects, rng)
-    for argument, value, most in (("clutter", clutter, 1.0), ("noise", noise, 10.0), ("light", light, 0.5)):
-        if not 0 <= value <= most:
-            raise InputError(f"{argument} is {value!r}; it must be 0 to {most:g}")
-    azimuth, pose = _random_pose(rng)
-    towards = np.array([np.cos(azimuth), np.sin(azimuth)])
-    meshes = _arrange([objects[name] for name in names], towards, clutter, rng)
+    names, meshes, _, pose = _composed(objects, n_objects, clutter, rng)
     return _render(names, meshes, pose, camera, noise, light, rng)
 
 
@@ -266,29 +258,35 @@ def compose_views(
     Raises:
         InputError: there are fewer than `n_objects` objects.
     """
-    names = _choose(objects, n_objects, rng)
-    azimuth, _ = _random_pose(rng)
-    meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), clutter, rng)
+    names, meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
     views = []
     for turn in np.arange(n_views) * arc / n_views:
-        _, pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
+        pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
         views.append((_render(names, meshes, pose, camera, noise, light, rng), pose))
     return views
 
 
-def _choose(objects: Mapping[str, TexturedMesh], count: int, rng: np.random.Generator) -> list[str]:
-    """Return the names of different random objects; raises InputError if there are fewer than `count`."""
+def _composed(
+    objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
+) -> tuple[list[str], list[TexturedMesh], float, Array]:
+    """Return names and meshes of random objects on the table, and azimuth and pose of the camera they are in line with.
+
+    Raises:
+        InputError: there are fewer than `count` objects.
+    """
     if not 1 <= count <= len(objects):
         raise InputError(f"n_objects is {count!r}; it must be 1 to {len(objects)}, the number of objects")
-    return [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
+    names = [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
+    azimuth = rng.uniform(0, 2 * np.pi)
+    pose = _random_pose(rng, azimuth)
+    towards = np.array([np.cos(azimuth), np.sin(azimuth)])
+    return names, _arrange([objects[name] for name in names], towards, clutter, rng), azimuth, pose
 
 
-def _random_pose(rng: np.random.Generator, azimuth: float | None = None) -> tuple[float, NDArray[np.float64]]:
-    """Return the azimuth, random by default, and the pose of a camera that looks down on the table."""
-    if azimuth is None:
-        azimuth = rng.uniform(0, 2 * np.pi)
+def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:
+    """Return the pose of a camera that looks down on the table."""
     pitch = np.radians(rng.uniform(25, 50))
-    return azimuth, camera_pose(azimuth, np.pi / 2 - pitch, np.array([0, 0, 0.04]), rng.uniform(0.7, 1.1))
+    return camera_pose(azimuth, np.pi / 2 - pitch, np.array([0, 0, 0.04]), rng.uniform(0.7, 1.1))
 
 
 def _render(

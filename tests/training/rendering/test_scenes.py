@@ -143,16 +143,9 @@ def test_light_changes_colours_by_a_gain() -> None:
     assert np.ptp(gain, axis=0).max() < 0.02 and 0.6 < gain.min() <= gain.max() < 1.45
 
 
-def test_numbers_out_of_range_are_refused() -> None:
-    for options, message in (
-        ({"n_objects": 0}, "n_objects is 0"),
-        ({"n_objects": 99}, "n_objects is 99;"),
-        ({"clutter": 1.5}, "clutter is 1.5"),
-        ({"noise": -1.0}, "noise is -1.0"),
-        ({"light": float("nan")}, "light is nan"),
-    ):
-        assert_refused(message, compose_scene, OBJECTS, np.random.default_rng(0), **options)
-    assert_refused("n_objects", compose_scene, {}, np.random.default_rng(0))
+def test_numbers_of_objects_out_of_range_are_refused() -> None:
+    for count in (0, 99):
+        assert_refused(f"n_objects is {count};", compose_scene, OBJECTS, np.random.default_rng(0), n_objects=count)
 
 
 def test_views_of_a_scene_agree_in_space() -> None:
@@ -168,4 +161,3 @@ def test_views_of_a_scene_agree_in_space() -> None:
                 middles.setdefault(name, []).append((seen.min(axis=0) + seen.max(axis=0)) / 2)
     distances = [np.linalg.norm(a - b) for of_object in middles.values() for a in of_object for b in of_object]
     assert len(distances) > len(middles) and max(distances) < 0.06
-    assert_refused("n_objects", compose_views, OBJECTS, np.random.default_rng(2), 99)
