@@ -213,8 +213,8 @@ def fit_network(
     def report(done: int, total: int, metrics: EpochMetrics) -> None:
         task.progress(f"fit {task.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
 
-    with Checkpoints(task.scratch / fit.directory) as checkpoints:
-        leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
+    checkpoints = Checkpoints(task.scratch / fit.directory)
+    leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
     state = jax.tree.unflatten(structure, leaves)
     return nnx.merge(graph, state.params, state.rest)
 

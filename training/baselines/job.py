@@ -123,7 +123,7 @@ def _train(task: FitTask) -> None:
     seconds = time.perf_counter() - start
     stored = StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights)
     write_baseline(file, stored, task.run.classes)
-    remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
+    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, also those of earlier versions
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, FittedBaseline]:

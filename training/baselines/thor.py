@@ -193,8 +193,8 @@ def fit_thor(task: FitTask) -> FittedBaseline:
             task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
 
         context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
-        with Checkpoints(task.scratch / f"{name}-{k}") as checkpoints:
-            return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
+        checkpoints = Checkpoints(task.scratch / f"{name}-{k}")
+        return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
 
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
-from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import (
     FitContext,
@@ -134,5 +134,6 @@ def fit(
         held_out_accuracy=held_out_accuracy,
         place=lambda state: replicate(state, context.mesh),
     )
+    wait_for_all(f"fitted {context.feature}")
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
@@ -43,6 +42,7 @@ from training.fitting.loop import (
     append_metrics,
     discard_later_epochs,
     read_metrics,
+    wait_for_all,
 )
 from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
 from training.fitting.samples import Samples, build_samples, fold_of_views
@@ -98,12 +98,6 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     return load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
 
 
-def _wait_for_all(point: str) -> None:
-    """Wait until all processes are here, so that none reads what the first one has not written."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(point)
-
-
 def train_run(
     source: ViewSource,
     out: str | Path,
@@ -152,7 +146,7 @@ def train_run(
         is_held_out = folds > 1 or settings.distractors is not None
         parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
         fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, settings.fit.seed)
-        _wait_for_all("checked")
+        wait_for_all("checked")
         if first:
             if not resumed:
                 check_out(out)  # another process may have been quicker
@@ -160,12 +154,12 @@ def train_run(
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
             remove_leftovers(out)
-        _wait_for_all("begun")
+        wait_for_all("begun")
         runs = [
             _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()
             for fold in range(folds)
         ]
-        _wait_for_all("trained")
+        wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")
         return runs
@@ -230,7 +224,7 @@ class _Fold(NamedTuple):
                     calibration, record["held_out_accuracy"][EMBEDDING] = fitted
                     record |= {"calibration": dataclasses.asdict(calibration)} if calibration is not None else {}
                 _publish(dataclasses.replace(run, record=record, embedding=embedding), self.scratch / "run", directory)
-            _wait_for_all("published")
+            wait_for_all("published")
         return load_run(directory)
 
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
@@ -251,12 +245,12 @@ class _Fold(NamedTuple):
                     append_metrics(self.out / METRICS, self.number, name, metrics)
 
             context = FitContext(name, settings.network, settings.config)
-            with Checkpoints(self.scratch / name) as checkpoints:
-                if first:
-                    discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
-                classifiers[name], best_epochs[name] = fit(
-                    samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
-                )
+            checkpoints = Checkpoints(self.scratch / name)
+            if first:
+                discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+            classifiers[name], best_epochs[name] = fit(
+                samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
+            )
         return classifiers, best_epochs
 
     def fit_embedding(self, run: TrainedRun) -> tuple[Embedding | None, tuple[Calibration | None, float] | None]:
@@ -264,28 +258,26 @@ class _Fold(NamedTuple):
         settings, samples, held_out = self.settings, self.samples, self.held_out
         if settings.distractors is None or held_out is None:
             return None, None
-        metrics_file, several = self.out / METRICS, jax.process_count() > 1
+        metrics_file = self.out / METRICS
 
         def report(stage: str, done: int, total: int, note: str = "") -> None:
             self.progress(settings.of_fold(stage, self.number), done, total, note)
 
-        # One of several processes fits the embedding, and checkpoints are written by all of them together.
-        with contextlib.nullcontext() if several else Checkpoints(self.scratch / EMBEDDING) as checkpoints:
-            done = checkpoints.last_epoch if checkpoints is not None else 0
-            discard_later_epochs(metrics_file, self.number, EMBEDDING, done)
-            labels = np.unique(samples.label)
-            embedding, kept = fit_run_embedding(
-                self.source,
-                {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels},
-                settings.distractors,
-                self.out / CHECKPOINTS / "distractors",
-                settings.network,
-                settings.config,
-                settings.fit.seed,
-                report,
-                checkpoints,
-                lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
-            )
+        checkpoints = Checkpoints(self.scratch / EMBEDDING)
+        discard_later_epochs(metrics_file, self.number, EMBEDDING, checkpoints.last_epoch)
+        labels = np.unique(samples.label)
+        embedding, kept = fit_run_embedding(
+            self.source,
+            {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels},
+            settings.distractors,
+            self.out / CHECKPOINTS / "distractors",
+            settings.network,
+            settings.config,
+            settings.fit.seed,
+            report,
+            checkpoints,
+            lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
+        )
         report(CALIBRATE, 0, 1)
         calibration = fit_calibration(run, embedding, kept)
         report(CALIBRATE, 1, 1)

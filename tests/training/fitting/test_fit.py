@@ -48,8 +48,7 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     folders = (tmp_path / str(number) for number in range(99))
 
     def run(options: FitOptions = QUICK, samples: Samples = separable, **arguments: object) -> tuple[MLP, int]:
-        with Checkpoints(next(folders)) as checkpoints:
-            return fit(samples, TOPS2, options, checkpoints, **arguments)
+        return fit(samples, TOPS2, options, Checkpoints(next(folders)), **arguments)
 
     return run
 
@@ -94,10 +93,8 @@ def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples,
     """Another fit with the same seed gives the same weights, one with another seed does not."""
     refuse = lambda *_: pytest.fail("the fit made a step")  # noqa: E731
     options = dataclasses.replace(QUICK, epochs=2)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        first = fit(separable, TOPS2, options, checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        second = fit(separable, TOPS2, options, checkpoints, None, refuse, refuse)
+    first = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"))
+    second = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"), None, refuse, refuse)
     again, other = fitted(options=options), fitted(options=dataclasses.replace(options, seed=4))
     assert first[1] == second[1] == again[1]
     for model in (second[0], again[0]):
@@ -131,13 +128,10 @@ def test_few_samples_make_one_batch_and_one_is_refused(separable: Samples, fitte
 
 def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Samples, tmp_path: Path) -> None:
     broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        fit(separable, TOPS2, dataclasses.replace(QUICK, epochs=2), checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        assert_refused("loss of tops2 is nan .*3", fit, broken, TOPS2, QUICK, checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        assert checkpoints.last_epoch == 2
-        fit(separable, TOPS2, QUICK, checkpoints)
+    fit(separable, TOPS2, dataclasses.replace(QUICK, epochs=2), Checkpoints(tmp_path / "c"))
+    assert_refused("loss of tops2 is nan .*3", fit, broken, TOPS2, QUICK, Checkpoints(tmp_path / "c"))
+    assert Checkpoints(tmp_path / "c").last_epoch == 2
+    fit(separable, TOPS2, QUICK, Checkpoints(tmp_path / "c"))
 
 
 def test_invalid_options_are_refused_by_name() -> None:
