@@ -57,8 +57,8 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     import colornet
     from thor2_jax import DescriptorConfig
     from thor2_jax.model.classifier import HIDDEN, MLP
+    from training.fitting.fit import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.fitting.samples import build_samples
-    from training.fitting.steps import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.objects.builtin_objects import builtin_objects
     from training.views.mesh_views import render_views
     from training.views.normalized_views import MemoryViews
@@ -79,7 +79,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
         nonlocal state
         order = rng.permutation(rows)
         for number, first in enumerate(range(0, len(order), BATCH)):
-            batch = shard_batch(samples.take(order[first : first + BATCH]), context.mesh)
+            batch = shard_batch(samples.take(order[first : first + BATCH]))
             state, _ = train_step(context, graph, state, batch, np.float32(RATE), np.uint32(0), np.uint32(number))
         jax.block_until_ready(state)
 

@@ -20,9 +20,9 @@ from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
 from training.embedding import run_embedding
 from training.fitting import job
+from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
-from training.fitting.steps import FitContext
 
 SAVEFIG = Figure.savefig
 

@@ -31,10 +31,9 @@ from thor2_jax.model.classifier import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline
 from training.fitting.calibration import sample_probabilities
-from training.fitting.fit import fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import build_samples
-from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
 __all__ = ["THOR", "VIEW_TYPES", "camera_types", "fit_thor", "view_types"]

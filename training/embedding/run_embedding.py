@@ -14,23 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.types import Cloud
-from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
-from training.embedding.samples import Samples, joined_samples, sample_clouds
-from training.embedding.sampling import (
-    ObjectSource,
-    ViewTask,
-    build_samples,
-    cached_samples,
-    render_clouds,
-    sampling_job,
-)
+from training.embedding.fit import fit_embedding, reference_views
+from training.embedding.samples import Samples, sample_clouds
+from training.embedding.sampling import AUGMENTATIONS, ObjectSource, build_samples, render_clouds, stored_samples
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.objects.meshes import load_mesh
-from training.storage.jobs import JOB_FILE, Progress, of_stage
+from training.storage.jobs import Progress, cache_directory, of_stage
 from training.storage.workers import local_workers
 from training.views.normalized_views import ViewSource
 from training.views.render_job import mesh_digest
@@ -115,10 +108,19 @@ def _distractor_samples(
 
     def build() -> Samples:
         pool, show = local_workers(distractors.workers), of_stage(progress, RENDER)
-        return build_samples(sources, directory, network, config, distractors.views, COPIES, SEED, pool, show)
+        return build_samples(sources, network, config, distractors.views, COPIES, SEED, pool, show)
 
-    job = sampling_job(objects, network, config, distractors.views, COPIES, SEED)
-    samples = cached_samples(job, build, resumes=(directory / JOB_FILE).is_file())
+    job = {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "objects": objects,
+        "views": distractors.views,
+        "copies": COPIES,
+        "seed": SEED,
+        "augmentations": AUGMENTATIONS.record(),
+    }
+    samples = stored_samples(job, cache_directory("distractors") or directory, build)
     progress(RENDER, len(sources), len(sources), "")
     return samples
 
@@ -141,8 +143,7 @@ def fit_run_embedding(
         source: normalized views of the classes.
         held_out: label -> indices of the views of the held-out set.
         distractors: the other objects.
-        directory: for the samples of the distractors, from which an interrupted training resumes; unused if the
-            user's cache has them.
+        directory: for the samples of the distractors, from which an interrupted training resumes if there is no cache.
         network: colour network.
         config: descriptor.
         seed: seed for weights, order and orientations of the views of the classes.
@@ -160,7 +161,7 @@ def fit_run_embedding(
     """
     config, classes = dataclasses.replace(config, homology="closed_form"), tuple(source.classes)
     others = _distractor_samples(distractors, directory, network, config, progress)
-    fitted: list[dict[str, NDArray[Any]]] = []
+    fitted: list[Samples] = []
     kept: list[tuple[int, Cloud]] = []
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
@@ -173,21 +174,31 @@ def fit_run_embedding(
             # A copy, since a slice would keep all views of the shard in memory.
             kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
         progress(DESCRIBE, index + 1, len(source.shards) + 1, "")
-    fitted.append(others.fields(np.flatnonzero(others.label % HELD_OUT)))
-    label = fitted[-1]["label"]
+    others = others.select(np.flatnonzero(others.label % HELD_OUT))
     # The labels of the fitted distractors follow those of the classes without gaps.
-    fitted[-1]["label"] = (len(classes) + label - label // HELD_OUT - 1).astype(np.int32)
+    label = (len(classes) + others.label - others.label // HELD_OUT - 1).astype(np.int32)
+    samples = Samples.concatenated([*fitted, dataclasses.replace(others, label=label)])
     # Samples are strips in random orientations, without points: the looks need the clouds, which are rendered again.
     objects = dict(list(enumerate(distractors.sources))[::HELD_OUT])
-    rendered = render_clouds(ViewTask(objects, distractors.views, SEED))
+    rendered = render_clouds(objects, distractors.views, SEED)
     kept += [(len(classes) + index, cloud) for index, cloud in rendered]
     progress(DESCRIBE, len(source.shards) + 1, len(source.shards) + 1, "")
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:
         progress(FIT, done, total, metrics.describe(distractors.epochs))
 
-    samples = joined_samples(fitted, config)
-    options = EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=distractors.networks)
-    embedding = fit_embedding(samples, network, config, options, SIZES, show, classes, checkpoints, epoch_done)
+    embedding = fit_embedding(
+        samples,
+        network,
+        config,
+        distractors.epochs,
+        SIZES,
+        networks=distractors.networks,
+        classes=classes,
+        seed=seed,
+        progress=show,
+        checkpoints=checkpoints,
+        epoch_done=epoch_done,
+    )
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples, seed))
     return embedding, kept

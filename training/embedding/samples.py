@@ -4,7 +4,8 @@ A sample stores only its occupied strips, about a tenth of all, and the statisti
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from thor2_jax.types import Cloud
 from training.augmentation.orientation import reorient
 from training.views.normalized_views import padded_batches
 
-__all__ = ["Batch", "Samples", "concatenate_fields", "joined_samples", "sample_clouds"]
+__all__ = ["Batch", "Samples", "sample_clouds"]
 
 CLOUDS_PER_BATCH = 64
 
@@ -46,59 +47,56 @@ class Samples:
     """Samples in compact form, one after the other.
 
     Attributes:
-        start: [M + 1] int64, index of each sample's first strip, and the number of all strips.
+        strips: [M] int64, number of strips of each sample.
         strip: [T] uint16, slice x J + strip.
         length: [T] float16.
         color: [T, R] float16.
         statistics: [M, 12 + R + N_BALANCED] float32.
         label: [M] int32.
-        shape: S and J.
     """
 
-    start: NDArray[np.int64]
+    strips: NDArray[np.int64]
     strip: NDArray[np.uint16]
     length: NDArray[np.float16]
     color: NDArray[np.float16]
     statistics: NDArray[np.float32]
     label: NDArray[np.int32]
-    shape: tuple[int, int]
+
+    @classmethod
+    def concatenated(cls, chunks: Sequence["Samples"]) -> "Samples":
+        """Return the samples of all chunks; there is at least one."""
+        return cls(**{name: np.concatenate([chunk.arrays()[name] for chunk in chunks]) for name in chunks[0].arrays()})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays by the names of the fields."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def __len__(self) -> int:
         return len(self.label)
 
-    def _entries(self, rows: NDArray[np.integer[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the number of strips of each of the samples, and the indices of all their strips."""
-        counts = self.start[rows + 1] - self.start[rows]
-        return counts, np.arange(counts.sum()) + np.repeat(self.start[rows] - np.cumsum(counts) + counts, counts)
+    @functools.cached_property
+    def _ends(self) -> NDArray[np.int64]:
+        return np.cumsum(self.strips)
 
-    def fields(self, rows: NDArray[np.integer[Any]]) -> dict[str, NDArray[Any]]:
-        """Return the fields of the samples with the given indices, as `sample_clouds` returns them."""
-        counts, entry = self._entries(rows)
-        return {
-            "strips": counts,
-            "strip": self.strip[entry],
-            "length": self.length[entry],
-            "color": self.color[entry],
-            "statistics": self.statistics[rows],
-            "label": self.label[rows],
-        }
-
-    def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
+    def select(self, rows: NDArray[np.integer[Any]]) -> "Samples":
         """Return the samples with the given indices."""
-        counts, entry = self._entries(rows)
-        sample = np.repeat(np.arange(len(rows)), counts)
-        strip = self.strip[entry]
-        n_strips = self.shape[0] * self.shape[1]
-        length = np.zeros((len(rows), n_strips), np.float16)
-        color = np.zeros((len(rows), n_strips, self.color.shape[1]), np.float16)
-        length[sample, strip], color[sample, strip] = self.length[entry], self.color[entry]
-        grid = len(rows), *self.shape
-        return Batch(length.reshape(grid), color.reshape(*grid, -1), self.statistics[rows], self.label[rows])
+        strips = self.strips[rows]
+        entry = np.arange(strips.sum()) + np.repeat(self._ends[rows] - np.cumsum(strips), strips)
+        of_strips = self.strip[entry], self.length[entry], self.color[entry]
+        return Samples(strips, *of_strips, self.statistics[rows], self.label[rows])
 
-    def batches(self, rows: NDArray[np.integer[Any]], size: int) -> Iterator[Batch]:
+    def take(self, rows: NDArray[np.integer[Any]], config: DescriptorConfig) -> Batch:
+        """Return the samples with the given indices as a batch; `config` is that of the samples."""
+        chosen, grid = self.select(rows), (len(rows), config.n_slices, config.n_strips)
+        at = np.repeat(np.arange(len(rows)), chosen.strips), *np.divmod(chosen.strip, config.n_strips)
+        length, color = np.zeros(grid, np.float16), np.zeros((*grid, self.color.shape[1]), np.float16)
+        length[at], color[at] = chosen.length, chosen.color
+        return Batch(length, color, chosen.statistics, chosen.label)
+
+    def batches(self, rows: NDArray[np.integer[Any]], size: int, config: DescriptorConfig) -> Iterator[Batch]:
         """Yield the samples with the given indices in batches of one size; the last one is filled with the first."""
         for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
-            yield self.take(chunk)
+            yield self.take(chunk, config)
 
 
 def sample_clouds(
@@ -109,8 +107,8 @@ def sample_clouds(
     copies: int,
     rng: np.random.Generator,
     are_normal: bool = False,
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of samples of clouds, each in `copies` random orientations.
+) -> Samples:
+    """Return samples of clouds, each in `copies` random orientations.
 
     Args:
         clouds: xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8. At least one.
@@ -124,7 +122,7 @@ def sample_clouds(
     """
     order = range(len(clouds)) if are_normal else sorted(range(len(clouds)), key=lambda k: len(clouds[k][0]))
     label = np.array([labels[k] for k in order], np.int32)
-    chunks: list[dict[str, NDArray[Any]]] = []
+    chunks: list[Samples] = []
     done = 0
     for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
         normal = batch if are_normal else view_normalize(batch, config)
@@ -136,27 +134,8 @@ def sample_clouds(
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
             length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)
-            chunks.append(
-                {
-                    "strips": np.bincount(sample, minlength=count),
-                    "strip": strip.astype(np.uint16),
-                    "length": length[sample, strip].astype(np.float16),
-                    "color": color[sample, strip].astype(np.float16),
-                    "statistics": statistics,
-                    "label": label[done : done + count],
-                }
-            )
+            at, named = (sample, strip), label[done : done + count]
+            of_strips = strip.astype(np.uint16), length[at].astype(np.float16), color[at].astype(np.float16)
+            chunks.append(Samples(np.bincount(sample, minlength=count), *of_strips, statistics, named))
         done += count
-    return concatenate_fields(chunks)
-
-
-def concatenate_fields(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Concatenate the fields of samples."""
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
-
-
-def joined_samples(chunks: Sequence[Mapping[str, NDArray[Any]]], config: DescriptorConfig) -> Samples:
-    """Return the samples of the fields that `sample_clouds` returns."""
-    fields = concatenate_fields(chunks)
-    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
-    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)
+    return Samples.concatenated(chunks)

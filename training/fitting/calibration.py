@@ -24,8 +24,8 @@ from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import Cloud
+from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples
-from training.fitting.steps import FitContext, describe_batch
 from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
 
 __all__ = [

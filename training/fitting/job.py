@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.sharding import batch_mesh
+from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
@@ -33,7 +33,7 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, 
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import fit_run_embedding
 from training.fitting.calibration import fit_calibration, temperatures
-from training.fitting.fit import check_batch_size, fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
     BEGUN,
     CHECKPOINTS,
@@ -46,7 +46,6 @@ from training.fitting.loop import (
 )
 from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
 from training.fitting.samples import Samples, build_samples, fold_of_views
-from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource
@@ -130,7 +129,9 @@ def train_run(
     check_out(out)
     job = settings.record(source.digest)
     check_begun(out, job, JOB)
-    check_batch_size(settings.fit.batch_size, batch_mesh())
+    size = settings.fit.batch_size
+    if size % jax.device_count():
+        raise InputError(f"batch_size is {size}; it must be a multiple of the {jax.device_count()} devices")
     with contextlib.ExitStack() as locks:
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:

@@ -8,7 +8,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from thor2_jax.files import atomic_write, content_digest
+from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
 
 __all__ = ["load_arrays", "load_metadata", "save_arrays"]
 
@@ -26,15 +26,15 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
 
 
 def load_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of a file; only its header is read.
+    """Return the metadata of a file, which may be damaged behind its header.
 
     Raises:
-        ValueError: the file is missing, or its header or its size is damaged.
+        ValueError: the file is missing, or its header is damaged.
     """
     try:
-        with safetensors.safe_open(path, "numpy") as file:
-            return dict(file.metadata() or {})
-    except (OSError, safetensors.SafetensorError) as error:
+        with path.open("rb") as stream:
+            return safetensors_metadata(stream.read(2**20))
+    except (OSError, TypeError, AttributeError) as error:
         raise ValueError(str(error)) from None
 
 
@@ -44,9 +44,11 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ValueError: the file is missing or damaged.
     """
-    checksum = load_metadata(path).get("sha256")
-    arrays = safetensors.numpy.load_file(path)
-    if _digest(arrays) != checksum:
+    try:
+        arrays = safetensors.numpy.load_file(path)
+    except (OSError, safetensors.SafetensorError) as error:
+        raise ValueError(str(error)) from None
+    if _digest(arrays) != load_metadata(path).get("sha256"):
         raise ValueError("its content is damaged")
     return arrays
 

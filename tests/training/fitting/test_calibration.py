@@ -20,8 +20,8 @@ from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
 from thor2_jax.types import Cloud
 from training.fitting import calibration
+from training.fitting.fit import FitContext
 from training.fitting.samples import MIRRORS, build_samples
-from training.fitting.steps import FitContext
 from training.views.normalized_views import CLOUDS_PER_BATCH, MemoryViews, padded_batches
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")

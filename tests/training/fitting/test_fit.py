@@ -16,10 +16,9 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.model.classifier import MLP, model_arrays
 from training.fitting import loop
-from training.fitting.fit import fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
-from training.fitting.steps import FitContext
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
