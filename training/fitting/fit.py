@@ -222,9 +222,8 @@ def fit(
         without a held-out set, with the lowest training loss.
 
     Raises:
-        InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite: then
-            the last checkpoint stays.
-        OSError: A checkpoint cannot be written; the previous one stays.
+        InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
+        OSError: A checkpoint cannot be written. The last complete one stays.
     """
     context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.augment import augmented_view
@@ -126,13 +126,12 @@ class WithLabelledViews:
         """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
 
         Raises:
-            InputError: as the source of the rendered views, or there are no crops of the instances.
+            InputError: as the source of the rendered views.
         """
         if index < self._first:
             assert self._rendered is not None
             return self._rendered.read_crops(index, size)
-        if self._crops is None:
-            raise InputError("frames: the instances were read without crops; expected crops for image networks")
+        assert self._crops is not None
         name = list(self._views)[index - self._first]
         crops, times = self._crops[name], 1 + self._copies(name)
         reduced = stacked(crops, len(crops[0][0])).reduced(size)
