@@ -26,10 +26,9 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature
 from thor2_jax.model.confidence import Calibration
-from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import fit_run_embedding
 from training.fitting.calibration import fit_calibration, temperatures
@@ -124,8 +123,6 @@ def train_run(
         OSError: A file cannot be written; the last complete checkpoints stay.
     """
     out = Path(out).absolute()
-    if settings.distractors is not None:
-        settings.distractors.check(source.classes)
     check_out(out)
     job = settings.record(source.digest)
     check_begun(out, job, JOB)
@@ -207,10 +204,7 @@ class _Fold(NamedTuple):
         out, settings, samples = self.out, self.settings, self.samples
         directory = out if settings.folds == 1 else out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
-            classifiers, best_epochs = self.fit_classifiers()
-            calibrated: dict[str, float] = {}
-            if isinstance(samples, Samples):
-                calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
+            classifiers, best_epochs, calibrated = self.fit_classifiers()
             if jax.process_index() == 0:
                 run = TrainedRun(settings.config, settings.network, samples.classes, classifiers, {})
                 embedding, fitted = self.fit_embedding(run)
@@ -228,11 +222,11 @@ class _Fold(NamedTuple):
             wait_for_all("published")
         return load_run(directory)
 
-    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
-        """Fit the classifiers; return them and the epochs that they are from."""
+    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
+        """Fit the classifiers; return them, the epochs that they are from, and their temperatures."""
         settings, samples, first = self.settings, self.samples, jax.process_index() == 0
         if not isinstance(samples, Samples):
-            return {}, {}
+            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         for name in settings.classifiers:
@@ -252,7 +246,8 @@ class _Fold(NamedTuple):
             classifiers[name], best_epochs[name] = fit(
                 samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
             )
-        return classifiers, best_epochs
+        calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
+        return classifiers, best_epochs, calibrated
 
     def fit_embedding(self, run: TrainedRun) -> tuple[Embedding | None, tuple[Calibration | None, float] | None]:
         """Fit the embedding, and the confidence and the accuracy on the held-out set; None without distractors."""
@@ -301,9 +296,8 @@ def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
     """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
     shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed just here
     save_run(run, complete)
-    directory.mkdir(exist_ok=True)
-    (directory / "weights").mkdir(exist_ok=True)
-    embedding = () if run.embedding is None else (complete / REFERENCES_FILE, complete / EMBEDDING_FILE)
-    weights = (weights_file(complete, each) for each in run.classifiers)
-    for path in (*weights, *embedding, complete / "network.npz", complete / RUN_FILE):
+    for name in ("", "weights"):
+        (directory / name).mkdir(exist_ok=True)
+    files = [path for path in complete.rglob("*") if path.is_file()]
+    for path in sorted(files, key=lambda path: path.name == RUN_FILE):
         path.rename(directory / path.relative_to(complete))

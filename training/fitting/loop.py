@@ -70,13 +70,10 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         for name, least in (("epochs", 1), ("batch_size", 2), ("seed", 0)):
-            if type(getattr(self, name)) is not int or getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)!r}; it must be an integer of at least {least}")
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be an integer of at least {least}")
         if self.seed > MAX_SEED:
             raise InputError(f"seed is {self.seed}; it must be at most {MAX_SEED}")
-        rates = self.learning_rates
-        if len(rates) != 2 or not all(isinstance(rate, int | float) and 0 < rate < math.inf for rate in rates):
-            raise InputError(f"learning_rates is {rates!r}; it must be two positive numbers")
 
 
 @dataclasses.dataclass(frozen=True)
