@@ -52,6 +52,7 @@ def sklearn_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[
 def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     """Write the arrays that the peers read; return a function that fits one epoch with this project."""
     import jax
+    import optax  # type: ignore[import-untyped]
     from flax import nnx
 
     import colornet
@@ -72,7 +73,8 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     x = np.concatenate([describe(chunk) for chunk in chunks])
     for name, array in {"x": x, "y": samples.label[: len(rows)].astype(np.int64), "hidden": np.array(HIDDEN)}.items():
         np.save(folder / f"{name}.npy", array)
-    graph, state = initial_state(MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0)))
+    model = MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0))
+    graph, state = initial_state(model, optax.adam(0.0))
     rng = np.random.default_rng(0)
 
     def epoch() -> None:

@@ -20,7 +20,7 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
-from training.fitting.fit import FitState, network_step
+from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
 from training.fitting.samples import fold_of_views
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
@@ -190,9 +190,7 @@ def fit_network(
     """
     batch_size = min(fit.batch_size, n_samples)
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
-    split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
-    graph, params, statistics = split
-    state = FitState(params, statistics, fit.optimizer(0.0).init(params))
+    graph, state = initial_state(model, fit.optimizer(0.0))
 
     def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
         rng = np.random.default_rng((task.options.seed, number - 1))

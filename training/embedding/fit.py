@@ -30,7 +30,7 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
-from training.fitting.fit import FitState, network_step
+from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
 __all__ = ["batch_descriptors", "fit_embedding", "reference_views"]
@@ -169,9 +169,7 @@ def fit_embedding(
     ]
     n_steps = len(samples) // BATCH_SIZE
     optimizer = _adamw(n_steps * epochs)
-    split: Any = [nnx.split(model, nnx.Param, ...) for model in (embedding.model, *further)]
-    graphs = tuple(graph for graph, _, _ in split)
-    states = tuple(FitState(weights, rest, optimizer.init(weights)) for _, weights, rest in split)
+    graphs, states = zip(*(initial_state(model, optimizer) for model in (embedding.model, *further)), strict=True)
     # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
     seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0

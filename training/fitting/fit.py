@@ -50,12 +50,12 @@ __all__ = [
 
 
 class FitState(NamedTuple):
-    """All that training changes. A pytree.
+    """All that the training of a network changes. A pytree.
 
     Attributes:
         params: weights.
-        rest: batch statistics and the constant input scaling.
-        optimizer: state of Adam.
+        rest: batch statistics and constants.
+        optimizer: state of the optimizer.
     """
 
     params: Any
@@ -78,11 +78,11 @@ class FitContext:
     config: DescriptorConfig
 
 
-def initial_state(model: MLP) -> tuple[Any, FitState]:
-    """Return the classifier's graph (the model without its arrays) and the state before the first step."""
+def initial_state(model: nnx.Module, optimizer: Any) -> tuple[Any, FitState]:
+    """Return the graph of a network (the network without its arrays) and the state before the first step."""
     split: Any = nnx.split(model, nnx.Param, ...)
     graph, params, rest = split
-    return graph, FitState(params, rest, optax.adam(0.0).init(params))
+    return graph, FitState(params, rest, optimizer.init(params))
 
 
 def shard_batch(batch: Batch) -> Batch:
@@ -240,7 +240,7 @@ def fit(
     model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
     chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
     model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
-    graph, initial = initial_state(model)
+    graph, initial = initial_state(model, optax.adam(0.0))
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""

@@ -76,16 +76,9 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
 
     Args:
         frame: frame with labels.
-        label: label number of the instance.
-        size: side of the crop, pixels.
-
-    Raises:
-        InputError: `size` is less than 1, or the instance has no pixel or no depth.
+        label: label number of an instance, of which some pixel has depth.
+        size: side of the crop, pixels, at least 1.
     """
-    if size < 1:
-        raise InputError(f"size is {size}; expected at least 1 pixel")
-    if label == 0 or label not in frame.instance_pixels:
-        raise InputError(f"label is {label}; expected one of the frame's instances: {frame.instances}")
     pixels = frame.instance_pixels[label]
     width = frame.depth.shape[1]
     rows, columns = np.divmod(pixels, width)
@@ -96,8 +89,6 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
     color, rays = np.zeros((side, side, 3), np.float32), np.zeros((side, side, 3))
     mask[inside] = True
     depth[inside] = frame.depth_m.ravel()[pixels]
-    if not depth.any():
-        raise InputError(f"label {label} has no depth in any of its {len(pixels)} pixels; expected some; leave it out")
     color[inside] = frame.color.reshape(-1, 3)[pixels] / np.float32(255)
     rays[inside] = pixel_rays(pixels, width, frame.intrinsics)
     normals = surface_normals(rays * fill_depth(depth, mask)[..., None], mask)

@@ -82,11 +82,7 @@ class WithLabelledViews:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
         rendered = self._rendered.digest if self._rendered else None
         copies = [self._copies(name) for name in self._views]
-        return hashlib.sha256(repr((rendered, self._digest_of_instances, copies)).encode()).hexdigest()
-
-    @functools.cached_property
-    def _digest_of_instances(self) -> str:
-        return digest_of_instances(self._views)
+        return hashlib.sha256(repr((rendered, digest_of_instances(self._views), copies)).encode()).hexdigest()
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -96,7 +92,7 @@ class WithLabelledViews:
             "digest": self.digest,
             "views": sum(shard.views for shard in self.shards),
             "frames": {
-                "digest": self._digest_of_instances,
+                "digest": digest_of_instances(self._views),
                 "instances": {name: len(each) for name, each in self._views.items()},
                 "copies": {name: self._copies(name) for name in self._views},
                 "skipped": self._skipped,

@@ -209,10 +209,15 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
-        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
     ]:
         assert_refused(message, render_dataset, meshes, out, *steps, **options)
         assert not out.exists()
+
+
+def test_an_object_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    assert_refused(
+        "object 'door': a view is .*unit", render_dataset, {"door": sphere(0.85)}, tmp_path / "views", 180, 90
+    )
 
 
 def test_other_files_are_kept(tmp_path: Path) -> None:
