@@ -12,8 +12,7 @@ from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
 if TYPE_CHECKING:
-    from training.embedding.run_embedding import Distractors
-    from training.fitting.protocol import Protocol
+    from training.fitting.protocol import Distractors, Protocol
 
 
 class _TrainCommand(options.ManyFrames):
@@ -221,7 +220,7 @@ def _distractors(
     protocol: "Protocol", procedural: int | None, meshes: Path | None, epochs: int | None, workers: int
 ) -> "Distractors | None":
     """Return the distractors of the protocol with the given values; None fits no embedding."""
-    from training.embedding.run_embedding import Distractors
+    from training.fitting.protocol import Distractors
     from training.objects.meshes import find_meshes
 
     default = protocol.distractors or Distractors()

@@ -20,7 +20,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_file
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import fit_embedding, reference_views
-from training.embedding.sampling import ObjectSource, build_samples
+from training.embedding.samples import ObjectSource, build_samples
 from training.fitting.loop import EpochMetrics
 from training.objects.meshes import find_meshes
 from training.storage.workers import local_workers

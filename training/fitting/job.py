@@ -14,7 +14,7 @@ An interrupted training resumes when it is called again. run.json is written las
 import contextlib
 import dataclasses
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -222,9 +222,21 @@ class _Fold(NamedTuple):
             wait_for_all("published")
         return load_run(directory)
 
+    def begin(self, name: str) -> tuple[Checkpoints, Callable[[EpochMetrics], object]]:
+        """Return the checkpoints of a fit, and what logs an epoch; logged epochs without a checkpoint are removed."""
+        checkpoints, first = Checkpoints(self.scratch / name), jax.process_index() == 0
+        if first:
+            discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+
+        def epoch_done(metrics: EpochMetrics) -> None:
+            if first:
+                append_metrics(self.out / METRICS, self.number, name, metrics)
+
+        return checkpoints, epoch_done
+
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
         """Fit the classifiers; return them, the epochs that they are from, and their temperatures."""
-        settings, samples, first = self.settings, self.samples, jax.process_index() == 0
+        settings, samples = self.settings, self.samples
         if not isinstance(samples, Samples):
             return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
@@ -235,14 +247,7 @@ class _Fold(NamedTuple):
             def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
                 self.progress(stage, done, total, metrics.describe(settings.fit.epochs))
 
-            def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
-                if first:
-                    append_metrics(self.out / METRICS, self.number, name, metrics)
-
-            context = FitContext(name, settings.network, settings.config)
-            checkpoints = Checkpoints(self.scratch / name)
-            if first:
-                discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+            context, (checkpoints, epoch_done) = FitContext(name, settings.network, settings.config), self.begin(name)
             classifiers[name], best_epochs[name] = fit(
                 samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
             )
@@ -254,26 +259,13 @@ class _Fold(NamedTuple):
         settings, samples, held_out = self.settings, self.samples, self.held_out
         if settings.distractors is None or held_out is None:
             return None, None
-        metrics_file = self.out / METRICS
 
         def report(stage: str, done: int, total: int, note: str = "") -> None:
             self.progress(settings.of_fold(stage, self.number), done, total, note)
 
-        checkpoints = Checkpoints(self.scratch / EMBEDDING)
-        discard_later_epochs(metrics_file, self.number, EMBEDDING, checkpoints.last_epoch)
-        labels = np.unique(samples.label)
-        embedding, kept = fit_run_embedding(
-            self.source,
-            {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels},
-            settings.distractors,
-            self.out / CHECKPOINTS / "distractors",
-            settings.network,
-            settings.config,
-            settings.fit.seed,
-            report,
-            checkpoints,
-            lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
-        )
+        labels, directory = np.unique(samples.label), self.out / CHECKPOINTS / "distractors"
+        views = {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels}
+        embedding, kept = fit_run_embedding(self.source, views, settings, directory, report, *self.begin(EMBEDDING))
         report(CALIBRATE, 0, 1)
         calibration = fit_calibration(run, embedding, kept)
         report(CALIBRATE, 1, 1)

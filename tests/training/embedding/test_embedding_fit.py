@@ -19,11 +19,11 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import model_arrays
 from training.augmentation import orientation
-from training.embedding import fit, sampling
+from training.embedding import fit
+from training.embedding import samples as module
 from training.embedding.build import build_embedding
 from training.embedding.fit import fit_embedding
-from training.embedding.samples import Samples, sample_clouds
-from training.embedding.sampling import build_samples, render_clouds
+from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
@@ -90,7 +90,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
 
 def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """A batch is made of the selected samples; a selection has the samples in its order."""
-    monkeypatch.setattr(sampling, "OBJECTS_PER_TASK", 3)
+    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
     done = []
     pooled = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=lambda function, tasks: (function(t) for t in tasks))
     whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=lambda *numbers: done.append(numbers))
@@ -143,7 +143,7 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple
 def test_too_few_samples_and_invisible_objects_are_refused(views: Samples, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
     assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1)
-    monkeypatch.setattr(sampling, "MIN_VIEW_POINTS", 10**6)
+    monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
     assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1)
 
 

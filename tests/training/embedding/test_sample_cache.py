@@ -13,10 +13,10 @@ from helpers import SMALL_CONFIG, full_disk, write_box
 
 import colornet
 import thor2_jax as thor2
-from training.embedding import run_embedding, sampling
-from training.embedding.run_embedding import Distractors
-from training.embedding.samples import Samples
-from training.embedding.sampling import stored_samples
+from training.embedding import run_embedding
+from training.embedding import samples as module
+from training.embedding.samples import Samples, stored_samples
+from training.fitting.protocol import Distractors
 from training.storage.jobs import cache_directory, locked
 
 SAMPLES = Samples(
@@ -68,7 +68,7 @@ def test_samples_are_built_once(
         assert [counted(), counted()] == [1, 0]
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
-    monkeypatch.setattr(sampling.training, "__file__", str(code.parent / "__init__.py"))
+    monkeypatch.setattr(module.training, "__file__", str(code.parent / "__init__.py"))
     monkeypatch.setenv("THOR2_CACHE", "off")
     assert [counted(), counted()] == [1, 0] and files(tmp_path / "run") and len(files(cache)) == 3
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
@@ -121,7 +121,7 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
     cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "save_arrays", full_disk)
+        patch.setattr(module, "save_arrays", full_disk)
         assert counted() == 1
     assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")

@@ -17,12 +17,12 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training.embedding import fit, run_embedding
-from training.embedding.run_embedding import Distractors
-from training.embedding.sampling import render_clouds
+from training.embedding.samples import render_clouds
 from training.fitting import job
 from training.fitting.calibration import fit_calibration
 from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.loop import Checkpoints, FitOptions, read_metrics
+from training.fitting.protocol import Distractors
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
