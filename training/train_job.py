@@ -142,7 +142,7 @@ def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
 
 
 def _stages(job: TrainJob) -> dict[str, float]:
-    """Return the stages of the training of a run, see `RunSettings.stages`; those of baselines are none of them."""
+    """Return the stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
     if job.meshes is None:
         return job.protocol.stages
     return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.protocol.stages

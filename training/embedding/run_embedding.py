@@ -27,7 +27,7 @@ from training.embedding.samples import (
     stored_samples,
 )
 from training.fitting.loop import Checkpoints, EpochMetrics
-from training.fitting.protocol import ONE_HELD_OUT_OF, STAGES, Distractors, RunSettings
+from training.fitting.protocol import ONE_HELD_OUT_OF, STAGES, Distractors, Protocol
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress, cache_directory, of_stage
 from training.storage.workers import local_workers
@@ -77,7 +77,7 @@ def _distractor_samples(
 def fit_run_embedding(
     source: ViewSource,
     held_out: Mapping[int, NDArray[np.integer[Any]]],
-    settings: RunSettings,
+    settings: Protocol,
     directory: Path,
     progress: Progress,
     checkpoints: Checkpoints,

@@ -43,13 +43,13 @@ from training.fitting.loop import (
     read_metrics,
     wait_for_all,
 )
-from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
+from training.fitting.protocol import CALIBRATE, DESCRIBE, Protocol
 from training.fitting.samples import Samples, build_samples, fold_of_views
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource
 
-__all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
 JOB = f"{CHECKPOINTS}/{BEGUN}"
@@ -75,7 +75,7 @@ def is_finished(out: Path) -> bool:
     return trained and not (out / JOB).exists()
 
 
-def check_trained(digest: str, out: Path, settings: RunSettings) -> None:
+def check_trained(digest: str, out: Path, settings: Protocol) -> None:
     """Raise if a finished run differs from what `train_run` trains with these settings on views with this digest.
 
     Raises:
@@ -99,7 +99,7 @@ def finished_record(out: Path) -> Mapping[str, Any]:
 def train_run(
     source: ViewSource,
     out: str | Path,
-    settings: RunSettings,
+    settings: Protocol,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
@@ -186,7 +186,7 @@ def _held_out_parts(samples: Samples | _Views) -> int:
 class _Fold(NamedTuple):
     """One fold of a training: the arguments of `train_run`, its number, all samples, and which are held out."""
 
-    settings: RunSettings
+    settings: Protocol
     source: ViewSource
     out: Path
     number: int

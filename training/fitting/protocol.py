@@ -26,7 +26,6 @@ __all__ = [
     "STAGES",
     "Distractors",
     "Protocol",
-    "RunSettings",
 ]
 
 DESCRIBE = "describe"
@@ -103,8 +102,8 @@ class Distractors:
 
 
 @dataclasses.dataclass(frozen=True)
-class RunSettings:
-    """Everything beside the views that determines a trained run.
+class Protocol:
+    """A training protocol: everything that determines a trained run, beside the objects.
 
     Attributes:
         classifiers: descriptors that the classifiers read, any of "ce", "tops", "tops2"; with distractors, there may be
@@ -116,6 +115,9 @@ class RunSettings:
         orientation_copies: further samples of each view for the classifiers, in random orientations.
         distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
             some views are held out for it. None fits none.
+        azimuth_step: degrees between cameras around the object.
+        polar_step: degrees between cameras from pole to pole.
+        augmentations: augmented copies of each view; None adds none.
 
     Raises:
         InputError: a classifier is unknown.
@@ -128,6 +130,9 @@ class RunSettings:
     mirrors: Sequence[str] = MIRRORS
     orientation_copies: int = 0
     distractors: Distractors | None = None
+    azimuth_step: float = 5.0
+    polar_step: float = 5.0
+    augmentations: Augmentations | None = None
 
     def __post_init__(self) -> None:
         if self.classifiers or self.distractors is None:
@@ -170,23 +175,8 @@ class RunSettings:
             "learning_rates": list(self.fit.learning_rates),
         }
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Protocol(RunSettings):
-    """A training protocol: the settings of a run, and its views.
-
-    Attributes:
-        azimuth_step: degrees between cameras around the object.
-        polar_step: degrees between cameras from pole to pole.
-        augmentations: augmented copies of each view; None adds none.
-    """
-
-    azimuth_step: float
-    polar_step: float
-    augmentations: Augmentations | None = None
-
     def replace(self, **values: Any) -> "Protocol":
-        """Return the protocol with the given values of its own fields or of `fit`; None keeps the protocol's own.
+        """Return the protocol with the given values of its fields or of those of `fit`; None keeps the protocol's own.
 
         Without copies in other orientations, views are also used in a mirror.
 
@@ -221,7 +211,5 @@ PAPER = Protocol(
     classifiers=FEATURES,
     fit=FitOptions(epochs=100, batch_size=128),
     mirrors=PAPER_MIRRORS,
-    azimuth_step=5.0,
-    polar_step=5.0,
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -20,9 +20,9 @@ from training.embedding import fit, run_embedding
 from training.embedding.samples import render_clouds
 from training.fitting import job
 from training.fitting.calibration import fit_calibration
-from training.fitting.job import RunSettings, check_trained, train_run
+from training.fitting.job import check_trained, train_run
 from training.fitting.loop import Checkpoints, FitOptions, read_metrics
-from training.fitting.protocol import Distractors
+from training.fitting.protocol import Distractors, Protocol
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
@@ -42,10 +42,10 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield directory
 
 
-SETTINGS = RunSettings((), FitOptions(), SMALL_CONFIG, distractors=DISTRACTORS)
+SETTINGS = Protocol((), FitOptions(), SMALL_CONFIG, distractors=DISTRACTORS)
 
 
-def train(out: Path, settings: RunSettings = SETTINGS, **more: Any) -> list[TrainedRun]:
+def train(out: Path, settings: Protocol = SETTINGS, **more: Any) -> list[TrainedRun]:
     return train_run(SOURCE, out, settings, **more)
 
 
