@@ -182,7 +182,6 @@ def render_dataset(
         InputError: Nothing is written if there are no meshes, a mesh is unreadable or never visible, a step or
             the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
             written by another process.
-            A mesh that is too large is found when its views are stored.
         OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)

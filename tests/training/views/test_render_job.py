@@ -214,12 +214,6 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
         assert not out.exists()
 
 
-def test_an_object_that_is_too_long_is_refused(tmp_path: Path) -> None:
-    assert_refused(
-        "object 'door': a view is .*unit", render_dataset, {"door": sphere(0.85)}, tmp_path / "views", 180, 90
-    )
-
-
 def test_other_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("text")
     assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, OBJECTS, tmp_path, *STEPS)
