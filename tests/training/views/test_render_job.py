@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import Command, Interrupted, assert_refused, files_of, write_box
+from helpers import Command, Interrupted, assert_refused, files_of, full_disk, write_box
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations
@@ -220,6 +220,23 @@ def test_other_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / MANIFEST).write_text('{"format": 1}')
     assert_refused("manifest.json has format 1; expected 2", render_dataset, OBJECTS, tmp_path, *STEPS)
     assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
+
+
+def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is room for a manifest, but not for a shard."""
+    replace = os.replace
+
+    def full_for_shards(source: Path, target: Path) -> None:
+        full_disk() if target.suffix == ".safetensors" else replace(source, target)
+
+    (copied / "0001-0000.safetensors").unlink()
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(os, "replace", full_for_shards)
+        render_dataset(OBJECTS, copied, *STEPS)
+    assert set(files_of(whole)) - set(files_of(copied)) == {"0001-0000.safetensors"}
+    assert_refused("3 of 4 shards", ViewDataset.open, copied)
+    render_dataset(OBJECTS, copied, *STEPS)
+    assert files_of(copied) == files_of(whole)
 
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
