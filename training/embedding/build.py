@@ -34,25 +34,12 @@ MESH_WEIGHT = 6
 def build_embedding(
     out: Annotated[Path, typer.Option(help="file to write (safetensors)")],
     objects: Annotated[int, typer.Option(min=2, help="procedural objects")] = 3000,
-    views: Annotated[int, typer.Option(min=1, help="views of each object")] = 16,
+    views: Annotated[int, typer.Option(min=1, help="views of each object; 6 times as many of a mesh")] = 16,
     epochs: Annotated[int, typer.Option(min=1, help="passes over the samples")] = 20,
     meshes: Annotated[Path | None, typer.Option(help="directory of other objects (GLB, OBJ, PLY)")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="rendering processes")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="rendering processes; they do not affect the result")] = 2,
 ) -> None:
-    """Fit an embedding and write it to a file.
-
-    Args:
-        out: file to write.
-        objects: number of procedural objects.
-        views: views of each procedural object; a mesh has `MESH_WEIGHT` times as many.
-        epochs: passes over the samples.
-        meshes: directory of other objects.
-        workers: rendering processes; they do not affect the result.
-
-    Raises:
-        InputError: a mesh is unreadable, or `out` is another file.
-        OSError: the file cannot be written.
-    """
+    """Fit an embedding and write it to a file; an error names a mesh or an output file that cannot be used."""
     check_output_file("out", out, lambda path: bool(Embedding.load(path)))
     of_meshes = find_meshes(meshes).values() if meshes else ()
     sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in of_meshes for _ in range(MESH_WEIGHT))]
