@@ -52,13 +52,14 @@ def sklearn_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[
 def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     """Write the arrays that the peers read; return a function that fits one epoch with this project."""
     import jax
+    import optax  # type: ignore[import-untyped]
     from flax import nnx
 
     import colornet
     from thor2_jax import DescriptorConfig
     from thor2_jax.model.classifier import HIDDEN, MLP
+    from training.fitting.fit import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.fitting.samples import build_samples
-    from training.fitting.steps import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.objects.builtin_objects import builtin_objects
     from training.views.mesh_views import render_views
     from training.views.normalized_views import MemoryViews
@@ -72,14 +73,15 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     x = np.concatenate([describe(chunk) for chunk in chunks])
     for name, array in {"x": x, "y": samples.label[: len(rows)].astype(np.int64), "hidden": np.array(HIDDEN)}.items():
         np.save(folder / f"{name}.npy", array)
-    graph, state = initial_state(MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0)))
+    model = MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0))
+    graph, state = initial_state(model, optax.adam(0.0))
     rng = np.random.default_rng(0)
 
     def epoch() -> None:
         nonlocal state
         order = rng.permutation(rows)
         for number, first in enumerate(range(0, len(order), BATCH)):
-            batch = shard_batch(samples.take(order[first : first + BATCH]), context.mesh)
+            batch = shard_batch(samples.take(order[first : first + BATCH]))
             state, _ = train_step(context, graph, state, batch, np.float32(RATE), np.uint32(0), np.uint32(number))
         jax.block_until_ready(state)
 

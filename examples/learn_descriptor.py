@@ -40,9 +40,9 @@ from training.evaluation.answers import fusions
 from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
-from training.fitting.fit import FitOptions
+from training.fitting.fit import scale_inputs
+from training.fitting.loop import FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
-from training.fitting.steps import scale_inputs
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes, read_names
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded

@@ -89,6 +89,6 @@ def test_requirements_are_those_of_the_project() -> None:
     extras = project["optional-dependencies"]
     full = names(project["dependencies"])
     needed = full | names(extras["serve"]) | names(extras["segment"])
-    training = {DISTRIBUTIONS.get(name, name) for name in TRAINING_PACKAGES} | {"optax", "orbax-checkpoint"}
+    training = {DISTRIBUTIONS.get(name, name) for name in TRAINING_PACKAGES} | {"optax"}
     assert training <= set(full)
     assert listed == {name: requirement for name, requirement in needed.items() if name not in training}

@@ -29,7 +29,6 @@ __all__ = [
     "check_output_directory",
     "check_output_file",
     "content_digest",
-    "directory_digest",
     "errors_name",
     "file_digest",
     "has_json",
@@ -189,18 +188,6 @@ def content_digest(parts: Iterable[str | bytes]) -> str:
     for part in parts:
         digest.update(part.encode() if isinstance(part, str) else part)
     return digest.hexdigest()
-
-
-def directory_digest(directory: Path) -> str:
-    """Return the SHA-256 of the names, sizes and contents of all files in a directory."""
-
-    def parts() -> Iterator[str | bytes]:
-        for path in sorted(path for path in directory.rglob("*") if path.is_file()):
-            content = path.read_bytes()
-            yield f"{path.relative_to(directory).as_posix()} {len(content)}"
-            yield content
-
-    return content_digest(parts())
 
 
 def file_digest(path: Path) -> str:

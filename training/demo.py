@@ -18,7 +18,7 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
-from training.embedding.sampling import AUGMENTATIONS
+from training.embedding.samples import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results

@@ -137,7 +137,7 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
 
 
 def _stages(job: TrainJob) -> dict[str, float]:
-    """Return the stages of the training of a run, see `RunSettings.stages`; those of baselines are none of them."""
+    """Return the stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
     if job.meshes is None:
         return job.protocol.stages
     return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.protocol.stages

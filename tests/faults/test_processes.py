@@ -8,8 +8,9 @@ from helpers import Interrupted, brick_and_stick, files_of, stop_when
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.fitting.job import RunSettings, train_run
+from training.fitting.job import train_run
 from training.fitting.loop import FitOptions
+from training.fitting.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 def train(out: Path, **more: Any) -> TrainedRun:
     views = MemoryViews(brick_and_stick(3), CONFIG)
-    (run,) = train_run(views, out, RunSettings(("tops",), FitOptions(epochs=2, batch_size=4), CONFIG), **more)
+    (run,) = train_run(views, out, Protocol(("tops",), FitOptions(epochs=2, batch_size=4), CONFIG), **more)
     return run
 
 

@@ -19,10 +19,10 @@ from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
 from training.embedding import run_embedding
-from training.fitting import job
+from training.fitting import job, protocol
+from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
-from training.fitting.steps import FitContext
 
 SAVEFIG = Figure.savefig
 
@@ -54,11 +54,13 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
         return random_classifier(inputs, len(samples.classes), 0), 1
 
     def fit_embedding(source: Any, *others: Any) -> tuple[Embedding, list[Any]]:
-        _, _, _, network, config, _, report, _, epoch_done = others
-        for stage in run_embedding.STAGES:
+        _, settings, _, report, _, epoch_done = others
+        for stage in protocol.STAGES:
             report(stage, 1, 1)
         epoch_done(metrics())
-        created = Embedding.create(config, network, run_embedding.SIZES, classes=tuple(source.classes), distractors=9)
+        created = Embedding.create(
+            settings.config, settings.network, run_embedding.SIZES, classes=tuple(source.classes), distractors=9
+        )
         views = References(np.zeros((1, created.size), np.float16), np.full(1, BACKGROUND, np.int32))
         return dataclasses.replace(created, references=views), []
 

@@ -10,6 +10,7 @@ rendered is always kept as copy 0.
 """
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -20,9 +21,9 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.instance_clouds import flying_pixels
 from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
+from training.augmentation.pixels import without
 from training.augmentation.segmentation import Base, Segmentation, resegmented, without_base
 from training.augmentation.sensor import Sensor, sensed
-from training.augmentation.settings import without
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["KINDS", "Augmentations", "augment"]
@@ -56,7 +57,7 @@ class Augmentations:
         copies: number of augmented copies of each view.
 
     Raises:
-        InputError: `copies` is not an integer from 1 to `MAX_COPIES`, or an augmentation has another type.
+        InputError: `copies` is not from 1 to `MAX_COPIES`.
     """
 
     illumination: Illumination | None = None
@@ -73,23 +74,16 @@ class Augmentations:
         return cls(**{name: KINDS[name][0]() for name in names}, copies=copies)
 
     def __post_init__(self) -> None:
-        for name, (kind, _) in KINDS.items():
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"augmentations.{name} is {value!r}; it must be None or {kind.__name__}")
-        if not isinstance(self.copies, int) or isinstance(self.copies, bool) or not 1 <= self.copies <= MAX_COPIES:
-            raise InputError(f"augmentations.copies is {self.copies!r}; expected an integer from 1 to {MAX_COPIES}")
+        if not 1 <= self.copies <= MAX_COPIES:
+            raise InputError(f"augmentations.copies is {self.copies}; expected an integer from 1 to {MAX_COPIES}")
 
     def __bool__(self) -> bool:
         return any(getattr(self, name) for name in KINDS)
 
     def record(self) -> dict[str, Any]:
         """Return all settings as JSON holds them: None for a disabled augmentation, ranges as lists."""
-
-        def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-            return {name: list(value) if isinstance(value, tuple) else value for name, value in items}
-
-        return dataclasses.asdict(self, dict_factory=plain)
+        record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return record
 
 
 def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:
@@ -100,13 +94,15 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
 
     Args:
         view: view as rendered; not modified.
-        augmentations: which augmentations to apply, with their settings.
+        augmentations: which augmentations to apply, with their settings; an empty view stays as it is.
         rng: random number generator.
 
     Returns:
         A view with the same pose. If the mask is dilated, the image may be larger by some pixels on each side; corner
         and intrinsics are adapted.
     """
+    if not view.depth.any():
+        return view
     for name, (_, apply) in KINDS.items():
         settings = getattr(augmentations, name)
         view = apply(view, settings, rng) if settings else view

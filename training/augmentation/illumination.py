@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width
+from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Illumination", "Registration", "misregistered", "relit"]
@@ -33,7 +33,7 @@ STEEPEST = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Illumination(Settings):
+class Illumination:
     """Ranges of light and camera response; values are drawn once per view.
 
     Attributes:
@@ -48,20 +48,18 @@ class Illumination(Settings):
         noise: standard deviation per pixel and channel.
     """
 
-    gamma: Range = limited((0.6, 1.6), 0.1, 10)
-    gain: Range = limited((0.4, 1.7), 0, 10)
-    cast: float = limited(0.25, 0, 0.9)
-    shading: Range = limited((0.0, 1.0), 0, 1)
-    saturation: Range = limited((0.4, 1.7), 0, 10)
-    veil: Range = limited((0.0, 0.12), 0, 1)
-    noise: Range = limited((0.0, 0.02), 0, 1)
+    gamma: Range = (0.6, 1.6)
+    gain: Range = (0.4, 1.7)
+    cast: float = 0.25
+    shading: Range = (0.0, 1.0)
+    saturation: Range = (0.4, 1.7)
+    veil: Range = (0.0, 0.12)
+    noise: Range = (0.0, 0.02)
 
 
 def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> RenderedView:
     """Return the view under a light drawn from `light`."""
     pixels = np.flatnonzero(view.depth)
-    if len(pixels) == 0:
-        return view
     ranges = light.gamma, light.gain, light.shading, light.saturation, light.veil, light.noise
     gamma, gain, shading, saturation, veil, noise = (rng.uniform(*drawn) for drawn in ranges)
     cast = rng.uniform(1 - light.cast, 1 + light.cast, 3)
@@ -106,7 +104,7 @@ def _slopes(depth: NDArray[np.float32], focal: float) -> NDArray[np.float32]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Registration(Settings):
+class Registration:
     """Ranges of the registration error; values are drawn once per view.
 
     Attributes:
@@ -115,16 +113,14 @@ class Registration(Settings):
         blur: standard deviation of the blur of the colour image, in pixels of a real frame.
     """
 
-    shifted: float = limited(0.5, 0, 1)
-    shift: float = limited(10.0, 0, 100)
-    blur: Range = limited((0.0, 3.0), 0, 50)
+    shifted: float = 0.5
+    shift: float = 10.0
+    blur: Range = (0.0, 3.0)
 
 
 def misregistered(view: RenderedView, registration: Registration, rng: np.random.Generator) -> RenderedView:
     """Return the view with a blurred, shifted colour image; the background has one random colour."""
     seen = view.depth > 0
-    if not seen.any():
-        return view
     scale = FRAME_PIXEL / pixel_width(view)
     blur = rng.uniform(*registration.blur) * scale
     shift = np.zeros(2, int)

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from training.augmentation.settings import Range, Settings, limited, pixel_width, without
+from training.augmentation.pixels import Range, pixel_width, without
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import DISTANCE, Camera, RenderedView, camera_pose
@@ -33,7 +33,7 @@ SHARE_TOLERANCE = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
-class Occlusion(Settings):
+class Occlusion:
     """Ranges of the occlusion; values are drawn once per view.
 
     Attributes:
@@ -43,17 +43,17 @@ class Occlusion(Settings):
         nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
     """
 
-    share: Range = limited((0.05, 0.8), 0, 0.95)
-    none: float = limited(0.2, 0, 1)
-    straight: float = limited(0.3, 0, 1)
-    nearer: Range = limited((1.0, 1.5), 1, 10)
+    share: Range = (0.05, 0.8)
+    none: float = 0.2
+    straight: float = 0.3
+    nearer: Range = (1.0, 1.5)
 
 
 def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator) -> RenderedView:
     """Return the view without its occluded pixels; a straight edge replaces silhouettes that are too small."""
     pixels = np.flatnonzero(view.depth)
     n = len(pixels)
-    if n == 0 or rng.random() < occlusion.none:
+    if rng.random() < occlusion.none:
         return view
     share = rng.uniform(*occlusion.share)
     angle, width = rng.uniform(0, 2 * np.pi), pixel_width(view)

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
 from thor2_jax.frames.frames import Intrinsics, pixel_points
 from thor2_jax.frames.instance_clouds import PIECE_CELL
-from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width, without
+from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width, without
 from training.rendering.view_sphere import TRAINING_CAMERA, RenderedView
 
 __all__ = ["Base", "Segmentation", "resegmented", "without_base"]
@@ -24,7 +24,7 @@ MAX_BACKGROUND_GAP = 2 * PIECE_CELL
 
 
 @dataclasses.dataclass(frozen=True)
-class Segmentation(Settings):
+class Segmentation:
     """Ranges of the mask's error; values are drawn once per view.
 
     Attributes:
@@ -34,17 +34,15 @@ class Segmentation(Settings):
         gap: distance between object and background otherwise, metres.
     """
 
-    pixels: Range = limited((-8.0, 6.0), -50, 50)
-    tilt: Range = limited((0.0, 70.0), 0, 75)
-    touching: float = limited(0.7, 0, 1)
-    gap: Range = limited((0.0, 0.5), 0, 10)
+    pixels: Range = (-8.0, 6.0)
+    tilt: Range = (0.0, 70.0)
+    touching: float = 0.7
+    gap: Range = (0.0, 0.5)
 
 
 def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
     """Return the view in a mask with a drawn error; an eroded mask keeps at least half of the pixels."""
     seen = view.depth > 0
-    if not seen.any():
-        return view
     steps = round(rng.uniform(*segmentation.pixels) * FRAME_PIXEL / pixel_width(view))
     return _dilated(view, steps, segmentation, rng) if steps > 0 else _eroded(view, seen, -steps)
 
@@ -106,7 +104,7 @@ MAX_CUT = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
-class Base(Settings):
+class Base:
     """Ranges of the missing base; values are drawn once per view.
 
     Attributes:
@@ -115,15 +113,15 @@ class Base(Settings):
         upright: probability that the object stands as its mesh does; otherwise it lies in a random orientation.
     """
 
-    missing: float = limited(0.4, 0, 1)
-    height: Range = limited((0.003, 0.02), 0, 0.1)
-    upright: float = limited(0.6, 0, 1)
+    missing: float = 0.4
+    height: Range = (0.003, 0.02)
+    upright: float = 0.6
 
 
 def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> RenderedView:
     """Return the view without the pixels near the table, or the view itself if that were most of it."""
     pixels = np.flatnonzero(view.depth)
-    if len(pixels) == 0 or rng.random() >= base.missing:
+    if rng.random() >= base.missing:
         return view
     up = np.array([0.0, 0.0, 1.0]) if rng.random() < base.upright else rng.standard_normal(3)
     up /= np.linalg.norm(up)

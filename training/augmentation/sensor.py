@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width, without
+from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width, without
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensor(Settings):
+class Sensor:
     """Ranges of the depth sensor's errors; values are drawn once per view.
 
     Attributes:
@@ -31,13 +31,13 @@ class Sensor(Settings):
         background: distance of the background behind the object, metres.
     """
 
-    distance: Range = limited((0.6, 1.2), 0.2, 5)
-    axial: Range = limited((0.3, 1.5), 0, 10)
-    lateral: float = limited(0.8, 0, 10)
-    grazing: float = limited(78.0, 45, 89)
-    missing: float = limited(0.3, 0, 1)
-    flying: float = limited(0.3, 0, 1)
-    background: Range = limited((0.1, 1.0), 0, 10)
+    distance: Range = (0.6, 1.2)
+    axial: Range = (0.3, 1.5)
+    lateral: float = 0.8
+    grazing: float = 78.0
+    missing: float = 0.3
+    flying: float = 0.3
+    background: Range = (0.1, 1.0)
 
 
 def axial_deviation(z: Any) -> Any:
@@ -49,8 +49,6 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     """Return the view as a depth camera drawn from `sensor` measures it."""
     pixels = np.flatnonzero(view.depth)
     n = len(pixels)
-    if n == 0:
-        return view
     deviation = rng.uniform(*sensor.axial) * axial_deviation(rng.uniform(*sensor.distance))
     behind = rng.uniform(*sensor.background)
     width = pixel_width(view)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
@@ -19,9 +18,9 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
+from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
 from training.fitting.samples import fold_of_views
-from training.fitting.steps import FitState
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource
 
@@ -137,19 +136,6 @@ class FitTask:
         return sum(shard.views for shard in self.source.shards)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
-def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
-    def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
-        logits = model(*inputs(*batch))
-        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
-        return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
-
-    (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
-    updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
-    return FitState(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
-
-
 class NetworkFit(NamedTuple):
     """How a network is fitted.
 
@@ -175,6 +161,15 @@ def as_given(*arrays: Any) -> tuple[Any, ...]:
     return arrays
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
+def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
+    def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:
+        logits = model(*inputs(*batch))
+        return logits, logits
+
+    return network_step(graph, state, optimizer(rate), label, outputs_of)
+
+
 def fit_network(
     task: FitTask, fit: NetworkFit, model: nnx.Module, label: Integers, rows: NDArray[np.intp], n_samples: int
 ) -> Any:
@@ -185,9 +180,7 @@ def fit_network(
     """
     batch_size = min(fit.batch_size, n_samples)
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
-    split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
-    graph, params, statistics = split
-    leaves, structure = jax.tree.flatten(FitState(params, statistics, fit.optimizer(0.0).init(params)))
+    graph, state = initial_state(model, fit.optimizer(0.0))
 
     def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
         rng = np.random.default_rng((task.options.seed, number - 1))
@@ -195,17 +188,15 @@ def fit_network(
         for batch in order.reshape(-1, batch_size):
             yield fit.draw(batch, rng), label[batch]
 
-    def step(leaves: list[Any], number: int, batch: tuple[Any, Integers]) -> tuple[list[Any], Any]:
+    def step(state: FitState, number: int, batch: tuple[Any, Integers]) -> tuple[FitState, Any]:
         rate = np.float32(fit.rate(number, steps.epochs * steps.of_epoch))
-        state, *metrics = _step(graph, fit.inputs, fit.optimizer, jax.tree.unflatten(structure, leaves), *batch, rate)
-        return jax.tree.leaves(state), metrics
+        return _step(graph, fit.inputs, fit.optimizer, state, *batch, rate)
 
     def report(done: int, total: int, metrics: EpochMetrics) -> None:
         task.progress(f"fit {task.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
 
-    with Checkpoints(task.scratch / fit.directory) as checkpoints:
-        leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
-    state = jax.tree.unflatten(structure, leaves)
+    checkpoints = Checkpoints(task.scratch / fit.directory)
+    state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=report)
     return nnx.merge(graph, state.params, state.rest)
 
 

@@ -108,7 +108,7 @@ def _train(task: FitTask) -> None:
     remove_leftovers(file.parent)
     fitted = _METHODS[task.name][0](task)
     write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
-    remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
+    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, also those of earlier versions
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:

@@ -31,10 +31,9 @@ from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled
 from training.baselines.files import StoredBaseline
 from training.fitting.calibration import sample_probabilities
-from training.fitting.fit import fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import build_samples
-from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
 __all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
@@ -188,8 +187,8 @@ def fit_thor(task: FitTask) -> StoredBaseline:
             task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
 
         context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
-        with Checkpoints(task.scratch / f"{name}-{k}") as checkpoints:
-            return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
+        checkpoints = Checkpoints(task.scratch / f"{name}-{k}")
+        return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
 
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])

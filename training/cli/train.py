@@ -172,8 +172,7 @@ def train(
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.model.classifier import FEATURES, check_features
     from thor2_jax.model.run_record import RUN_FILE
-    from training.embedding.run_embedding import Distractors
-    from training.fitting.protocol import DEFAULT, PAPER, QUICK
+    from training.fitting.protocol import DEFAULT, PAPER, QUICK, Distractors
     from training.objects.meshes import find_meshes
     from training.storage.workers import keep_freed_memory
     from training.train_job import TrainJob, run_train_job

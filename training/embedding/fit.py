@@ -11,7 +11,7 @@ Reference views of an embedding are chosen from the samples that it was fitted o
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,44 +30,23 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
+from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
-__all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding", "reference_views"]
+__all__ = ["batch_descriptors", "fit_embedding", "reference_views"]
 
 BASIS_SAMPLES = 2048
 """Samples whose features determine the principal components."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EmbeddingFit:
-    """Options of a fit.
+BATCH_SIZE = 256
+"""Samples of a step."""
 
-    Attributes:
-        epochs: passes over the samples.
-        batch_size: samples of a step.
-        rate: learning rate of AdamW at the first step; it falls to 0 along a cosine.
-        margin: subtracted from the cosine between a view and its own proxy.
-        seed: seed for weights, proxies, sample order and dropout.
-        networks: number of networks, fitted together on the same batches from different weights. Only the first one
-            embeds; all classify. Use 1 without classes.
+RATE = 2e-3
+"""Learning rate of AdamW at the first step; it falls to 0 along a cosine."""
 
-    Raises:
-        InputError: a value is out of range.
-    """
-
-    epochs: int = 10
-    batch_size: int = 256
-    rate: float = 2e-3
-    margin: float = 0.12
-    seed: int = 0
-    networks: int = 1
-
-    def __post_init__(self) -> None:
-        if min(self.epochs, self.batch_size - 1, self.networks) < 1 or not (self.rate > 0 and 0 <= self.margin < 1):
-            raise InputError(
-                f"{self}; expected at least 1 epoch, 1 network, batches of at least 2, a positive rate and a margin "
-                "in [0, 1)"
-            )
+MARGIN = 0.12
+"""Subtracted from the cosine between a view and its own proxy."""
 
 
 def batch_descriptors(
@@ -95,11 +74,11 @@ def _projected_features(version: int, network: ColorNetwork, config: DescriptorC
 
 
 def _color_basis(
-    samples: Samples, network: ColorNetwork, config: DescriptorConfig, sizes: EmbeddingSizes, batch_size: int
+    samples: Samples, network: ColorNetwork, config: DescriptorConfig, sizes: EmbeddingSizes
 ) -> NDArray[np.float32]:
     """Return the principal components [F, C] of the projected features, not centred: projections keep cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
-    batches = samples.batches(rows, batch_size)
+    batches = samples.batches(rows, BATCH_SIZE, config)
     features = np.concatenate([_projected_features(sizes.version, network, config, batch) for batch in batches])
     variances, vectors = np.linalg.eigh(features @ features.T)
     size = sizes.color
@@ -109,54 +88,34 @@ def _color_basis(
 
 
 @functools.cache  # equal optimizers share the compiled step
-def _adamw(rate: float, n_steps: int) -> Any:
-    return optax.adamw(optax.cosine_decay_schedule(rate, n_steps), weight_decay=1e-3)
+def _adamw(n_steps: int) -> Any:
+    return optax.adamw(optax.cosine_decay_schedule(RATE, n_steps), weight_decay=1e-3)
 
 
-class NetworkState(NamedTuple):
-    """All that the fit of one network changes. A pytree.
-
-    Attributes:
-        parameters: weights.
-        rest: batch statistics and constants.
-        moments: state of the optimizer.
-    """
-
-    parameters: Any
-    rest: Any
-    moments: Any
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4), donate_argnums=5)
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3), donate_argnums=4)
 def _step(
     graphs: tuple[Any, ...],
     optimizer: Any,
-    margin: float,
     network: ColorNetwork,
     config: DescriptorConfig,
-    states: tuple[NetworkState, ...],
+    states: tuple[FitState, ...],
     batch: Batch,
     seen: jax.Array,
     keys: jax.Array,
-) -> tuple[tuple[NetworkState, ...], jax.Array]:
+) -> tuple[tuple[FitState, ...], jax.Array]:
     """Make one step of every network; return the next states, and the mean loss and accuracy [2] before the step."""
     descriptors = batch_descriptors(batch.length, batch.color, network, config)
 
-    def step(graph: Any, state: NetworkState, seen: jax.Array, key: jax.Array) -> tuple[NetworkState, jax.Array]:
-        def loss_of(parameters: Any) -> Any:
-            model = nnx.merge(graph, parameters, state.rest, copy=True)
+    def step(graph: Any, state: FitState, seen: jax.Array, key: jax.Array) -> tuple[FitState, jax.Array]:
+        def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:
             statistics = batch.statistics[:, : len(seen)] * seen
             learned = model.learned(descriptors, statistics, train=True, rngs=nnx.Rngs(dropout=key))
             cosines = class_cosines(learned, model.proxies[...])
             own = jax.nn.one_hot(batch.label, cosines.shape[1])
-            logits = jnp.exp(model.log_scale[...]) * (cosines - margin * own)
-            loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
-            accuracy = (cosines.argmax(axis=1) == batch.label).mean()
-            return loss, (nnx.state(model, nnx.Not(nnx.Param)), accuracy)
+            return jnp.exp(model.log_scale[...]) * (cosines - MARGIN * own), cosines
 
-        (loss, (rest, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.parameters)
-        updates, moments = optimizer.update(gradients, state.moments, state.parameters)
-        return NetworkState(optax.apply_updates(state.parameters, updates), rest, moments), jnp.stack([loss, accuracy])
+        after, metrics = network_step(graph, state, optimizer, batch.label, outputs_of)
+        return after, jnp.stack(metrics)
 
     after, metrics = zip(*(step(*each) for each in zip(graphs, states, seen, keys, strict=True)), strict=True)
     return after, jnp.stack(metrics).mean(axis=0)
@@ -166,12 +125,15 @@ def fit_embedding(
     samples: Samples,
     network: ColorNetwork,
     config: DescriptorConfig,
-    options: EmbeddingFit,
+    epochs: int,
     sizes: EmbeddingSizes | None = None,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     classes: tuple[str, ...] = (),
     checkpoints: Checkpoints | None = None,
     epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
+    *,
+    networks: int = 1,
+    seed: int = 0,
 ) -> Embedding:
     """Fit an embedding, or resume from the last checkpoint.
 
@@ -181,50 +143,50 @@ def fit_embedding(
         samples: of at least two objects.
         network: colour network of the samples.
         config: descriptor of the samples.
-        options: of the fit.
+        epochs: passes over the samples.
         sizes: of the network.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
             objects as distractors, are kept. None by default: the proxies are discarded.
         checkpoints: of this fit only, written after each epoch; None writes none.
         epoch_done: called after each epoch, before its checkpoint is written.
+        networks: number of networks, fitted together on the same batches from different weights. Only the first one
+            embeds; all classify. Use 1 without classes.
+        seed: seed for weights, proxies, sample order and dropout.
 
     Raises:
         InputError: there are fewer samples than in a batch, the loss is not finite, or a checkpoint is unreadable.
         OSError: a checkpoint cannot be written; the previous one stays.
     """
-    if len(samples) < options.batch_size:
-        raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
+    if len(samples) < BATCH_SIZE:
+        raise InputError(f"there are {len(samples)} samples; expected at least {BATCH_SIZE}; add views")
     n_objects = int(samples.label.max()) + 1
-    embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
-    basis = _color_basis(samples, network, embedding.config, embedding.sizes, options.batch_size)
-    embedding.model.color_basis[...] = jnp.asarray(basis)
+    embedding = Embedding.create(config, network, sizes, seed, classes, n_objects - len(classes))
+    embedding.model.color_basis[...] = jnp.asarray(_color_basis(samples, network, embedding.config, embedding.sizes))
     further = [
-        embedding.create_further(int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0]))
-        for number in range(1, options.networks)
+        embedding.create_further(int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+        for number in range(1, networks)
     ]
-    n_steps = len(samples) // options.batch_size
-    optimizer = _adamw(options.rate, n_steps * options.epochs)
-    split: Any = [nnx.split(model, nnx.Param, ...) for model in (embedding.model, *further)]
-    graphs = tuple(graph for graph, _, _ in split)
-    states = tuple(NetworkState(weights, rest, optimizer.init(weights)) for _, weights, rest in split)
+    n_steps = len(samples) // BATCH_SIZE
+    optimizer = _adamw(n_steps * epochs)
+    graphs, states = zip(*(initial_state(model, optimizer) for model in (embedding.model, *further)), strict=True)
     # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
-    seen = np.ones((options.networks, N_SCALARS + network.n_regions), np.float32)
+    seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0
 
     def epoch(number: int) -> Iterator[Batch]:
         # Order and dropout are drawn from seed and step, so that a resumed fit needs no generator state.
-        order = np.random.default_rng([options.seed, number]).permutation(len(samples))
-        return samples.batches(order[: n_steps * options.batch_size], options.batch_size)
+        order = np.random.default_rng([seed, number]).permutation(len(samples))
+        return samples.batches(order[: n_steps * BATCH_SIZE], BATCH_SIZE, config)
 
-    def step(states: tuple[NetworkState, ...], number: int, batch: Batch) -> tuple[tuple[NetworkState, ...], Any]:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), number + 1), options.networks)
-        return _step(graphs, optimizer, options.margin, embedding.network, embedding.config, states, batch, seen, keys)
+    def step(states: tuple[FitState, ...], number: int, batch: Batch) -> tuple[tuple[FitState, ...], Any]:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), number + 1), networks)
+        return _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
 
     states = run_epochs(
         "the embedding",
         states,
-        Steps(options.epochs, n_steps, options.batch_size),
+        Steps(epochs, n_steps, BATCH_SIZE),
         epoch,
         step,
         checkpoints,
@@ -232,7 +194,7 @@ def fit_embedding(
         epoch_done=epoch_done,
         place=lambda states: jax.tree.map(jnp.asarray, states),
     )
-    models = [nnx.merge(graph, state.parameters, state.rest) for graph, state in zip(graphs, states, strict=True)]
+    models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
     return fitted if classes else fitted.without_proxies()
 
@@ -242,8 +204,6 @@ BACKGROUND_VIEWS = 4096
 
 VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192
 """Views of each class and, at most, of all classes together."""
-
-BATCH = 256
 
 
 def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> References:
@@ -258,7 +218,8 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
     per_class = min(VIEWS_OF_CLASS, CLASS_VIEWS // max(n_classes, 1))
     chosen = [_choose(samples.label == label, per_class, rng) for label in range(n_classes)]
     rows = np.concatenate([*chosen, _choose(samples.label >= n_classes, BACKGROUND_VIEWS, rng)])
-    looks = (batch_looks(batch, embedding.network, embedding.config) for batch in samples.batches(rows, BATCH))
+    config = embedding.config
+    looks = (batch_looks(batch, embedding.network, config) for batch in samples.batches(rows, BATCH_SIZE, config))
     chunks = [embedding.embed_oriented(batch)[:, 0] for batch in looks]
     label = samples.label[rows]
     embedded, shown = np.concatenate(chunks)[: len(rows)], np.where(label < n_classes, label, BACKGROUND)

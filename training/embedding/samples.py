@@ -1,26 +1,64 @@
 """Samples that an embedding is fitted on: the strips of clouds in random orientations.
 
+    samples = build_samples(range(400), network, config, views=16, pool=local_workers(2))
+
 A sample stores only its occupied strips, about a tenth of all, and the statistics of its cloud.
+
+Views of objects are rendered from random cameras, with stronger augmentation than for classifiers: an embedding is used
+on cameras and objects that it never saw; a classifier is fitted on its own objects.
+
+Samples of distractors are kept in the user's cache: all runs use the same ones, and rendering them takes minutes. Each
+file holds the samples of one record of everything that determines them, and is named by the record's digest.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+import thor2_jax
+import training
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
+from thor2_jax.errors import InputError
+from thor2_jax.files import content_digest, json_digest, remove_leftovers
 from thor2_jax.types import Cloud
+from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.orientation import reorient
+from training.objects.meshes import load_mesh
+from training.objects.procedural import procedural_object
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import Camera, camera_pose, random_angles
+from training.storage.arrays import load_arrays, load_metadata, save_arrays
+from training.storage.jobs import locked, processor
+from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import padded_batches
 
-__all__ = ["Batch", "Samples", "concatenate_fields", "joined_samples", "sample_clouds"]
+__all__ = [
+    "AUGMENTATIONS",
+    "Batch",
+    "ObjectSource",
+    "Samples",
+    "build_samples",
+    "render_clouds",
+    "sample_clouds",
+    "stored_samples",
+]
 
 CLOUDS_PER_BATCH = 64
 
@@ -46,59 +84,56 @@ class Samples:
     """Samples in compact form, one after the other.
 
     Attributes:
-        start: [M + 1] int64, index of each sample's first strip, and the number of all strips.
+        strips: [M] int64, number of strips of each sample.
         strip: [T] uint16, slice x J + strip.
         length: [T] float16.
         color: [T, R] float16.
         statistics: [M, 12 + R + N_BALANCED] float32.
         label: [M] int32.
-        shape: S and J.
     """
 
-    start: NDArray[np.int64]
+    strips: NDArray[np.int64]
     strip: NDArray[np.uint16]
     length: NDArray[np.float16]
     color: NDArray[np.float16]
     statistics: NDArray[np.float32]
     label: NDArray[np.int32]
-    shape: tuple[int, int]
+
+    @classmethod
+    def concatenated(cls, chunks: Sequence["Samples"]) -> "Samples":
+        """Return the samples of all chunks; there is at least one."""
+        return cls(**{name: np.concatenate([chunk.arrays()[name] for chunk in chunks]) for name in chunks[0].arrays()})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays by the names of the fields."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def __len__(self) -> int:
         return len(self.label)
 
-    def _entries(self, rows: NDArray[np.integer[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the number of strips of each of the samples, and the indices of all their strips."""
-        counts = self.start[rows + 1] - self.start[rows]
-        return counts, np.arange(counts.sum()) + np.repeat(self.start[rows] - np.cumsum(counts) + counts, counts)
+    @functools.cached_property
+    def _ends(self) -> NDArray[np.int64]:
+        return np.cumsum(self.strips)
 
-    def fields(self, rows: NDArray[np.integer[Any]]) -> dict[str, NDArray[Any]]:
-        """Return the fields of the samples with the given indices, as `sample_clouds` returns them."""
-        counts, entry = self._entries(rows)
-        return {
-            "strips": counts,
-            "strip": self.strip[entry],
-            "length": self.length[entry],
-            "color": self.color[entry],
-            "statistics": self.statistics[rows],
-            "label": self.label[rows],
-        }
-
-    def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
+    def select(self, rows: NDArray[np.integer[Any]]) -> "Samples":
         """Return the samples with the given indices."""
-        counts, entry = self._entries(rows)
-        sample = np.repeat(np.arange(len(rows)), counts)
-        strip = self.strip[entry]
-        n_strips = self.shape[0] * self.shape[1]
-        length = np.zeros((len(rows), n_strips), np.float16)
-        color = np.zeros((len(rows), n_strips, self.color.shape[1]), np.float16)
-        length[sample, strip], color[sample, strip] = self.length[entry], self.color[entry]
-        grid = len(rows), *self.shape
-        return Batch(length.reshape(grid), color.reshape(*grid, -1), self.statistics[rows], self.label[rows])
+        strips = self.strips[rows]
+        entry = np.arange(strips.sum()) + np.repeat(self._ends[rows] - np.cumsum(strips), strips)
+        of_strips = self.strip[entry], self.length[entry], self.color[entry]
+        return Samples(strips, *of_strips, self.statistics[rows], self.label[rows])
 
-    def batches(self, rows: NDArray[np.integer[Any]], size: int) -> Iterator[Batch]:
+    def take(self, rows: NDArray[np.integer[Any]], config: DescriptorConfig) -> Batch:
+        """Return the samples with the given indices as a batch; `config` is that of the samples."""
+        chosen, grid = self.select(rows), (len(rows), config.n_slices, config.n_strips)
+        at = np.repeat(np.arange(len(rows)), chosen.strips), *np.divmod(chosen.strip, config.n_strips)
+        length, color = np.zeros(grid, np.float16), np.zeros((*grid, self.color.shape[1]), np.float16)
+        length[at], color[at] = chosen.length, chosen.color
+        return Batch(length, color, chosen.statistics, chosen.label)
+
+    def batches(self, rows: NDArray[np.integer[Any]], size: int, config: DescriptorConfig) -> Iterator[Batch]:
         """Yield the samples with the given indices in batches of one size; the last one is filled with the first."""
         for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
-            yield self.take(chunk)
+            yield self.take(chunk, config)
 
 
 def sample_clouds(
@@ -109,8 +144,8 @@ def sample_clouds(
     copies: int,
     rng: np.random.Generator,
     are_normal: bool = False,
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of samples of clouds, each in `copies` random orientations.
+) -> Samples:
+    """Return samples of clouds, each in `copies` random orientations.
 
     Args:
         clouds: xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8. At least one.
@@ -124,7 +159,7 @@ def sample_clouds(
     """
     order = range(len(clouds)) if are_normal else sorted(range(len(clouds)), key=lambda k: len(clouds[k][0]))
     label = np.array([labels[k] for k in order], np.int32)
-    chunks: list[dict[str, NDArray[Any]]] = []
+    chunks: list[Samples] = []
     done = 0
     for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
         normal = batch if are_normal else view_normalize(batch, config)
@@ -136,27 +171,163 @@ def sample_clouds(
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
             length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)
-            chunks.append(
-                {
-                    "strips": np.bincount(sample, minlength=count),
-                    "strip": strip.astype(np.uint16),
-                    "length": length[sample, strip].astype(np.float16),
-                    "color": color[sample, strip].astype(np.float16),
-                    "statistics": statistics,
-                    "label": label[done : done + count],
-                }
-            )
+            at, named = (sample, strip), label[done : done + count]
+            of_strips = strip.astype(np.uint16), length[at].astype(np.float16), color[at].astype(np.float16)
+            chunks.append(Samples(np.bincount(sample, minlength=count), *of_strips, statistics, named))
         done += count
-    return concatenate_fields(chunks)
+    return Samples.concatenated(chunks)
 
 
-def concatenate_fields(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Concatenate the fields of samples."""
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+OBJECTS_PER_TASK = 32
+
+AUGMENTATIONS = Augmentations.of_names(KINDS)
+
+UNCHANGED = 0.2
+"""Share of views without augmentation."""
+
+CAMERA = Camera.from_field_of_view(540, 405, 40.0)
+"""Half the pixels of the training camera: still two for each voxel of a cloud."""
+
+ObjectSource = int | Path
+"""The seed of a procedural object, or a mesh file."""
 
 
-def joined_samples(chunks: Sequence[Mapping[str, NDArray[Any]]], config: DescriptorConfig) -> Samples:
-    """Return the samples of the fields that `sample_clouds` returns."""
-    fields = concatenate_fields(chunks)
-    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
-    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)
+def render_clouds(objects: Mapping[int, ObjectSource], views: int, seed: int) -> list[tuple[int, Cloud]]:
+    """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
+
+    Args:
+        objects: index -> object.
+        views: number of views of each object.
+        seed: seed for cameras and augmentations, with the index.
+
+    Raises:
+        InputError: a mesh is unreadable.
+    """
+    clouds = []
+    for index, source in objects.items():
+        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+        caster = RayCaster([mesh])
+        rng = np.random.default_rng([seed, index])
+        for _ in range(views):
+            view = render_view(caster, camera_pose(*random_angles(rng), mesh.centre), CAMERA)
+            cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
+            if len(cloud[0]) >= MIN_VIEW_POINTS:
+                clouds.append((index, cloud))
+    return clouds
+
+
+def build_samples(
+    sources: Sequence[ObjectSource],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    views: int,
+    copies: int = 2,
+    seed: int = 0,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Samples:
+    """Render views of objects and sample them.
+
+    Args:
+        sources: objects; labels are indices into this sequence. An object that occurs n times has n times the views
+            and the label of its first occurrence.
+        network: colour network.
+        config: descriptor. Static.
+        views: number of views of each object.
+        copies: samples of each view, in random orientations.
+        seed: seed for cameras, augmentations and orientations.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (objects done, number of objects) at the start and after each task of a worker.
+
+    Raises:
+        InputError: a mesh is unreadable or is visible in none of its views.
+    """
+    numbered = list(enumerate(sources))
+    label_of = {source: index for index, source in reversed(numbered)}
+    tasks = [dict(numbered[first : first + OBJECTS_PER_TASK]) for first in range(0, len(sources), OBJECTS_PER_TASK)]
+    chunks: list[Samples] = []
+    progress(0, len(sources))
+    with closing(pool(functools.partial(render_clouds, views=views, seed=seed), tasks)) as results:
+        for task, rendered in zip(tasks, results, strict=True):
+            invisible = task.keys() - {index for index, _ in rendered}
+            if invisible:
+                raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
+            rng = np.random.default_rng([seed, len(sources), min(task)])
+            labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
+            chunks.append(sample_clouds(clouds, labels, network, config, copies, rng))
+            progress(max(task) + 1, len(sources))
+    return Samples.concatenated(chunks)
+
+
+MAX_FILES = 3
+"""Number of files that are kept; the ones that were used last."""
+
+FORMAT = "thor2 samples of distractors"
+NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
+
+CODE = ("augmentation", "embedding", "objects", "rendering", "views")
+LIBRARY_CODE = (".", "descriptor", "frames")
+"""Packages of training and of the library whose code determines the samples."""
+
+log = logging.getLogger(__name__)
+
+
+def stored_samples(job: Mapping[str, Any], directory: Path, build: Callable[[], Samples]) -> Samples:
+    """Return the samples of a job from a directory, or build them and store them there.
+
+    A directory that cannot be used costs the time to build the samples, and is logged as a warning.
+
+    Args:
+        job: record of everything that determines the samples beside the software and the kind of processor.
+        directory: the user's cache, or a directory of the training.
+        build: returns the samples.
+
+    Raises:
+        InputError: as `build`.
+        OSError: as `build`.
+    """
+    file = directory / f"distractors-{json_digest({**job, **_software()})}.safetensors"
+    try:
+        if file.is_file():
+            samples = Samples(**load_arrays(file))
+            with contextlib.suppress(OSError):  # a read-only cache is used as it is
+                os.utime(file)
+            return samples
+    except (OSError, ValueError, TypeError) as error:
+        advice = "" if _is_own(file) else "; delete this file"
+        log.warning("%s cannot be used (%s); the distractors are rendered again%s", file, error, advice)
+    samples = build()
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with locked(directory):
+            remove_leftovers(directory)
+            if not file.exists() or _is_own(file):
+                save_arrays(file, samples.arrays(), {"format": FORMAT})
+            own = [path for path in directory.iterdir() if _is_own(path)]
+            for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
+                path.unlink(missing_ok=True)
+    except InputError:
+        pass  # another process is writing, usually the same file
+    except OSError as error:
+        log.warning("the distractors cannot be kept for the next training: %s", error)
+    return samples
+
+
+def _software() -> dict[str, str]:
+    """Return the record of the software: users of a checkout change code within a version."""
+    root = Path(training.__file__).parent
+    folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
+    files = (file for folder in folders for file in sorted(folder.glob("*.py")))
+    return {
+        "version": thor2_jax.__version__,
+        "code": content_digest(file.read_bytes() for file in files),
+        "platform": f"{jax.default_backend()} {processor()}",
+    }
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is one of these, also of an earlier version, and may be replaced or removed."""
+    try:
+        return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
+    except (ValueError, KeyError):
+        return False

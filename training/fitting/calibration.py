@@ -16,7 +16,6 @@ from sklearn.linear_model import LogisticRegression
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, class_probabilities
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
@@ -24,15 +23,14 @@ from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import Cloud
+from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples
-from training.fitting.steps import FitContext, describe_batch
 from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
 
 __all__ = [
     "KEPT",
     "fit_calibration",
     "fit_temperature",
-    "negative_log_likelihood",
     "sample_probabilities",
     "temperatures",
 ]
@@ -87,38 +85,17 @@ def temperatures(
     }
 
 
-Floats = NDArray[np.floating[Any]]
-
-
-def negative_log_likelihood(probabilities: Floats, truth: NDArray[np.integer[Any]], temperature: float = 1.0) -> float:
-    """Return the mean of -log p(true class) over [N, C] probabilities with true class indices `truth` [N]."""
-    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
-    return float(-log_softmax(logits / temperature, axis=1)[np.arange(len(truth)), truth].mean())
-
-
-def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> float:
+def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.integer[Any]]) -> float:
     """Return the temperature between 0.01 and 100 that minimizes the negative log-likelihood of a held-out set.
 
     Args:
-        probabilities: [N, C] class probabilities of views that the classifier was not trained on.
+        probabilities: [N, C] class probabilities of views that the classifier was not trained on, N above 0.
         truth: [N] class indices.
-
-    Raises:
-        InputError: the shapes do not match, N is 0, or an index is not a class.
     """
-    probabilities, truth = np.asarray(probabilities), np.asarray(truth)
-    if probabilities.ndim != 2 or truth.shape != probabilities.shape[:1] or len(truth) == 0:
-        raise InputError(
-            f"probabilities and truth have shapes {probabilities.shape} and {truth.shape}; "
-            "expected [N, C] and [N] with N above 0"
-        )
-    if truth.min() < 0 or truth.max() >= probabilities.shape[1]:
-        raise InputError(
-            f"truth has values from {truth.min()} to {truth.max()}; expected 0 to {probabilities.shape[1] - 1}"
-        )
+    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
 
     def loss(exponent: float) -> float:
-        return negative_log_likelihood(probabilities, truth, math.exp(exponent))
+        return float(-log_softmax(logits / math.exp(exponent), axis=1)[np.arange(len(truth)), truth].mean())
 
     bounds = math.log(0.01), math.log(100)
     return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)

@@ -4,44 +4,193 @@ Two trainings with the same seed, views and options have the same folds, initial
 the same machine, with the same library versions and number of CPU devices, their weights and metrics are equal bit for
 bit, also if one of them was interrupted; only `samples_per_second` differs. On other hardware, on accelerators or with
 another number of devices, floating-point sums are rounded differently, and the weights are close but not equal.
+
+Steps are compiled and data-parallel over all devices of all processes (`batch_mesh`). Batches are sharded over the
+devices and weights are replicated; loss, gradients and batch normalization are means over the whole batch.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax  # type: ignore[import-untyped]
 from flax import nnx
-from jax.sharding import Mesh
+from jax.sharding import NamedSharding, PartitionSpec
+from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
+from colornet import ColorNetwork
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.describe import describe_strips
+from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
+from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.errors import InputError
-from thor2_jax.model.classifier import MLP
+from thor2_jax.model.classifier import MLP, Feature, feature_of
 from thor2_jax.model.run_directory import input_size
-from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
-from training.fitting.samples import Batch, Samples
-from training.fitting.steps import (
-    FitContext,
-    FitState,
-    count_correct,
-    initial_state,
-    replicate,
-    scale_inputs,
-    shard_batch,
-    train_step,
-)
+from thor2_jax.types import Descriptors
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
+from training.fitting.samples import Batch, Samples, expand
 
-__all__ = ["check_batch_size", "fit"]
+__all__ = [
+    "FitContext",
+    "FitState",
+    "count_correct",
+    "describe_batch",
+    "fit",
+    "initial_state",
+    "network_step",
+    "scale_inputs",
+    "shard_batch",
+    "train_step",
+]
+
+
+class FitState(NamedTuple):
+    """All that the training of a network changes. A pytree.
+
+    Attributes:
+        params: weights.
+        rest: batch statistics and constants.
+        optimizer: state of the optimizer.
+    """
+
+    params: Any
+    rest: Any
+    optimizer: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class FitContext:
+    """Constants of a fit; static under jit.
+
+    Attributes:
+        feature: which part of the descriptor the classifier reads.
+        network: colour network; gives the colour regions and their similarity.
+        config: descriptor, as the samples were built with.
+    """
+
+    feature: Feature
+    network: ColorNetwork
+    config: DescriptorConfig
+
+
+def initial_state(model: nnx.Module, optimizer: Any) -> tuple[Any, FitState]:
+    """Return the graph of a network (the network without its arrays) and the state before the first step."""
+    split: Any = nnx.split(model, nnx.Param, ...)
+    graph, params, rest = split
+    return graph, FitState(params, rest, optimizer.init(params))
+
+
+def shard_batch(batch: Batch) -> Batch:
+    """Move a batch to the devices, split along the samples; each process gives its own chunk of the batch."""
+    return _to_devices(batch, PartitionSpec(BATCH_AXIS))
+
+
+def _to_devices(tree: Any, spec: PartitionSpec) -> Any:
+    sharding = NamedSharding(batch_mesh(), spec)
+    return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), tree)
+
+
+def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """Return the descriptors of the samples of a batch."""
+    return describe_strips(expand(batch, region_sets(network).weights, config), network, config)
+
+
+def _replicated(tree: Any) -> Any:
+    """Constrain the arrays to be replicated on all devices."""
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(batch_mesh(), PartitionSpec()))
+
+
+def network_step(
+    graph: Any,
+    state: FitState,
+    optimizer: Any,
+    label: ArrayLike,
+    outputs_of: Callable[[Any], tuple[jax.Array, jax.Array]],
+) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
+    """Make one step of an optimizer on the cross-entropy of a network; call it under jit.
+
+    Args:
+        graph: the network without its arrays.
+        state: before the step.
+        optimizer: from optax.
+        label: [B] class indices.
+        outputs_of: function of the network that returns logits [B, C], and scores [B, C] of which the highest is the
+            answer.
+
+    Returns:
+        The next state, and the batch's loss and accuracy before the step.
+    """
+
+    def loss_of(params: Any) -> Any:
+        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
+        logits, scores = outputs_of(model)
+        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
+        return loss, ((scores.argmax(axis=-1) == label).mean(), nnx.state(model, nnx.Not(nnx.Param)))
+
+    (loss, (accuracy, rest)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    updates, moments = optimizer.update(gradients, state.optimizer, state.params)
+    return FitState(optax.apply_updates(state.params, updates), rest, moments), (loss, accuracy)
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
+def train_step(
+    context: FitContext, graph: Any, state: FitState, batch: Batch, rate: ArrayLike, seed: ArrayLike, step: ArrayLike
+) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
+    """Make one step of Adam.
+
+    Args:
+        context: static.
+        graph: the classifier without its arrays, from `initial_state`. Static.
+        state: donated; not usable afterwards.
+        batch: on the devices, from `shard_batch`.
+        rate: learning rate.
+        seed: seed for the dropout.
+        step: number of the step; dropout is drawn from it and the seed.
+
+    Returns:
+        The next state, and the batch's loss and accuracy before the step.
+    """
+    x = feature_of(describe_batch(batch, context.network, context.config), context.feature)
+    key = jax.random.fold_in(jax.random.key(seed), step)
+
+    def outputs_of(model: MLP) -> tuple[jax.Array, jax.Array]:
+        logits = model(x, train=True, rngs=nnx.Rngs(dropout=key))
+        return logits, logits
+
+    return _replicated(network_step(graph, state, optax.adam(rate), batch.label, outputs_of))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def count_correct(context: FitContext, graph: Any, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
+    """Return how many of the first `count` samples of a batch are classified correctly."""
+    model = nnx.merge(graph, state.params, state.rest, copy=True)
+    logits = model(feature_of(describe_batch(batch, context.network, context.config), context.feature))
+    correct = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
+    return _replicated(correct.sum())
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def scale_inputs(sample: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig) -> jax.Array:
+    """Return the input scaling [F]: 1 / root mean square over a batch, one value for images, one for embeddings."""
+    descriptors = describe_batch(sample, network, config)
+    images, embeddings = descriptors.images, descriptors.embeddings
+    block = dataclasses.replace(
+        descriptors,
+        images=jnp.full(images.shape[1:], jnp.sqrt((images**2).mean()))[None],
+        embeddings=jnp.full(embeddings.shape[1:], jnp.sqrt((embeddings**2).mean()))[None],
+        overflow=descriptors.overflow[:1],
+    )
+    size = feature_of(block, feature)[0]
+    return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+
 
 SCALE_SAMPLES = 1024
 """Approximate number of training samples that determine the input scaling."""
-
-
-def check_batch_size(batch_size: int, mesh: Mesh) -> None:
-    """Raise InputError unless the batch divides evenly among the devices."""
-    if batch_size % mesh.devices.size:
-        raise InputError(f"batch_size is {batch_size}; it must be a multiple of the {mesh.devices.size} devices")
 
 
 def fit(
@@ -60,8 +209,8 @@ def fit(
 
     Args:
         samples: training samples and held-out set; with several processes, the same in each.
-        context: feature, colour network, descriptor and devices.
-        options: epochs, learning rates, batch size and seed.
+        context: feature, colour network and descriptor.
+        options: epochs, learning rates, seed and batch size, a multiple of the number of devices.
         checkpoints: of this fit only; written after each epoch.
         held_out: [M], True for samples of the held-out set; by default there is none.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
@@ -73,15 +222,13 @@ def fit(
         without a held-out set, with the lowest training loss.
 
     Raises:
-        InputError: There are fewer than two training samples, the batch does not divide among the devices, a checkpoint
-            is unreadable, or the loss is not finite (the last checkpoint stays).
-        OSError: A checkpoint cannot be written; the previous one stays.
+        InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
+        OSError: A checkpoint cannot be written. The last complete one stays.
     """
     context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
-    n_devices, rows = context.mesh.devices.size, np.arange(len(samples)) if rows is None else rows
+    n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
     train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]
-    check_batch_size(options.batch_size, context.mesh)
     least = max(2, n_devices)
     if len(train_rows) < least:
         raise InputError(
@@ -93,13 +240,13 @@ def fit(
     model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
     chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
     model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
-    graph, initial = initial_state(model)
+    graph, initial = initial_state(model, optax.adam(0.0))
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""
         chunk = batch_size // jax.process_count()
         for first in range(jax.process_index() * chunk, len(rows), batch_size):
-            yield shard_batch(samples.take(rows[first : first + chunk]), context.mesh)
+            yield shard_batch(samples.take(rows[first : first + chunk]))
 
     def epoch(number: int) -> Iterator[Batch]:
         # The order is drawn from seed and epoch, so that a resumed fit needs no generator state.
@@ -132,7 +279,8 @@ def fit(
         progress=progress,
         epoch_done=epoch_done,
         held_out_accuracy=held_out_accuracy,
-        place=lambda state: replicate(state, context.mesh),
+        place=lambda state: _to_devices(state, PartitionSpec()),
     )
+    wait_for_all(f"fitted {context.feature}")
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch

@@ -14,27 +14,25 @@ An interrupted training resumes when it is called again. run.json is written las
 import contextlib
 import dataclasses
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.sharding import batch_mesh
+from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature
 from thor2_jax.model.fusion import Calibration
-from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import fit_run_embedding
 from training.fitting.calibration import fit_calibration, temperatures
-from training.fitting.fit import check_batch_size, fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
     BEGUN,
     CHECKPOINTS,
@@ -43,15 +41,15 @@ from training.fitting.loop import (
     append_metrics,
     discard_later_epochs,
     read_metrics,
+    wait_for_all,
 )
-from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
+from training.fitting.protocol import CALIBRATE, DESCRIBE, Protocol
 from training.fitting.samples import Samples, build_samples, fold_of_views
-from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource
 
-__all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
 JOB = f"{CHECKPOINTS}/{BEGUN}"
@@ -77,7 +75,7 @@ def is_finished(out: Path) -> bool:
     return trained and not (out / JOB).exists()
 
 
-def check_trained(digest: str, out: Path, settings: RunSettings) -> None:
+def check_trained(digest: str, out: Path, settings: Protocol) -> None:
     """Raise if a finished run differs from what `train_run` trains with these settings on views with this digest.
 
     Raises:
@@ -98,16 +96,10 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     return load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
 
 
-def _wait_for_all(point: str) -> None:
-    """Wait until all processes are here, so that none reads what the first one has not written."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(point)
-
-
 def train_run(
     source: ViewSource,
     out: str | Path,
-    settings: RunSettings,
+    settings: Protocol,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
@@ -131,12 +123,12 @@ def train_run(
         OSError: A file cannot be written; the last complete checkpoints stay.
     """
     out = Path(out).absolute()
-    if settings.distractors is not None:
-        settings.distractors.check(source.classes)
     check_out(out)
     job = settings.record(source.digest)
     check_begun(out, job, JOB)
-    check_batch_size(settings.fit.batch_size, batch_mesh())
+    size = settings.fit.batch_size
+    if size % jax.device_count():
+        raise InputError(f"batch_size is {size}; it must be a multiple of the {jax.device_count()} devices")
     with contextlib.ExitStack() as locks:
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
@@ -152,7 +144,7 @@ def train_run(
         is_held_out = folds > 1 or settings.distractors is not None
         parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
         fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, settings.fit.seed)
-        _wait_for_all("checked")
+        wait_for_all("checked")
         if first:
             if not resumed:
                 check_out(out)  # another process may have been quicker
@@ -160,12 +152,12 @@ def train_run(
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
             remove_leftovers(out)
-        _wait_for_all("begun")
+        wait_for_all("begun")
         runs = [
             _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()
             for fold in range(folds)
         ]
-        _wait_for_all("trained")
+        wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")
         return runs
@@ -194,7 +186,7 @@ def _held_out_parts(samples: Samples | _Views) -> int:
 class _Fold(NamedTuple):
     """One fold of a training: the arguments of `train_run`, its number, all samples, and which are held out."""
 
-    settings: RunSettings
+    settings: Protocol
     source: ViewSource
     out: Path
     number: int
@@ -212,10 +204,7 @@ class _Fold(NamedTuple):
         out, settings, samples = self.out, self.settings, self.samples
         directory = out if settings.folds == 1 else out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
-            classifiers, best_epochs = self.fit_classifiers()
-            calibrated: dict[str, float] = {}
-            if isinstance(samples, Samples):
-                calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
+            classifiers, best_epochs, calibrated = self.fit_classifiers()
             if jax.process_index() == 0:
                 run = TrainedRun(settings.config, settings.network, samples.classes, classifiers, {})
                 embedding, fitted = self.fit_embedding(run)
@@ -230,14 +219,26 @@ class _Fold(NamedTuple):
                     calibration, record["held_out_accuracy"][EMBEDDING] = fitted
                     record |= {"calibration": dataclasses.asdict(calibration)} if calibration is not None else {}
                 _publish(dataclasses.replace(run, record=record, embedding=embedding), self.scratch / "run", directory)
-            _wait_for_all("published")
+            wait_for_all("published")
         return load_run(directory)
 
-    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
-        """Fit the classifiers; return them and the epochs that they are from."""
-        settings, samples, first = self.settings, self.samples, jax.process_index() == 0
+    def begin(self, name: str) -> tuple[Checkpoints, Callable[[EpochMetrics], object]]:
+        """Return the checkpoints of a fit, and what logs an epoch; logged epochs without a checkpoint are removed."""
+        checkpoints, first = Checkpoints(self.scratch / name), jax.process_index() == 0
+        if first:
+            discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+
+        def epoch_done(metrics: EpochMetrics) -> None:
+            if first:
+                append_metrics(self.out / METRICS, self.number, name, metrics)
+
+        return checkpoints, epoch_done
+
+    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
+        """Fit the classifiers; return them, the epochs that they are from, and their temperatures."""
+        settings, samples = self.settings, self.samples
         if not isinstance(samples, Samples):
-            return {}, {}
+            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         for name in settings.classifiers:
@@ -246,46 +247,25 @@ class _Fold(NamedTuple):
             def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
                 self.progress(stage, done, total, metrics.describe(settings.fit.epochs))
 
-            def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
-                if first:
-                    append_metrics(self.out / METRICS, self.number, name, metrics)
-
-            context = FitContext(name, settings.network, settings.config)
-            with Checkpoints(self.scratch / name) as checkpoints:
-                if first:
-                    discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
-                classifiers[name], best_epochs[name] = fit(
-                    samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
-                )
-        return classifiers, best_epochs
+            context, (checkpoints, epoch_done) = FitContext(name, settings.network, settings.config), self.begin(name)
+            classifiers[name], best_epochs[name] = fit(
+                samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
+            )
+        calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
+        return classifiers, best_epochs, calibrated
 
     def fit_embedding(self, run: TrainedRun) -> tuple[Embedding | None, tuple[Calibration | None, float] | None]:
         """Fit the embedding, and the confidence and the accuracy on the held-out set; None without distractors."""
         settings, samples, held_out = self.settings, self.samples, self.held_out
         if settings.distractors is None or held_out is None:
             return None, None
-        metrics_file, several = self.out / METRICS, jax.process_count() > 1
 
         def report(stage: str, done: int, total: int, note: str = "") -> None:
             self.progress(settings.of_fold(stage, self.number), done, total, note)
 
-        # One of several processes fits the embedding, and checkpoints are written by all of them together.
-        with contextlib.nullcontext() if several else Checkpoints(self.scratch / EMBEDDING) as checkpoints:
-            done = checkpoints.last_epoch if checkpoints is not None else 0
-            discard_later_epochs(metrics_file, self.number, EMBEDDING, done)
-            labels = np.unique(samples.label)
-            embedding, kept = fit_run_embedding(
-                self.source,
-                {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels},
-                settings.distractors,
-                self.out / CHECKPOINTS / "distractors",
-                settings.network,
-                settings.config,
-                settings.fit.seed,
-                report,
-                checkpoints,
-                lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
-            )
+        labels, directory = np.unique(samples.label), self.out / CHECKPOINTS / "distractors"
+        views = {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels}
+        embedding, kept = fit_run_embedding(self.source, views, settings, directory, report, *self.begin(EMBEDDING))
         report(CALIBRATE, 0, 1)
         calibration = fit_calibration(run, embedding, kept)
         report(CALIBRATE, 1, 1)
@@ -308,9 +288,8 @@ def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
     """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
     shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed just here
     save_run(run, complete)
-    directory.mkdir(exist_ok=True)
-    (directory / "weights").mkdir(exist_ok=True)
-    embedding = () if run.embedding is None else (complete / REFERENCES_FILE, complete / EMBEDDING_FILE)
-    weights = (weights_file(complete, each) for each in run.classifiers)
-    for path in (*weights, *embedding, complete / "network.npz", complete / RUN_FILE):
+    for name in ("", "weights"):
+        (directory / name).mkdir(exist_ok=True)
+    files = [path for path in complete.rglob("*") if path.is_file()]
+    for path in sorted(files, key=lambda path: path.name == RUN_FILE):
         path.rename(directory / path.relative_to(complete))

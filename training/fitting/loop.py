@@ -1,39 +1,34 @@
 """The training loop of all networks, with metrics, and checkpoints from which an interrupted fit resumes.
 
-    with Checkpoints(directory) as checkpoints:
-        state = checkpoints.last(state) if checkpoints.last_epoch else state
-        for epoch in range(checkpoints.last_epoch + 1, epochs + 1):
-            ...
-            checkpoints.save(epoch, state, score)
-        state = checkpoints.best(state)
+    checkpoints = Checkpoints(directory)
+    state = checkpoints.last(state) if checkpoints.last_epoch else state
+    for epoch in range(checkpoints.last_epoch + 1, epochs + 1):
+        ...
+        checkpoints.save(epoch, state, score)
+    state = checkpoints.best(state)
 
 Two epochs are kept: the last one and the one with the best score. A checkpoint is written atomically, and an older one
-is removed only afterwards, so the last complete checkpoint survives any crash. Nothing else uses orbax's managers. The
-log of the metrics is JSON lines, readable while the training runs.
+is removed only afterwards, so the last complete checkpoint survives any crash. The log of the metrics is JSON lines,
+readable while the training runs.
 """
 
 import contextlib
 import dataclasses
 import json
-import logging
 import math
-import os
-import re
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp  # type: ignore[import-untyped]
-from orbax.checkpoint import checkpoint_managers
+from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import directory_digest, errors_name, write_text
+from thor2_jax.files import errors_name, remove_leftovers, write_text
 from thor2_jax.model.run_record import RUN_FILE
+from training.storage.arrays import load_arrays, load_metadata, save_arrays
 
 __all__ = [
     "BEGUN",
@@ -47,6 +42,7 @@ __all__ = [
     "find_run_directories",
     "read_metrics",
     "run_epochs",
+    "wait_for_all",
 ]
 
 MAX_SEED = 2**31 - 1
@@ -74,13 +70,10 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         for name, least in (("epochs", 1), ("batch_size", 2), ("seed", 0)):
-            if type(getattr(self, name)) is not int or getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)!r}; it must be an integer of at least {least}")
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be an integer of at least {least}")
         if self.seed > MAX_SEED:
             raise InputError(f"seed is {self.seed}; it must be at most {MAX_SEED}")
-        rates = self.learning_rates
-        if len(rates) != 2 or not all(isinstance(rate, int | float) and 0 < rate < math.inf for rate in rates):
-            raise InputError(f"learning_rates is {rates!r}; it must be two positive numbers")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,43 +139,37 @@ CHECKPOINTS = "checkpoints"
 BEGUN = "begun.json"
 """Job record of an unfinished training in this directory."""
 
-DIGEST_FILE = "sha256"
 
-
-class Checkpoints(contextlib.AbstractContextManager["Checkpoints"]):
-    """Checkpoints in one directory, which all processes of a training share."""
+class Checkpoints:
+    """Checkpoints in one directory, which all processes of a training share; the first process writes them."""
 
     def __init__(self, directory: str | Path) -> None:
-        """Open or create the directory, and remove incomplete checkpoints from it.
+        """Open or create the directory.
 
         Raises:
-            OSError: if the directory cannot be created.
+            InputError: a checkpoint is damaged.
+            OSError: the directory cannot be created.
         """
         self.directory = Path(directory).absolute()
         self.directory.mkdir(parents=True, exist_ok=True)
-        keep = checkpoint_managers.AnyPreservationPolicy(
-            [checkpoint_managers.LatestN(1), checkpoint_managers.BestN(get_metric_fn=_score, n=1)]
-        )
-        options = ocp.CheckpointManagerOptions(
-            preservation_policy=keep, best_fn=_score, cleanup_tmp_directories=True, enable_async_checkpointing=False
-        )
-        self._manager = ocp.CheckpointManager(self.directory, options=options)
-
-    def __exit__(self, *_: object) -> None:
-        self._manager.close()
+        remove_leftovers(self.directory)
+        self._scores: dict[int, float] = {}
+        for path in self.directory.glob("[0-9]*.safetensors"):
+            with self._readable(path):
+                self._scores[int(path.stem)] = float(load_metadata(path)["score"])
 
     @property
     def last_epoch(self) -> int:
         """Epoch of the last checkpoint; 0 if there is none."""
-        return int(self._manager.latest_step() or 0)
+        return max(self._scores, default=0)
 
     @property
     def best_epoch(self) -> int:
         """Epoch of the checkpoint with the highest score, the latest of equal ones; 0 if there is none."""
-        return int(self._manager.best_step() or 0)
+        return max(self._scores, key=lambda epoch: (self._scores[epoch], epoch), default=0)
 
     def save(self, epoch: int, state: Any, score: float) -> None:
-        """Write a checkpoint.
+        """Write a checkpoint, and remove those that are neither the last nor the best one.
 
         Args:
             epoch: number of the epoch, greater than that of the last checkpoint.
@@ -190,18 +177,15 @@ class Checkpoints(contextlib.AbstractContextManager["Checkpoints"]):
             score: quality of the state; higher is better.
 
         Raises:
-            OSError: if the checkpoint cannot be written, for example because the disk is full.
+            OSError: the checkpoint cannot be written, for example because the disk is full.
         """
-        host = _storable(jax.tree.map(np.asarray, state))
-        try:
-            with _quiet_orbax():
-                self._manager.save(epoch, args=ocp.args.StandardSave(host), metrics={"score": score})
-            if jax.process_index() == 0:
-                write_text(self._path(epoch) / DIGEST_FILE, directory_digest(self._path(epoch) / "default"))
-        except Exception as error:  # orbax passes on all exceptions of its storage layers
-            number, reason = _system_error(error)
-            message = f"the checkpoint of epoch {epoch} cannot be written: {reason}"
-            raise OSError(number, message, str(self.directory)) from None
+        if jax.process_index() == 0:
+            arrays = {str(number): np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}
+            save_arrays(self._path(epoch), arrays, {"score": repr(score)})
+        self._scores[epoch] = score
+        for old in self._scores.keys() - {self.last_epoch, self.best_epoch}:
+            del self._scores[old]
+            self._path(old).unlink(missing_ok=True)
 
     def last(self, like: Any) -> Any:
         """Return the state of the last checkpoint, as NumPy arrays.
@@ -219,67 +203,27 @@ class Checkpoints(contextlib.AbstractContextManager["Checkpoints"]):
         return self._restore(self.best_epoch, like)
 
     def _path(self, epoch: int) -> Path:
-        return self.directory / str(epoch)
+        return self.directory / f"{epoch}.safetensors"
+
+    @contextlib.contextmanager
+    def _readable(self, path: Path) -> Iterator[None]:
+        """Raise InputError if a checkpoint cannot be read in the block."""
+        try:
+            yield
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
+            ) from None
 
     def _restore(self, epoch: int, like: Any) -> Any:
-        path = self._path(epoch)
-        target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)
-        try:
-            # A process that is killed between checkpoint and digest leaves no digest.
-            digest = path / DIGEST_FILE
-            if digest.is_file() and digest.read_text() != directory_digest(path / "default"):
-                raise ValueError("it is damaged")
-            with _quiet_orbax():
-                state = self._manager.restore(epoch, args=ocp.args.StandardRestore(_storable(target)))
-            state = jax.tree.map(lambda leaf, expected: leaf if expected.size else expected, state, target)
-            for leaf, expected in zip(jax.tree.leaves(state), jax.tree.leaves(target), strict=True):
+        leaves, structure = jax.tree.flatten(like)
+        with self._readable(self._path(epoch)):
+            arrays = load_arrays(self._path(epoch))
+            stored = [arrays[str(number)] for number in range(len(leaves))]
+            for leaf, expected in zip(stored, leaves, strict=True):
                 if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
                     raise ValueError(f"it has {leaf.dtype} {leaf.shape}; expected {expected.dtype} {expected.shape}")
-        except Exception as error:  # orbax passes on all exceptions of its storage layers
-            raise InputError(
-                f"checkpoint: {path} cannot be read ({_first_line(error)}); remove {self.directory} to restart this fit"
-            ) from None
-        return state
-
-
-def _storable(state: Any) -> Any:
-    """Return a state with an element in each empty array, which orbax does not store."""
-    return jax.tree.map(lambda a: a if a.size else np.zeros(1, a.dtype), state)
-
-
-def _score(metrics: dict[str, float]) -> float:
-    return metrics["score"]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
-
-
-def _system_error(error: Exception) -> tuple[int | None, str]:
-    """Return the system's error number and message, from an OSError or from the text of tensorstore's error."""
-    match = re.search(r"os_error_code='(\d+)'", str(error))
-    number = error.errno if isinstance(error, OSError) else int(match[1]) if match else None
-    return number, os.strerror(number) if number else _first_line(error)
-
-
-@contextlib.contextmanager
-def _quiet_orbax() -> Iterator[None]:
-    """Suppress the tracebacks that orbax's threads log or print for errors that are raised anyway.
-
-    After an error, its threads find their event loop closed, also later; that message stays suppressed.
-    """
-    logger, hook = logging.getLogger("absl"), sys.excepthook
-
-    def print_others(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if not (kind is RuntimeError and str(error) == "Event loop is closed"):
-            hook(kind, error, traceback)
-
-    before, logger.disabled, sys.excepthook = logger.disabled, True, print_others
-    try:
-        yield
-        sys.excepthook = hook
-    finally:
-        logger.disabled = before
+            return jax.tree.unflatten(structure, stored)
 
 
 def find_run_directories(paths: Iterable[Path]) -> list[Path]:
@@ -300,6 +244,12 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
         else:
             directories += sorted(folds, key=lambda fold: int(fold.name[5:]))
     return directories
+
+
+def wait_for_all(point: str) -> None:
+    """Wait until all processes are here, so that none reads what the first one has not written."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(point)
 
 
 STEPS_PER_REPORT = 20

@@ -1,25 +1,41 @@
 """Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
-from training.embedding.run_embedding import STAGES, Distractors
-from training.embedding.sampling import AUGMENTATIONS
+from training.embedding.samples import AUGMENTATIONS, ObjectSource
 from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
-__all__ = ["CALIBRATE", "DEFAULT", "DESCRIBE", "PAPER", "QUICK", "Protocol", "RunSettings"]
+__all__ = [
+    "CALIBRATE",
+    "DEFAULT",
+    "DESCRIBE",
+    "ONE_HELD_OUT_OF",
+    "PAPER",
+    "QUICK",
+    "STAGES",
+    "Distractors",
+    "Protocol",
+]
 
 DESCRIBE = "describe"
 """Name of the first stage."""
 
 CALIBRATE = "fit the confidence"
 """Name of the last stage, with an embedding."""
+
+STAGES = ("render distractors", "describe for the embedding", "fit networks")
+"""Names of the stages of the embedding."""
 
 DESCRIBE_SHARE = 0.3
 """Time of describing the views, divided by that of rendering them; for the time left."""
@@ -31,9 +47,63 @@ EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
 """The same of an epoch of a classifier, or of one network of the embedding."""
 
 
+ONE_HELD_OUT_OF = 10
+"""One of so many distractors is held out."""
+
+
 @dataclasses.dataclass(frozen=True)
-class RunSettings:
-    """Everything beside the views that determines a trained run.
+class Distractors:
+    """Objects that are none of the classes, and how the embedding is fitted on them and the classes.
+
+    Attributes:
+        procedural: number of procedural objects.
+        meshes: name -> file of other objects.
+        views: views of each distractor.
+        epochs: passes over the samples.
+        networks: number of networks in the embedding; docs/decisions.md says why there are several.
+        workers: rendering processes; they do not affect the result.
+
+    Raises:
+        InputError: there are fewer than ten distractors.
+    """
+
+    procedural: int = 1500
+    meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    views: int = 8
+    epochs: int = 8
+    networks: int = 5
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        count = self.procedural + len(self.meshes)
+        if count < ONE_HELD_OUT_OF:
+            raise InputError(f"distractors: there are {count} objects; expected at least {ONE_HELD_OUT_OF}; give more")
+
+    @property
+    def sources(self) -> list[ObjectSource]:
+        """The meshes and the procedural objects in a random order, always the same, so that both kinds are held out."""
+        mixed: list[ObjectSource] = [*self.meshes.values(), *range(self.procedural)]
+        return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
+
+    def check(self, classes: Sequence[str]) -> None:
+        """Raise InputError if a distractor has the name of a class."""
+        shared = sorted(set(self.meshes) & set(classes))
+        if shared:
+            raise InputError(
+                f"distractors: {shared[0]!r} is also a class; expected other objects; remove its mesh from one of the "
+                "two directories"
+            )
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """All that determines the embedding, as JSON holds it."""
+        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
+        return named | {"meshes": sorted(self.meshes)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """A training protocol: everything that determines a trained run, beside the objects.
 
     Attributes:
         classifiers: descriptors that the classifiers read, any of "ce", "tops", "tops2"; with distractors, there may be
@@ -45,6 +115,9 @@ class RunSettings:
         orientation_copies: further samples of each view for the classifiers, in random orientations.
         distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
             some views are held out for it. None fits none.
+        azimuth_step: degrees between cameras around the object.
+        polar_step: degrees between cameras from pole to pole.
+        augmentations: augmented copies of each view; None adds none.
 
     Raises:
         InputError: a classifier is unknown.
@@ -57,6 +130,9 @@ class RunSettings:
     mirrors: Sequence[str] = MIRRORS
     orientation_copies: int = 0
     distractors: Distractors | None = None
+    azimuth_step: float = 5.0
+    polar_step: float = 5.0
+    augmentations: Augmentations | None = None
 
     def __post_init__(self) -> None:
         if self.classifiers or self.distractors is None:
@@ -99,23 +175,8 @@ class RunSettings:
             "learning_rates": list(self.fit.learning_rates),
         }
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Protocol(RunSettings):
-    """A training protocol: the settings of a run, and its views.
-
-    Attributes:
-        azimuth_step: degrees between cameras around the object.
-        polar_step: degrees between cameras from pole to pole.
-        augmentations: augmented copies of each view; None adds none.
-    """
-
-    azimuth_step: float
-    polar_step: float
-    augmentations: Augmentations | None = None
-
     def replace(self, **values: Any) -> "Protocol":
-        """Return the protocol with the given values of its own fields or of `fit`; None keeps the protocol's own.
+        """Return the protocol with the given values of its fields or of those of `fit`; None keeps the protocol's own.
 
         Without copies in other orientations, views are also used in a mirror.
 
@@ -150,7 +211,5 @@ PAPER = Protocol(
     classifiers=FEATURES,
     fit=FitOptions(epochs=100, batch_size=128),
     mirrors=PAPER_MIRRORS,
-    azimuth_step=5.0,
-    polar_step=5.0,
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -230,10 +230,8 @@ def fold_of_views(
         seed: seed for the assignment.
 
     Raises:
-        InputError: `folds` is not positive, or a class has fewer views than folds.
+        InputError: a class has fewer views than folds.
     """
-    if folds < 1:
-        raise InputError(f"folds is {folds}; it must be at least 1")
     rng = np.random.default_rng(seed)
     fold: NDArray[Any] = np.zeros(len(label), np.intp)
     for index, name in enumerate(classes):

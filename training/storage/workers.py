@@ -24,7 +24,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import needs_extra
 from thor2_jax.signals import signals_blocked
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
@@ -86,11 +86,6 @@ def _initialize_worker() -> None:
     threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
-def _check_workers(workers: int) -> None:
-    if workers < 1:
-        raise InputError(f"workers is {workers}; expected at least 1")
-
-
 class _Processes:
     """Worker processes, each of which is replaced when it dies, and a thread for each that waits for it.
 
@@ -145,7 +140,6 @@ def local_workers(workers: int = 1) -> WorkerPool:
     Raises:
         InputError: if `workers` is not positive.
     """
-    _check_workers(workers)
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
         if workers == 1:
@@ -170,9 +164,8 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             duration of the map.
 
     Raises:
-        InputError: if `workers` is not positive, or Ray is not installed.
+        InputError: if Ray is not installed.
     """
-    _check_workers(workers)
     with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
 

@@ -17,7 +17,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -32,7 +31,6 @@ from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 __all__ = [
     "CROPS",
     "CROP_SIZE",
-    "CropManifest",
     "MANIFEST",
     "QuantizedCrop",
     "ViewCrops",
@@ -41,10 +39,11 @@ __all__ = [
     "fill_depth",
     "intact_content",
     "quantized",
-    "read_crops",
+    "read_manifest",
     "rgbd_crop",
     "stacked",
     "surface_normals",
+    "write_manifest",
 ]
 
 CROP_SIZE = 224
@@ -77,16 +76,9 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
 
     Args:
         frame: frame with labels.
-        label: label number of the instance.
-        size: side of the crop, pixels.
-
-    Raises:
-        InputError: `size` is less than 1, or the instance has no pixel or no depth.
+        label: label number of an instance, of which some pixel has depth.
+        size: side of the crop, pixels, at least 1.
     """
-    if size < 1:
-        raise InputError(f"size is {size}; expected at least 1 pixel")
-    if label == 0 or label not in frame.instance_pixels:
-        raise InputError(f"label is {label}; expected one of the frame's instances: {frame.instances}")
     pixels = frame.instance_pixels[label]
     width = frame.depth.shape[1]
     rows, columns = np.divmod(pixels, width)
@@ -97,8 +89,6 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
     color, rays = np.zeros((side, side, 3), np.float32), np.zeros((side, side, 3))
     mask[inside] = True
     depth[inside] = frame.depth_m.ravel()[pixels]
-    if not depth.any():
-        raise InputError(f"label {label} has no depth in any of its {len(pixels)} pixels; expected some; leave it out")
     color[inside] = frame.color.reshape(-1, 3)[pixels] / np.float32(255)
     rays[inside] = pixel_rays(pixels, width, frame.intrinsics)
     normals = surface_normals(rays * fill_depth(depth, mask)[..., None], mask)
@@ -250,46 +240,43 @@ def encode_crops(crops: ViewCrops) -> bytes:
     return stream.getvalue()
 
 
-@dataclasses.dataclass(frozen=True)
-class CropManifest:
-    """The crops of a dataset.
+def write_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
+    """Write the manifest of a directory of crops.
 
-    Attributes:
+    Args:
+        directory: the directory.
         size: side of the crops, pixels.
         dataset: digest of the dataset.
         files: file name -> SHA-256 of the finished files.
+
+    Raises:
+        OSError: the manifest cannot be written.
     """
+    content = {"format": MANIFEST_FORMAT, "size": size, "dataset": dataset, "files": files}
+    write_text(directory / MANIFEST, json.dumps(content) + "\n")
 
-    size: int
-    dataset: str
-    files: Mapping[str, str]
 
-    def write(self, directory: Path) -> None:
-        """Write the manifest to the directory of the crops; raises OSError."""
-        write_text(directory / MANIFEST, json.dumps({"format": MANIFEST_FORMAT, **dataclasses.asdict(self)}) + "\n")
+def read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
+    """Return size, dataset and files of the manifest in a directory of crops, see `write_manifest`.
 
-    @classmethod
-    def read(cls, directory: Path) -> "CropManifest":
-        """Read the manifest in the directory of the crops.
-
-        Raises:
-            InputError: it is missing, damaged or of another format.
-        """
-        path = directory / MANIFEST
-        try:
-            content = json.loads(path.read_bytes())
-            if content["format"] != MANIFEST_FORMAT:
-                raise ValueError(f"its format is {content['format']!r}; expected {MANIFEST_FORMAT}")
-            return cls(int(content["size"]), str(content["dataset"]), dict(content["files"]))
-        except OSError:
-            raise InputError(
-                f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
-                "`thor2 render` command with --crops"
-            ) from None
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
-            ) from None
+    Raises:
+        InputError: it is missing, damaged or of another format.
+    """
+    path = directory / MANIFEST
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] != MANIFEST_FORMAT:
+            raise ValueError(f"its format is {content['format']!r}; expected {MANIFEST_FORMAT}")
+        return int(content["size"]), str(content["dataset"]), dict(content["files"])
+    except OSError:
+        raise InputError(
+            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
+            "`thor2 render` command with --crops"
+        ) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
+        ) from None
 
 
 def crop_file(shard: str) -> str:
@@ -302,37 +289,3 @@ def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
     path = directory / name
     content = path.read_bytes() if path.is_file() else b""
     return content if hashlib.sha256(content).hexdigest() == sha256 else None
-
-
-def read_crops(dataset: Path, digest: str, shard: str, size: int) -> ViewCrops:
-    """Read the crops of a shard.
-
-    Args:
-        dataset: directory of the dataset.
-        digest: its digest.
-        shard: file name of the shard.
-        size: side of the crops, pixels; larger stored ones are reduced.
-
-    Raises:
-        InputError: the dataset has no crops, smaller ones, or a file is missing or damaged.
-    """
-    directory = dataset / CROPS
-    manifest = CropManifest.read(directory)
-    if manifest.dataset != digest:
-        raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
-    if manifest.size < size:
-        raise InputError(
-            f"dataset: {directory} has crops of {manifest.size} pixels; expected at least {size}; delete it and render "
-            f"with --crops {size}"
-        )
-    name = crop_file(shard)
-    content = intact_content(directory, name, manifest.files[name]) if name in manifest.files else None
-    if content is None:
-        raise InputError(
-            f"dataset: {directory / name} is missing or damaged; repeat `thor2 render` with --crops to restore it"
-        )
-    try:
-        with np.load(io.BytesIO(content)) as arrays:
-            return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)
-    except (ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"dataset: {directory / name} is damaged ({error}); delete {directory}") from None

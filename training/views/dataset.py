@@ -22,6 +22,7 @@ time stamps: the same job gives the same bytes.
 import contextlib
 import dataclasses
 import hashlib
+import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -33,7 +34,7 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file, remove_written, write_text
-from training.views.crops import CROPS, MANIFEST, ViewCrops, read_crops
+from training.views.crops import CROPS, MANIFEST, ViewCrops, crop_file, intact_content, read_manifest
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
@@ -75,30 +76,6 @@ class Shard:
     views: int
     left_out: int
     points: int
-
-    def __post_init__(self) -> None:
-        numbers = (self.label, self.views, self.left_out, self.points)
-        if not all(type(number) is int and number >= 0 for number in numbers):
-            raise ValueError(f"label, views, left_out, points are {numbers!r}; expected non-negative integers")
-        if not isinstance(self.file, str) or Path(self.file).name != self.file:
-            raise ValueError(f"file is {self.file!r}; expected a plain file name")
-
-    def content(self, directory: Path) -> bytes:
-        """Return the bytes of the file.
-
-        Raises:
-            InputError: The file is missing, unreadable or has another checksum.
-        """
-        path = directory / self.file
-        try:
-            content = read_file(path)
-        except OSError as error:
-            raise InputError(
-                f"dataset: {path} cannot be read ({error.strerror}); repeat `thor2 render` to restore it"
-            ) from None
-        if hashlib.sha256(content).hexdigest() != self.sha256:
-            raise InputError(f"dataset: {path} is damaged (its checksum differs); repeat `thor2 render` to restore it")
-        return content
 
 
 def _dump(table: Mapping[str, Any]) -> str:
@@ -157,15 +134,7 @@ class Manifest:
                 checksum = table.pop("sha256")
                 if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
                     raise ValueError("its checksum differs")
-                manifest = cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
-                names = [entry["name"] for entry in manifest.job["objects"]]
-                if not all(isinstance(name, str) for name in names):
-                    raise ValueError(f"its objects are named {names!r}")
-                if any(shard.label >= len(names) for shard in manifest.shards):
-                    raise ValueError("a shard has a label without an object")
-                if type(manifest.job["shards"]) is not int or "descriptor_version" not in manifest.job:
-                    raise ValueError("its job lacks the number of shards or the descriptor version")
-                return manifest
+                return cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
@@ -246,7 +215,11 @@ class ViewDataset:
             InputError: The shard's file is missing or damaged.
         """
         shard = self.shards[index]
-        arrays = safetensors.numpy.load(shard.content(self.directory))
+        content = intact_content(self.directory, shard.file, shard.sha256)
+        if content is None:
+            path = self.directory / shard.file
+            raise InputError(f"dataset: {path} is missing or damaged; repeat `thor2 render` to restore it")
+        arrays = safetensors.numpy.load(content)
         xyz = arrays.pop("xyz").astype(np.float32) * np.float32(COORDINATE_STEP)
         return NormalizedViews(xyz, label=shard.label, **arrays)
 
@@ -260,4 +233,19 @@ class ViewDataset:
         Raises:
             InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
         """
-        return read_crops(self.directory, self.digest, self.shards[index].file, size)
+        directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
+        stored, digest, files = read_manifest(directory)
+        if digest != self.digest:
+            raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
+        if stored < size:
+            raise InputError(
+                f"dataset: {directory} has crops of {stored} pixels; expected at least {size}; delete it and render "
+                f"with --crops {size}"
+            )
+        content = intact_content(directory, name, files.get(name, ""))
+        if content is None:
+            raise InputError(
+                f"dataset: {directory / name} is missing or damaged; repeat `thor2 render` with --crops to restore it"
+            )
+        with np.load(io.BytesIO(content)) as arrays:
+            return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)

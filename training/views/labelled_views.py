@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import augmented_view
@@ -82,11 +82,7 @@ class WithLabelledViews:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
         rendered = self._rendered.digest if self._rendered else None
         copies = [self._copies(name) for name in self._views]
-        return hashlib.sha256(repr((rendered, self._digest_of_instances, copies)).encode()).hexdigest()
-
-    @functools.cached_property
-    def _digest_of_instances(self) -> str:
-        return digest_of_instances(self._views)
+        return hashlib.sha256(repr((rendered, digest_of_instances(self._views), copies)).encode()).hexdigest()
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -96,7 +92,7 @@ class WithLabelledViews:
             "digest": self.digest,
             "views": sum(shard.views for shard in self.shards),
             "frames": {
-                "digest": self._digest_of_instances,
+                "digest": digest_of_instances(self._views),
                 "instances": {name: len(each) for name, each in self._views.items()},
                 "copies": {name: self._copies(name) for name in self._views},
                 "skipped": self._skipped,
@@ -126,13 +122,12 @@ class WithLabelledViews:
         """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
 
         Raises:
-            InputError: as the source of the rendered views, or there are no crops of the instances.
+            InputError: as the source of the rendered views.
         """
         if index < self._first:
             assert self._rendered is not None
             return self._rendered.read_crops(index, size)
-        if self._crops is None:
-            raise InputError("frames: the instances were read without crops; expected crops for image networks")
+        assert self._crops is not None
         name = list(self._views)[index - self._first]
         crops, times = self._crops[name], 1 + self._copies(name)
         reduced = stacked(crops, len(crops[0][0])).reduced(size)

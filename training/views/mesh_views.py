@@ -1,6 +1,6 @@
 """Render training clouds: one coloured point cloud per view of a mesh (paper, section "Training").
 
-    views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5, workers=2)     # name -> clouds
+    views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5)     # name -> clouds
 
 `render_dataset` writes more views than memory holds to disk. Nothing here imports JAX, so that processes that render
 start quickly.
@@ -8,10 +8,7 @@ start quickly.
 
 import dataclasses
 import hashlib
-import itertools
-import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +25,6 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import RenderedView, camera_pose, random_angles, view_angles
-from training.storage.workers import local_workers
 
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from thor2_jax.types import Cloud
@@ -37,26 +33,22 @@ __all__ = [
     "MESH_VIEWS",
     "MIN_VIEW_POINTS",
     "RenderProgress",
-    "ViewCloud",
     "ViewTask",
     "all_views",
     "checked_meshes",
     "cloud_of",
     "clouds_per_view",
     "mesh_views",
+    "read_mesh",
     "render_task",
     "render_views",
     "view_cloud",
-    "view_tasks",
 ]
 
 SIGMA_S = DescriptorConfig().sigma_s
 
 MIN_VIEW_POINTS = 30
 """Views with fewer points are left out: too little of the object is visible to describe it."""
-
-VIEWS_PER_TASK = 256
-"""Views per task: rendering them takes long compared with sending and indexing a mesh (0.03 s)."""
 
 RenderProgress = Callable[[int, int], object]
 """Called with (clouds done, total clouds)."""
@@ -120,23 +112,6 @@ class ViewTask:
     seed: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewCloud:
-    """The cloud of one view.
-
-    Attributes:
-        view: index of the view among all views of the object.
-        copy: 0 is the view as rendered, others are augmented views from random cameras.
-        xyz: [n, 3] float32, metres, camera frame.
-        rgb: [n, 3] uint8.
-    """
-
-    view: int
-    copy: int
-    xyz: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-
-
 def clouds_per_view(augmentations: Augmentations | None) -> int:
     """Return the number of clouds per view: the view as rendered and its augmented copies."""
     return 1 + augmentations.copies if augmentations else 1
@@ -159,17 +134,21 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
             yield number, copy, augment(other, task.augmentations, rng)
 
 
-def _clouds(task: ViewTask) -> Iterator[ViewCloud]:
-    clouds = (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
-    return (cloud for cloud in clouds if len(cloud.xyz) >= MIN_VIEW_POINTS)
+def _clouds(task: ViewTask) -> Iterator[tuple[int, int, "Cloud"]]:
+    clouds = ((number, copy, cloud_of(view)) for number, copy, view in all_views(task))
+    return ((number, copy, cloud) for number, copy, cloud in clouds if len(cloud[0]) >= MIN_VIEW_POINTS)
 
 
-def render_task(task: ViewTask) -> list[ViewCloud]:
-    """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy."""
+def render_task(task: ViewTask) -> list[tuple[int, int, "Cloud"]]:
+    """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy.
+
+    Each has the index of its view among all views of the object, and the number of the copy: 0 is the view as rendered.
+    """
     return list(_clouds(task))
 
 
-def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
+def read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
+    """Return the mesh of a file, or the mesh itself."""
     return source if isinstance(source, TexturedMesh) else load_mesh(source)
 
 
@@ -184,7 +163,7 @@ def checked_meshes(
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
-        mesh = _mesh(source)
+        mesh = read_mesh(source)
         if next(_clouds(ViewTask(name, mesh, angles)), None) is None:
             raise InputError(
                 f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
@@ -193,30 +172,8 @@ def checked_meshes(
         yield name, mesh
 
 
-def view_tasks(
-    meshes: Mapping[str, Path | TexturedMesh],
-    angles: NDArray[np.float64],
-    starts: Iterable[tuple[str, int]],
-    size: int,
-    augmentations: Augmentations | None = None,
-    seed: int = 0,
-) -> Iterator[ViewTask]:
-    """Yield one task of `size` views for each start, an object's name and the index of its first view.
-
-    A mesh is read once for consecutive starts of its object.
-    """
-    for name, group in itertools.groupby(starts, key=operator.itemgetter(0)):
-        mesh = _mesh(meshes[name])
-        for _, first in group:
-            yield ViewTask(name, mesh, angles[first : first + size], first, augmentations, seed)
-
-
 def render_views(
-    meshes: Mapping[str, Path | TexturedMesh],
-    azimuth_step: float = 5.0,
-    polar_step: float = 5.0,
-    workers: int = 1,
-    progress: RenderProgress = lambda done, total: None,
+    meshes: Mapping[str, Path | TexturedMesh], azimuth_step: float = 5.0, polar_step: float = 5.0
 ) -> dict[str, list["Cloud"]]:
     """Render the training clouds of every object to memory (about 15 kB per view of a scan).
 
@@ -224,27 +181,17 @@ def render_views(
         meshes: object name -> mesh file, as from `find_meshes`, or mesh.
         azimuth_step: degrees; divides 360.
         polar_step: degrees; divides 180.
-        workers: rendering processes; the result does not depend on their number. With more than 1, the calling script
-            needs the `if __name__ == "__main__"` guard of `multiprocessing`.
-        progress: called after each task.
 
     Returns:
         name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8), in the order of `meshes` and
         `view_angles`; views with fewer than `MIN_VIEW_POINTS` points are left out.
 
     Raises:
-        InputError: There are no meshes, a mesh is unreadable or never visible, or a step or `workers` is invalid.
+        InputError: There are no meshes, a mesh is unreadable or never visible, or a step is invalid.
     """
-    angles, pool = view_angles(azimuth_step, polar_step), local_workers(workers)
-    views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(meshes, angles)}
-    starts = [(name, first) for name in meshes for first in range(0, len(angles), VIEWS_PER_TASK)]
-    done, total = 0, len(angles) * len(meshes)
-    with closing(pool(render_task, view_tasks(meshes, angles, starts, VIEWS_PER_TASK))) as results:
-        for (name, first), clouds in zip(starts, results, strict=True):
-            views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
-            done += len(angles[first : first + VIEWS_PER_TASK])
-            progress(done, total)
-    return views
+    angles = view_angles(azimuth_step, polar_step)
+    tasks = (ViewTask(name, mesh, angles) for name, mesh in checked_meshes(meshes, angles))
+    return {task.name: [cloud for _, _, cloud in _clouds(task)] for task in tasks}
 
 
 MESH_VIEWS = 60
@@ -268,8 +215,8 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int 
     name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
     augmentations = Augmentations.of_names(KINDS, copies=1)
     task = ViewTask(name, loaded, _evenly_spread(cameras), augmentations=augmentations)
-    clouds = enumerate(render_task(task))
-    views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
+    clouds = enumerate(_clouds(task))
+    views = [PreparedInstance(k, xyz, rgb, np.zeros(len(xyz), bool)) for k, (_, _, (xyz, rgb)) in clouds]
     if not views:
         raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
     return views

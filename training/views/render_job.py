@@ -16,7 +16,8 @@ import dataclasses
 import functools
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +29,22 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import atomic_write, check_output_directory, content_digest, remove_leftovers
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
+from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
 from training.rendering.view_sphere import DISTANCE, TRAINING_CAMERA, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views import crops, mesh_views
-from training.views.crops import CROP_SIZE, CropManifest, QuantizedCrop, crop_file, intact_content
+from training.views.crops import CROP_SIZE, QuantizedCrop, crop_file, intact_content
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
-from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view, view_tasks
-from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
+from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view
+from training.views.normalized_views import COORDINATE_STEP, normalize_views
 
 __all__ = ["dataset_job", "mesh_digest", "render_crops", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
-
-SUFFIX = ".safetensors"
 
 
 def mesh_digest(mesh: TexturedMesh) -> str:
@@ -53,20 +53,6 @@ def mesh_digest(mesh: TexturedMesh) -> str:
     for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
         parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
     return content_digest(parts)
-
-
-def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
-    """Check every mesh and return the names and digests of the objects."""
-    objects = []
-    for name, mesh in mesh_views.checked_meshes(meshes, angles):
-        diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if SIGMA_S * diameter > MAX_VIEW_LENGTH:
-            raise InputError(
-                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
-                "stored; scale the mesh to metres"
-            )
-        objects.append({"name": name, "mesh": mesh_digest(mesh)})
-    return objects
 
 
 def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
@@ -89,16 +75,15 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
-def _store(path: Path, label: int, planned: int, rendered: Sequence[mesh_views.ViewCloud]) -> Shard:
+def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
     """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
 
     Raises:
         InputError: A cloud cannot be normalized or stored.
         OSError: The file cannot be written.
     """
-    clouds = [(cloud.xyz, cloud.rgb) for cloud in rendered]
-    numbers = [cloud.view for cloud in rendered], [cloud.copy for cloud in rendered]
-    views = normalize_views(clouds, label, *numbers, DescriptorConfig())
+    numbers = [number for number, _, _ in rendered], [copy for _, copy, _ in rendered]
+    views = normalize_views([cloud for _, _, cloud in rendered], label, *numbers, DescriptorConfig())
     content = encode(views)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -106,38 +91,30 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[mesh_views.V
     return Shard(path.name, digest, label, n_views, left_out=planned - n_views, points=len(views.xyz))
 
 
-@dataclasses.dataclass(frozen=True)
-class ShardPlan:
-    """Which views each shard of a dataset holds.
+def _plan(n_objects: int, n_views: int, copies: int) -> dict[str, tuple[int, range]]:
+    """Return file name -> label and numbers of the views, for the shards of objects with `copies` clouds of a view."""
+    size = max(1, CLOUDS_PER_SHARD // copies)
+    return {
+        f"{label:04d}-{number:04d}.safetensors": (label, range(first, min(first + size, n_views)))
+        for label in range(n_objects)
+        for number, first in enumerate(range(0, n_views, size))
+    }
 
-    Attributes:
-        angles: [n, 2] azimuth and polar angle of every view of an object.
-        copies: clouds per view.
-        names: of the objects.
-    """
 
-    angles: NDArray[np.float64]
-    copies: int
-    names: tuple[str, ...]
-
-    @property
-    def size(self) -> int:
-        """Views per shard."""
-        return max(1, CLOUDS_PER_SHARD // self.copies)
-
-    @property
-    def clouds(self) -> int:
-        """Clouds in all shards, with those that will be left out."""
-        return self.copies * len(self.angles) * len(self.names)
-
-    @functools.cached_property
-    def shards(self) -> dict[str, tuple[int, int]]:
-        """File name -> label and index of the first view."""
-        return {
-            f"{label:04d}-{number:04d}{SUFFIX}": (label, first)
-            for label in range(len(self.names))
-            for number, first in enumerate(range(0, len(self.angles), self.size))
-        }
+def _tasks(
+    meshes: Mapping[str, Path | TexturedMesh],
+    names: Sequence[str],
+    angles: NDArray[np.float64],
+    shards: Iterable[tuple[int, range]],
+    augmentations: Augmentations | None,
+    seed: int,
+) -> Iterator[ViewTask]:
+    """Yield the task of each shard; a mesh is read once for consecutive shards of its object."""
+    for label, group in itertools.groupby(shards, key=operator.itemgetter(0)):
+        mesh = mesh_views.read_mesh(meshes[names[label]])
+        for _, views in group:
+            of_views = angles[views.start : views.stop]
+            yield ViewTask(names[label], mesh, of_views, views.start, augmentations, seed)
 
 
 def dataset_job(
@@ -155,8 +132,9 @@ def dataset_job(
     if seed < 0:
         raise InputError(f"seed is {seed}; it must be at least 0")
     angles = view_angles(azimuth_step, polar_step)
-    objects = _objects(meshes, angles)
-    plan = ShardPlan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
+    checked = mesh_views.checked_meshes(meshes, angles)
+    objects = [{"name": name, "mesh": mesh_digest(mesh)} for name, mesh in checked]
+    plan = _plan(len(objects), len(angles), clouds_per_view(augmentations))
     camera = TRAINING_CAMERA
     # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
     intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
@@ -171,7 +149,7 @@ def dataset_job(
         "polar_step": float(polar_step),
         "variations": {"seed": seed, "cameras": "random", **augmentations.record()} if augmentations else None,
         "objects": objects,
-        "shards": len(plan.shards),
+        "shards": len(plan),
     }
 
 
@@ -201,30 +179,28 @@ def render_dataset(
         seed: seed for the augmentations. The copies of an object do not depend on the other objects.
 
     Raises:
-        InputError: Nothing is written if there are no meshes, a mesh is unreadable, too large or never visible, a step
-            or the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
+        InputError: Nothing is written if there are no meshes, a mesh is unreadable or never visible, a step or
+            the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
             written by another process.
         OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)
     check_output_directory(out, MANIFEST)
     job = dataset_job(meshes, azimuth_step, polar_step, augmentations, seed)
-    angles = view_angles(azimuth_step, polar_step)
-    plan = ShardPlan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in job["objects"]))
+    names = [entry["name"] for entry in job["objects"]]
+    angles, copies = view_angles(azimuth_step, polar_step), clouds_per_view(augmentations)
+    plan, total = _plan(len(names), len(angles), copies), len(names) * len(angles) * copies
     with locked(out):
         done = {shard.file: shard for shard in _begin(out, job).shards}
-        progress(_clouds(done), plan.clouds)
-        missing = [file for file in plan.shards if file not in done]
-        starts = [(plan.names[label], first) for label, first in (plan.shards[file] for file in missing)]
-        tasks = view_tasks(meshes, angles, starts, plan.size, augmentations, seed)
+        progress(_clouds(done), total)
+        missing = {file: shard for file, shard in plan.items() if file not in done}
+        tasks = _tasks(meshes, names, angles, missing.values(), augmentations, seed)
         with contextlib.closing(pool(mesh_views.render_task, tasks)) as results:
-            for file, rendered in zip(missing, results, strict=True):
-                label, first = plan.shards[file]
-                planned = plan.copies * len(angles[first : first + plan.size])
-                with with_context(f"object {plan.names[label]!r}"):
-                    done[file] = _store(out / file, label, planned, rendered)
-                Manifest(job, tuple(done[name] for name in plan.shards if name in done)).write(out)
-                progress(_clouds(done), plan.clouds)
+            for (file, (label, views)), rendered in zip(missing.items(), results, strict=True):
+                with with_context(f"object {names[label]!r}"):
+                    done[file] = _store(out / file, label, copies * len(views), rendered)
+                Manifest(job, tuple(done[name] for name in plan if name in done)).write(out)
+                progress(_clouds(done), total)
     return ViewDataset.open(out)
 
 
@@ -252,25 +228,11 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
-    stored, requested = CropManifest.read(directory), {"crops": size, "dataset": dataset.digest}
-    check_same_job(directory, {"crops": stored.size, "dataset": stored.dataset}, requested)
+    stored_size, digest, files = crops.read_manifest(directory)
+    requested = {"crops": size, "dataset": dataset.digest}
+    check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
     remove_leftovers(directory)
-    return {name: sha for name, sha in stored.files.items() if intact_content(directory, name, sha) is not None}
-
-
-def _of_shard(
-    dataset: ViewDataset, index: int, rendered: Mapping[tuple[int, int], QuantizedCrop], size: int
-) -> crops.ViewCrops:
-    """Return the crops of the clouds of a shard, in their order."""
-    views = dataset.read(index)
-    keys = list(zip(views.view.tolist(), views.copy.tolist(), strict=True))
-    missing = [key for key in keys if key not in rendered]
-    if missing:
-        raise InputError(
-            f"meshes: view {missing[0][0]} of {dataset.classes[views.label]!r} is in {dataset.directory}, but is empty "
-            "now; give the meshes of the dataset"
-        )
-    return crops.stacked([rendered[key] for key in keys], size)
+    return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
 
 
 def render_crops(
@@ -285,7 +247,7 @@ def render_crops(
     """Render the crops of all views of a dataset; an interrupted rendering resumes.
 
     Args:
-        meshes: the meshes of the dataset.
+        meshes: those that the dataset was rendered from.
         dataset: the dataset.
         size: side of the crops, pixels, at least 1.
         pool: worker processes that render; does not affect the result.
@@ -294,29 +256,27 @@ def render_crops(
         seed: seed of the dataset.
 
     Raises:
-        InputError: the dataset has crops of another size or views of other meshes.
+        InputError: the dataset has crops of another size.
         OSError: a file cannot be written; the rendering can be resumed.
     """
     directory = dataset.directory / crops.CROPS
-    job = dataset.manifest.job
-    angles = view_angles(job["azimuth_step"], job["polar_step"])
-    plan = ShardPlan(angles, clouds_per_view(augmentations), dataset.classes)
+    angles = view_angles(dataset.manifest.job["azimuth_step"], dataset.manifest.job["polar_step"])
+    plan = _plan(len(dataset.classes), len(angles), clouds_per_view(augmentations))
     with locked(directory):
         done = _begin_crops(directory, dataset, size)
         missing = [index for index, shard in enumerate(dataset.shards) if crop_file(shard.file) not in done]
-        total = sum(shard.views for shard in dataset.shards)
-        n_done = total - sum(dataset.shards[index].views for index in missing)
-        progress(n_done, total)
-        places = [plan.shards[dataset.shards[index].file] for index in missing]
-        starts = [(dataset.classes[label], first) for label, first in places]
-        tasks = view_tasks(meshes, angles, starts, plan.size, augmentations, seed)
+        n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
+        progress(n_done, len(dataset))
+        shards = [plan[dataset.shards[index].file] for index in missing]
+        tasks = _tasks(meshes, dataset.classes, angles, shards, augmentations, seed)
         with contextlib.closing(pool(functools.partial(_crops_of_task, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
-                name = crop_file(dataset.shards[index].file)
-                content = crops.encode_crops(_of_shard(dataset, index, rendered, size))
+                views, name = dataset.read(index), crop_file(dataset.shards[index].file)
+                of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
+                content = crops.encode_crops(crops.stacked(of_shard, size))
                 with atomic_write(directory / name) as temporary:
                     temporary.write_bytes(content)
                 done[name] = hashlib.sha256(content).hexdigest()
-                CropManifest(size, dataset.digest, dict(sorted(done.items()))).write(directory)
-                n_done += dataset.shards[index].views
-                progress(n_done, total)
+                crops.write_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
+                n_done += len(views)
+                progress(n_done, len(dataset))

@@ -1,7 +1,6 @@
 """Fixtures shared by the tests of the command line."""
 
 import dataclasses
-import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,8 +12,7 @@ from thor2_jax.gallery import embedding, objects
 from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
-from training.embedding import run_embedding
-from training.embedding.fit import EmbeddingFit
+from training.embedding import fit, run_embedding
 from training.fitting import protocol
 from training.fitting.protocol import DEFAULT, PAPER
 from training.views import mesh_views
@@ -43,7 +41,7 @@ def small_descriptors() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
         patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(run_embedding, "EmbeddingFit", functools.partial(EmbeddingFit, batch_size=64))
+        patch.setattr(fit, "BATCH_SIZE", 64)
         patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
         patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
         yield

@@ -1,8 +1,7 @@
 """Fitting of embeddings: samples, orientations, resumption, determinism, and what a short fit achieves."""
 
 import dataclasses
-import itertools
-from collections.abc import Generator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import SMALL_CONFIG
+from helpers import SMALL_CONFIG, assert_refused
 
 import colornet
 import thor2_jax as thor2
@@ -20,40 +19,47 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import model_arrays
 from training.augmentation import orientation
-from training.embedding import fit, sampling
-from training.embedding.build import main
-from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.samples import Samples, sample_clouds
-from training.embedding.sampling import ViewTask, build_samples, render_clouds
-from training.storage.workers import IN_PROCESS
+from training.embedding import fit
+from training.embedding import samples as module
+from training.embedding.build import build_embedding
+from training.embedding.fit import fit_embedding
+from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
 OBJECTS = range(2, 42, 5)  # all of their views have enough points
 CLASSES = ("a", "b")
-OPTIONS = EmbeddingFit(epochs=12, batch_size=32, rate=5e-3)
+EPOCHS = 12
 
 whole_embedding = nnx.jit(lambda model, *inputs: model(*inputs))
 learned_block = nnx.jit(lambda model, *inputs: model.learned(*inputs))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_batches() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "BATCH_SIZE", 32)
+        patch.setattr(fit, "RATE", 5e-3)
+        yield
+
+
 @pytest.fixture(scope="module")
-def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
-    return build_samples(OBJECTS, tmp_path_factory.mktemp("embedding") / "samples", NETWORK, SMALL_CONFIG, views=6)
+def views() -> Samples:
+    return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, views=6)
 
 
 def test_views_depend_on_seed_and_object_only() -> None:
-    one = render_clouds(ViewTask({3: 15, 4: 20}, 2, 0))
-    again = render_clouds(ViewTask({4: 20}, 2, 0))
+    one = render_clouds({3: 15, 4: 20}, 2, 0)
+    again = render_clouds({4: 20}, 2, 0)
     assert [index for index, _ in one] == [3, 3, 4, 4]
     np.testing.assert_equal(again, one[2:])
-    other = render_clouds(ViewTask({4: 20}, 2, 1))
+    other = render_clouds({4: 20}, 2, 1)
     assert not np.array_equal(other[0][1][0], again[0][1][0])
 
 
-def test_each_object_has_one_label(views: Samples, tmp_path: Path) -> None:
+def test_each_object_has_one_label(views: Samples) -> None:
     assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
-    repeated = build_samples([5, 10, 5], tmp_path / "samples", NETWORK, SMALL_CONFIG, views=2, copies=1)
+    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, copies=1)
     assert sorted(repeated.label) == [0, 0, 0, 0, 1, 1]
     first = repeated.statistics[repeated.label == 0]
     assert len(np.unique(first, axis=0)) == 4
@@ -63,13 +69,12 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     monkeypatch.setattr(
         orientation, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
     )
-    rendered = render_clouds(ViewTask({0: 0, 1: 10}, 3, 0))
+    rendered = render_clouds({0: 0, 1: 10}, 3, 0)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
     rng = np.random.default_rng(0)
-    fields = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, 1, rng)
-    start = np.concatenate([[0], np.cumsum(fields.pop("strips"))])
+    samples = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, 1, rng)
     rows = np.array([5, 0, 5, 1, 2])
-    batch = Samples(start=start, shape=(2, 5), **fields).take(rows)
+    batch = samples.take(rows, SMALL_CONFIG)
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     normal = thor2.view_normalize(thor2.PointClouds.pack([rendered[k][1] for k in order[rows]]), SMALL_CONFIG)
     descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
@@ -83,24 +88,18 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 
 
-def test_an_interrupted_sampling_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(sampling, "OBJECTS_PER_SHARD", 3)
-
-    def interrupted(function, items) -> Generator:
-        yield from map(function, itertools.islice(items, 2))
-        raise KeyboardInterrupt
-
-    arguments = NETWORK, SMALL_CONFIG, 2
-    with pytest.raises(KeyboardInterrupt):
-        build_samples(OBJECTS, tmp_path / "one", *arguments, pool=interrupted)
-    assert len(list((tmp_path / "one").glob("*.safetensors"))) == 2
+def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A batch is made of the selected samples; a selection has the samples in its order."""
+    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
     done = []
-    resumed = build_samples(OBJECTS, tmp_path / "one", *arguments, progress=lambda *numbers: done.append(numbers))
-    assert done == [(6, 8), (8, 8)]
-    whole = build_samples(OBJECTS, tmp_path / "two", *arguments, pool=IN_PROCESS)
-    np.testing.assert_equal(vars(resumed), vars(whole))
-    with pytest.raises(thor2.InputError, match="views"):
-        build_samples(OBJECTS, tmp_path / "one", NETWORK, SMALL_CONFIG, 3)
+    pooled = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=lambda function, tasks: (function(t) for t in tasks))
+    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=lambda *numbers: done.append(numbers))
+    assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
+    np.testing.assert_equal(vars(pooled), vars(whole))
+    rows = np.array([5, 0, 5])
+    chosen, batch = whole.select(rows), whole.take(rows, SMALL_CONFIG)
+    np.testing.assert_equal(chosen.take(np.arange(3), SMALL_CONFIG), batch)
+    np.testing.assert_array_equal((batch.color != 0).any(axis=-1).sum(axis=(1, 2)), chosen.strips)
 
 
 @pytest.fixture(scope="module")
@@ -108,13 +107,13 @@ def fitted(views: Samples) -> tuple[Embedding, list[Any]]:
     """A fit of one network, and its progress."""
     losses: list[Any] = []
     show = lambda *numbers: losses.append(numbers)  # noqa: E731
-    return fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, show, CLASSES), losses
+    return fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, SIZES, show, CLASSES), losses
 
 
 def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
     embedding, losses = fitted
     assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
-    batch = views.take(np.arange(len(views)))
+    batch = views.take(np.arange(len(views)), SMALL_CONFIG)
     descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
     same = batch.label[:, None] == batch.label
     gaps = []
@@ -128,10 +127,10 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
 
 
 def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
-    done, options = [], dataclasses.replace(OPTIONS, networks=2)
+    done = []
     show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
     programs = fit._step._cache_size()
-    two = fit_embedding(views, NETWORK, SMALL_CONFIG, options, SIZES, show, CLASSES)
+    two = fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, SIZES, show, CLASSES, networks=2)
     assert fit._step._cache_size() == programs + 1  # all steps share one
     assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
     (second,) = two.further
@@ -141,32 +140,22 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
 
 
-@pytest.mark.parametrize(
-    "options", [{"epochs": 0}, {"networks": 0}, {"batch_size": 1}, {"rate": 0.0}, {"margin": 1.0}], ids=str
-)
-def test_invalid_options_and_too_few_samples_are_refused(
-    options: dict[str, float], views: Samples, tmp_path: Path
-) -> None:
-    with pytest.raises(thor2.InputError, match=next(iter(options))):
-        EmbeddingFit(**options)
-    with pytest.raises(thor2.InputError, match="4096"):
-        fit_embedding(views, NETWORK, SMALL_CONFIG, EmbeddingFit(batch_size=4096))
-    with pytest.raises(thor2.InputError, match="1 objects"):
-        build_samples([3], tmp_path / "samples", NETWORK, SMALL_CONFIG, 2)
+def test_too_few_samples_and_invisible_objects_are_refused(views: Samples, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
+    assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1)
+    monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
+    assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1)
 
 
-@pytest.mark.parametrize("name", ["embedding.safetensors", "embedding.safetensors.samples/00000.safetensors"])
-def test_files_of_the_user_are_not_replaced(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text("a user's")
-    with pytest.raises(SystemExit, match="embedding.safetensors"):
-        main(["--out", str(tmp_path / "embedding.safetensors")])
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
+def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "embedding.safetensors").write_text("a user's")
+    assert_refused("embedding.safetensors", build_embedding, tmp_path / "embedding.safetensors")
+    assert (tmp_path / "embedding.safetensors").read_text() == "a user's"
 
 
 @pytest.mark.slow
 def test_the_command_writes_an_embedding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "embedding.safetensors"
-    main(["--out", str(out), "--objects", "24", "--views", "6", "--epochs", "1", "--workers", "1"])
+    build_embedding(out, objects=24, views=6, epochs=1, workers=1)
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
     assert {path.name for path in tmp_path.iterdir()} == {out.name, REFERENCES_FILE}

@@ -13,20 +13,19 @@ from helpers import SMALL_CONFIG, full_disk, write_box
 
 import colornet
 import thor2_jax as thor2
-from training.embedding import run_embedding, sampling
-from training.embedding.run_embedding import Distractors
-from training.embedding.samples import Samples
-from training.embedding.sampling import cached_samples
-from training.storage.jobs import locked
+from training.embedding import run_embedding
+from training.embedding import samples as module
+from training.embedding.samples import Samples, stored_samples
+from training.fitting.protocol import Distractors
+from training.storage.jobs import cache_directory, locked
 
 SAMPLES = Samples(
-    start=np.array([0, 2, 3]),
+    strips=np.array([2, 1]),
     strip=np.array([1, 4, 2], np.uint16),
     length=np.array([0.1, 0.2, 0.3], np.float16),
     color=np.arange(6, dtype=np.float16).reshape(3, 2),
     statistics=np.ones((2, 14), np.float32),
     label=np.array([0, 1], np.int32),
-    shape=(2, 5),
 )
 
 
@@ -39,12 +38,12 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def counted() -> Callable[..., int]:
+def counted(tmp_path: Path) -> Callable[..., int]:
     """Return a function that asks for samples, checks them and returns how often they were built."""
 
-    def get(job: dict[str, Any] | None = None, **options: Any) -> int:
+    def get(job: dict[str, Any] | None = None) -> int:
         build = mock.Mock(return_value=SAMPLES)
-        samples = cached_samples(job or {"seed": 0}, build, **options)
+        samples = stored_samples(job or {"seed": 0}, cache_directory("distractors") or tmp_path / "run", build)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
         return build.call_count
@@ -59,20 +58,19 @@ def files(cache: Path) -> list[Path]:
 def test_samples_are_built_once(
     cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Each job and each version of the code has its own samples. The user can move the cache, or switch it off."""
+    """Each job and each version of the code has its own samples. Without a cache, they are in the run's directory."""
     with locked(cache):
         assert counted() == 1  # does not wait for another process
     assert [counted(), counted(), counted({"seed": 1}), counted(), counted({"seed": 1})] == [1, 0, 1, 0, 0]
     assert len(files(cache)) == 2
-    assert counted(resumes=True) == 1  # an interrupted sampling resumes from its own directory
     with monkeypatch.context() as patch:
         patch.setattr(thor2, "__version__", "99")
         assert [counted(), counted()] == [1, 0]
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
-    monkeypatch.setattr(sampling.training, "__file__", str(code.parent / "__init__.py"))
+    monkeypatch.setattr(module.training, "__file__", str(code.parent / "__init__.py"))
     monkeypatch.setenv("THOR2_CACHE", "off")
-    assert [counted(), counted()] == [1, 1] and len(files(cache)) == 3
+    assert [counted(), counted()] == [1, 0] and files(tmp_path / "run") and len(files(cache)) == 3
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
     assert [counted(), counted()] == [1, 0] and files(tmp_path / "elsewhere") and len(files(cache)) == 3
     monkeypatch.delenv("THOR2_CACHE")
@@ -100,7 +98,7 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     [
         lambda content: content[:-5],
         lambda content: content[:-1] + bytes([content[-1] ^ 1]),
-        lambda content: content.replace(b"distractors, 1", b"distractors, 2"),
+        lambda content: content.replace(b'"strips"', b'"strip_"'),
         lambda content: b"a user's",
     ],
 )
@@ -123,7 +121,7 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
     cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "atomic_write", full_disk)
+        patch.setattr(module, "save_arrays", full_disk)
         assert counted() == 1
     assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
@@ -133,7 +131,7 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
 def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
     network, jobs = colornet.load_default(), list[dict[str, Any]]()
-    monkeypatch.setattr(run_embedding, "cached_samples", lambda job, build, resumes: jobs.append(job))
+    monkeypatch.setattr(run_embedding, "stored_samples", lambda job, directory, build: jobs.append(job))
 
     def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> dict[str, Any]:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}

@@ -9,17 +9,16 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import assert_refused, input_error, random_clouds
+from helpers import assert_refused, random_clouds
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.model.classifier import MLP, model_arrays
 from training.fitting import loop
-from training.fitting.fit import fit
+from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
-from training.fitting.steps import FitContext
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -48,8 +47,7 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     folders = (tmp_path / str(number) for number in range(99))
 
     def run(options: FitOptions = QUICK, samples: Samples = separable, **arguments: object) -> tuple[MLP, int]:
-        with Checkpoints(next(folders)) as checkpoints:
-            return fit(samples, TOPS2, options, checkpoints, **arguments)
+        return fit(samples, TOPS2, options, Checkpoints(next(folders)), **arguments)
 
     return run
 
@@ -94,10 +92,8 @@ def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples,
     """Another fit with the same seed gives the same weights, one with another seed does not."""
     refuse = lambda *_: pytest.fail("the fit made a step")  # noqa: E731
     options = dataclasses.replace(QUICK, epochs=2)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        first = fit(separable, TOPS2, options, checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        second = fit(separable, TOPS2, options, checkpoints, None, refuse, refuse)
+    first = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"))
+    second = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"), None, refuse, refuse)
     again, other = fitted(options=options), fitted(options=dataclasses.replace(options, seed=4))
     assert first[1] == second[1] == again[1]
     for model in (second[0], again[0]):
@@ -131,24 +127,20 @@ def test_few_samples_make_one_batch_and_one_is_refused(separable: Samples, fitte
 
 def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Samples, tmp_path: Path) -> None:
     broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        fit(separable, TOPS2, dataclasses.replace(QUICK, epochs=2), checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        assert_refused("loss of tops2 is nan .*3", fit, broken, TOPS2, QUICK, checkpoints)
-    with Checkpoints(tmp_path / "c") as checkpoints:
-        assert checkpoints.last_epoch == 2
-        fit(separable, TOPS2, QUICK, checkpoints)
+    fit(separable, TOPS2, dataclasses.replace(QUICK, epochs=2), Checkpoints(tmp_path / "c"))
+    assert_refused("loss of tops2 is nan .*3", fit, broken, TOPS2, QUICK, Checkpoints(tmp_path / "c"))
+    assert Checkpoints(tmp_path / "c").last_epoch == 2
+    fit(separable, TOPS2, QUICK, Checkpoints(tmp_path / "c"))
 
 
 def test_invalid_options_are_refused_by_name() -> None:
     for name, value in (
-        *[("epochs", value) for value in (0, 1.5, "3", True)],
+        ("epochs", 0),
         ("batch_size", 1),
-        *[("seed", value) for value in (-1, 2**31)],
-        *[("learning_rates", value) for value in ((1e-2,), (0, 1e-3), (math.nan, 1.0), (math.inf, 1.0))],
+        ("seed", -1),
+        ("seed", 2**31),
     ):
-        with input_error(f"{name} is {value!r};", match=f"^{name} "):
-            FitOptions(**{name: value})
+        assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 
 def metrics(epoch: int) -> EpochMetrics:

@@ -18,8 +18,9 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.evaluation.runs import load_runs
 from training.fitting import job as module
 from training.fitting import loop
-from training.fitting.job import RunSettings, train_run
+from training.fitting.job import train_run
 from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
+from training.fitting.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -34,7 +35,7 @@ def source(seed: int = 0) -> MemoryViews:
 
 
 def train(out: Path, features: tuple[str, ...] = ("tops",), options: FitOptions = OPTIONS, **more: Any) -> TrainedRun:
-    (run,) = train_run(source(), out, RunSettings(features, options, CONFIG), **more)
+    (run,) = train_run(source(), out, Protocol(features, options, CONFIG), **more)
     return run
 
 
@@ -110,7 +111,7 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
     ):
         with pytest.raises(thor2.InputError, match=message):
-            train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
+            train_run(MemoryViews(bad, CONFIG), tmp_path / "run", Protocol(["tops"], OPTIONS, CONFIG, folds))
         assert names(tmp_path) == []
 
 
@@ -163,7 +164,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 4))
     before = files_of(out)
-    begun = RunSettings(("tops",), OPTIONS, CONFIG)
+    begun = Protocol(("tops",), OPTIONS, CONFIG)
     cases: list[tuple[str, int, dict[str, Any]]] = [
         ("batch_size 8, not 6", 0, {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", 0, {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
@@ -215,7 +216,7 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, rmdir = tmp_path / "run", os.rmdir
 
     def run(progress: Any = lambda *_: None) -> None:
-        train_run(source(), out, RunSettings(["tops"], OPTIONS, CONFIG, 3), progress)
+        train_run(source(), out, Protocol(["tops"], OPTIONS, CONFIG, 3), progress)
 
     def stopping(path: Any, **options: Any) -> None:
         if Path(path).name.endswith("checkpoints"):

@@ -18,7 +18,8 @@ import numpy as np
 import thor2_jax as thor2
 from thor2_jax.model.classifier import model_arrays
 from training.fitting.loop import FitOptions
-from training.fitting.job import RunSettings, train_run
+from training.fitting.job import train_run
+from training.fitting.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 rng = np.random.default_rng(0)
@@ -28,7 +29,7 @@ def clouds(size, low, high):
 
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
-settings = RunSettings(["tops2"], FitOptions(epochs=4, batch_size=16), config, 2)
+settings = Protocol(["tops2"], FitOptions(epochs=4, batch_size=16), config, 2)
 runs = train_run(MemoryViews(views, config), out, settings)
 assert len(jax.devices()) == int(sys.argv[4])
 for fold, run in enumerate(runs):

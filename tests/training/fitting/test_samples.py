@@ -113,5 +113,4 @@ def test_samples_of_a_view_stay_together_and_folds_are_even() -> None:
     np.testing.assert_array_equal(fold_numbers, fold_of(label, view, 5, 0))
     assert (fold_numbers != fold_of(label, view, 5, 1)).any()
     assert not fold_of(label, view, 1, 0).any()
-    for folds in (14, 0):
-        assert_refused(f"folds is {folds}", fold_of, label, view, folds, 0)
+    assert_refused("folds is 14", fold_of, label, view, 14, 0)

@@ -115,14 +115,6 @@ def test_filling_matches_scipy() -> None:
     np.testing.assert_array_equal(fill_depth(depth, mask), np.where(mask, np.float32(0.7), 0))
 
 
-def test_instances_that_cannot_be_cropped_are_refused() -> None:
-    frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
-    empty = thor2.RGBDFrame(frame.color, frame.depth * (frame.labels == 0), frame.labels, CAMERA)  # type: ignore[operator]
-    for bad, label, size, argument in ((frame, 2, 8, "label"), (frame, 0, 8, "label"), (frame, 3, 0, "size")):
-        assert_refused(f"^{argument} is", rgbd_crop, bad, label, size)
-    assert_refused("^label 3 has no depth", rgbd_crop, empty, 3)
-
-
 SIZE = 24
 
 

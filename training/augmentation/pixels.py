@@ -1,0 +1,31 @@
+"""What the augmentations share: ranges of their settings, and the pixels of a view."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.rendering.view_sphere import RenderedView
+
+__all__ = ["FRAME_PIXEL", "Range", "pixel_width", "without"]
+
+FRAME_PIXEL = 0.001
+"""Width of a pixel of a real frame on the object, metres (f = 616 pixels at 0.6 m, 920 at 0.9 m, 1,067 at 1.1 m).
+A pixel of a training view is 1.4 mm wide."""
+
+
+def pixel_width(view: RenderedView) -> float:
+    """Return the width of a pixel on the object, metres, at the mean depth; at least one pixel must have depth."""
+    return float(view.depth.sum() / np.count_nonzero(view.depth)) / 1000 / view.intrinsics.fx
+
+
+def without(view: RenderedView, pixels: NDArray[np.intp]) -> RenderedView:
+    """Return the view without `pixels`, flat indices [n]."""
+    color, depth = view.color.copy(), view.depth.copy()
+    color.reshape(-1, 3)[pixels] = 0
+    depth.reshape(-1)[pixels] = 0
+    return dataclasses.replace(view, color=color, depth=depth)
+
+
+Range = tuple[float, float]
+"""Smallest and largest value of a uniform distribution."""
