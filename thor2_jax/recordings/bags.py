@@ -112,7 +112,7 @@ class Bag:
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
-                    raise ValueError("it has no metadata.yaml")
+                    raise ValueError("it has no metadata.yaml; repair it: ros2 bag reindex")
                 # rosbags would expand aliases without a limit, and fail to close other values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):

@@ -155,9 +155,12 @@ class Service:
             self.metrics.ready_workers.set(1)
         log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
         if self.settings.warm_why:
-            for n_points in POINT_BUCKETS:
-                for programs in self.engine.explanation_programs(n_points):
-                    self._compile_explanations(programs)
+            self._warm_why([programs for n in POINT_BUCKETS for programs in self.engine.explanation_programs(n)])
+
+    def _warm_why(self, programs: list[ExplanationPrograms]) -> None:
+        """Compile for explanations, one size after the other, so that what requests ask for comes in between."""
+        if programs and self.state == "ready":
+            self._compile_explanations(programs[0]).add_done_callback(lambda _: self._warm_why(programs[1:]))
 
     def _compile_explanations(self, programs: ExplanationPrograms) -> Future[None]:
         """Compile what explanations need in the background, unless that has begun already."""
