@@ -217,7 +217,7 @@ class _ClassViews(nnx.Module):
     def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
         """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
         cosines = jnp.einsum("bkl,nl->bkn", learned, self.learned[...])
-        return jnp.where(self.label[...] == label[:, None, None], cosines, -1).max(axis=-1)
+        return jnp.where(self.label[...] == label[:, None, None], cosines, -1).max(axis=-1, initial=-1)
 
 
 def _class_probabilities(
