@@ -85,10 +85,11 @@ class ClassUnion:
     def combine(self, probabilities: Values | None, scores: Values) -> Values:
         """Combine the confidences of the classifiers with the scores of the gallery.
 
-        What the classifiers leave to 1, the probability that their answer is not right, is divided between an enrolled
-        object, by the odds of its score, and unknown objects, with odds of 1. The confidence in a trained class is
-        divided by the same sum, of the best object. So an object takes probability only where its score is high, and
-        little from a confident answer; and its own confidence does not depend on other enrolled objects that are alike.
+        The shares of the names are the confidence c of a trained class, and (1 - c) times the odds of its score for an
+        enrolled object, which is what the best class leaves to 1, divided between the object and unknown objects. The
+        name of the largest share is the answer. Its value is the probability that the object is known at all,
+        (c + m) / (1 + m) for the largest shares c of a class and m of an object; the others are in proportion. So an
+        enrolled object lowers no confidence in another one, and takes the name only where its score is high.
 
         Args:
             probabilities: [B, C], fused; None if the gallery alone answers.
@@ -100,5 +101,7 @@ class ClassUnion:
         nothing: Values = np.zeros((len(scores), len(self.names)))
         trained = nothing if probabilities is None else self.of_classifiers(probabilities)
         rest = (1 - trained.max(axis=1, keepdims=True, initial=0)).clip(0)
-        odds = rest * score_odds(self.of_gallery(scores))
-        return trained / (1 + odds.max(axis=1, keepdims=True, initial=0)) + odds / (1 + odds)
+        enrolled = rest * score_odds(self.of_gallery(scores))
+        shares, best = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
+        known = (trained.max(axis=1, keepdims=True, initial=0) + best) / (1 + best)
+        return shares / np.maximum(shares.max(axis=1, keepdims=True, initial=0), np.finfo(np.float32).tiny) * known

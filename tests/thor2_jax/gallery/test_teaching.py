@@ -254,9 +254,12 @@ def test_combined_values_of_classes_and_objects() -> None:
     p, s = np.array([[0.5, 0.4, 0.1]]), np.array([[0.25, 0.9]])
     np.testing.assert_allclose(union.of_classifiers(p), [[0.5, 0.4, 0]])
     np.testing.assert_allclose(union.of_gallery(s), [[0, 0.9, 0.25]])
-    # What the best class leaves, 0.5, is divided between an object, with odds of 1.95 or 91.1, and unknown, with 1.
+    # The best class leaves 0.5; odds of 1.95 and 91.1. The best share, that of b, gets the probability of being known.
     x, b = 0.5 * (0.25 / 0.2) ** 3, 0.5 * 4.5**3
-    np.testing.assert_allclose(union.combine(p, s), [[0.5 / (1 + b), (0.4 + b) / (1 + b), x / (1 + x)]])
-    np.testing.assert_allclose(union.combine(None, s), [[0, 2 * b / (1 + 2 * b), 2 * x / (1 + 2 * x)]])
+    known = (0.5 + b) / (1 + b)
+    np.testing.assert_allclose(union.combine(p, s), known * np.array([[0.5, 0.4 + b, x]]) / (0.4 + b))
+    np.testing.assert_allclose(union.combine(None, s), 2 * np.array([[0, b, x]]) / (1 + 2 * b))
+    np.testing.assert_allclose(union.combine(p, s * 0.1)[0, 0], 0.5, atol=0.03)  # an answer by the classifiers
+    assert union.combine(None, np.zeros((1, 2))).tolist() == [[0, 0, 0]]
     same = ClassUnion(("a", "b"))
     assert same.of_classifiers(p) is p and same.combine(p[:, :2], np.zeros((1, 0))) == pytest.approx(p[:, :2])
