@@ -30,8 +30,10 @@ class Pipeline:
     def describe(self, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None) -> thor2.Descriptors:
         return self._call(thor2.describe, clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
 
-    def describe_aligned(self, aligned: thor2.PointClouds) -> thor2.Descriptors:
-        return self._call(thor2.describe_aligned, aligned, thor2.Parameters.of(NETWORK, self.config))
+    def describe_aligned(
+        self, aligned: thor2.PointClouds, parameters: thor2.Parameters | None = None
+    ) -> thor2.Descriptors:
+        return self._call(thor2.describe_aligned, aligned, parameters or thor2.Parameters.of(NETWORK, self.config))
 
 
 @functools.cache

@@ -43,6 +43,12 @@ def test_company_and_colours_of_the_same_regions(pipeline: Any, data: st.DataObj
     laws.assert_company_invariant(pipeline.describe_aligned, *aligned)
 
 
+@given(data=st.data(), steps=st.tuples(*[st.integers(-2048, 2048)] * 3))
+def test_translation(pipeline: Any, data: st.DataObject, steps: tuple[int, int, int]) -> None:
+    clouds = draw(data, laws.lattice_clouds(), pipeline.capacity)
+    laws.assert_translation_invariant(pipeline.describe, clouds, np.array(steps) / 2048)
+
+
 @given(data=st.data(), rotation=laws.rotations(), shift=st.tuples(*[st.floats(-1, 1)] * 3))
 def test_rigid_motion(pipeline: Any, data: st.DataObject, rotation: np.ndarray, shift: tuple[float, ...]) -> None:
     clouds = draw(data, laws.decided_clouds(CONFIG), pipeline.capacity)

@@ -1,12 +1,13 @@
-"""Values of descriptors: the equations, other networks and overflow."""
+"""Values of descriptors: masses, linearity, stability, the equations, and the limit of the relaxation."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import colornet
@@ -18,8 +19,8 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 SIZE = 4
 
 
-def aligned_batches(reach: float = 1.0) -> Any:
-    return laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, 512)
+def aligned_batches(max_points: int = 512, margin: float = 0.1, reach: float = 1.0) -> Any:
+    return laws.packed(laws.aligned_clouds(CONFIG, max_points=max_points, margin=margin, reach=reach), SIZE, 512)
 
 
 @pytest.mark.slow
@@ -27,8 +28,9 @@ def aligned_batches(reach: float = 1.0) -> Any:
 def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.PointClouds) -> None:
     for function, batch in ((thor2.describe, clouds), (thor2.describe_aligned, aligned)):
         for config in (CONFIG, thor2.DescriptorConfig.released(homology="closed_form")):
-            first, second = (dataclasses.replace(config, homology=name) for name in ("closed_form", "gudhi"))
-            laws.assert_equal(function(batch, NETWORK, second), function(batch, NETWORK, first))
+            both = [dataclasses.replace(config, homology=name) for name in ("closed_form", "gudhi")]
+            first, second = (lambda clouds, c=c, f=function: f(clouds, NETWORK, c) for c in both)
+            laws.assert_backends_agree(first, second, batch)
 
 
 @given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
@@ -38,15 +40,35 @@ def test_equations(pipeline: Any, data: st.DataObject, reach: float) -> None:
     for config in (pipeline.config, dataclasses.replace(pipeline.config, convention="released")):
         ways = dataclasses.replace(pipeline, config=config)
         laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, config)
+    images = pipeline.describe_aligned(aligned).images
+    laws.assert_image_mass(images, thor2.diagrams(aligned, pipeline.config), CONFIG)
 
 
-@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds())
-def test_other_networks(aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int) -> None:
+@given(data=st.data(), seed=laws.seeds(), factors=st.tuples(*[st.integers(-8, 8).map(lambda k: k / 4)] * 2))
+def test_embedding_is_linear(pipeline: Any, data: st.DataObject, seed: int, factors: tuple[float, float]) -> None:
+    parameters = thor2.Parameters.of(NETWORK, CONFIG)
+
+    def describe_with(clouds: thor2.PointClouds, similarity: np.ndarray) -> thor2.Descriptors:
+        return pipeline.describe_aligned(clouds, dataclasses.replace(parameters, similarity=jnp.asarray(similarity)))
+
+    strategy = laws.packed(laws.aligned_clouds(CONFIG, max_points=256), SIZE, pipeline.capacity)
+    first, second = data.draw(strategy), data.draw(strategy)
+    laws.assert_embedding_additive(pipeline.describe_aligned, first, second)
+    pair = tuple(np.random.default_rng(seed).normal(size=(2, 22, 22)).astype(np.float32))
+    laws.assert_embedding_linear(describe_with, first, pair, factors)
+
+
+@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds(), axis=st.sampled_from("xyz"))
+def test_strips_and_other_networks(
+    aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int, axis: str
+) -> None:
     def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
         return thor2.describe_aligned(clouds, network, CONFIG)
 
     laws.assert_same_regions_alike(describe, aligned, network, seed)
     laws.assert_follows_equations(describe, aligned, network, CONFIG)
+    laws.assert_color_mass(thor2.strips(aligned, network, CONFIG), aligned)
+    laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
 
 
 @given(aligned=aligned_batches(), exponent=st.integers(1, 37), seed=laws.seeds())
@@ -58,8 +80,8 @@ def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, see
     signs, sizes = rng.choice([-1, 1], (stray.sum(), 3)), rng.uniform(1, 9.9, (stray.sum(), 3))
     points[stray] = signs * sizes * 10.0**exponent
     clouds = dataclasses.replace(aligned, points=jnp.asarray(points * np.asarray(aligned.mask)[..., None], jnp.float32))
-    describe = lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG)  # noqa: E731
-    laws.assert_follows_equations(describe, clouds, NETWORK, CONFIG)
+    laws.assert_overflow_told(lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG), clouds, NETWORK, CONFIG)
+    laws.assert_color_mass(thor2.strips(clouds, NETWORK, CONFIG), clouds)
 
 
 @pytest.mark.parametrize("far", [1e7, 1e8, 1e37])
@@ -73,3 +95,55 @@ def test_points_too_far_to_be_sliced_are_counted_in_overflow(far: float) -> None
         assert int(descriptors.overflow[0]) == 3 and np.isfinite(np.asarray(descriptors.tops2)).all()
         moved = thor2.describe(thor2.PointClouds.pack([(whole, np.zeros((40, 3)))], 512), NETWORK, config)
         assert int(moved.overflow[0]) == 40 and not np.asarray(moved.tops2).any()
+
+
+def test_an_occluded_end_flips_the_cloud() -> None:
+    seen: set[int] = set()
+
+    @settings(settings.get_profile("properties-quick"), max_examples=15)
+    @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), seed=laws.seeds())
+    def law(clouds: thor2.PointClouds, seed: int) -> None:
+        flipped = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
+        seen.update(flipped.tolist())
+
+    law()
+    assert {0, 1} <= seen
+
+
+@given(data=st.data(), seed=laws.seeds(), eps=st.floats(1e-4, 0.0025))
+def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) -> None:
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG), SIZE, pipeline.capacity))
+    moved = laws.moved_within_strips(aligned, CONFIG, seed, eps)
+    share = laws.assert_stable(
+        pipeline.describe_aligned, lambda c: thor2.diagrams(c, pipeline.config), aligned, moved, eps, CONFIG
+    )
+    assert share <= 1 / math.sqrt(5) + 0.01
+
+
+def test_the_stability_bound_is_tight() -> None:
+    """The change approaches 1 / sqrt(5) of the bound for large persistences; the remainder allows for moving births."""
+
+    def share(height: float) -> float:
+        both = [
+            thor2.PointClouds.pack([(np.array([[0.4, 0, 0.05], [0.4, y, 0.05]]), np.zeros((2, 3)))], 512)
+            for y in (height, height + 0.002)
+        ]
+        return laws.assert_stable(
+            lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG),
+            lambda clouds: thor2.diagrams(clouds, CONFIG),
+            *both,
+            0.001,
+            CONFIG,
+        )
+
+    shares = [share(height) for height in (0.05, 0.2, 0.5)]
+    assert shares == sorted(shares) and 0.38 < shares[-1] < 1 / math.sqrt(5), shares
+
+
+@pytest.mark.slow
+@given(aligned=aligned_batches(max_points=256, margin=0.2), factor=st.sampled_from([0.02, 0.01]))
+def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
+    def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
+        return thor2.describe_aligned(clouds, NETWORK, config)
+
+    laws.assert_relaxation_converges(describe_at, aligned, NETWORK, CONFIG, factor)

@@ -12,12 +12,14 @@
         assert_permutation_invariant(describe, clouds, seed, config)
 
 Requires the extra `testing`: pip install -c constraints.txt '.[testing]'. All batches of a strategy have the same
-shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances.
+shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances (`comparing`).
 """
 
-from thor2_jax.testing import damage, laws, strategies
+from thor2_jax.testing import damage, laws, strategies, values
+from thor2_jax.testing.comparing import alignment_drift
 from thor2_jax.testing.damage import *
 from thor2_jax.testing.laws import *
 from thor2_jax.testing.strategies import *
+from thor2_jax.testing.values import *
 
-__all__ = [*damage.__all__, *laws.__all__, *strategies.__all__]
+__all__ = ["alignment_drift", *damage.__all__, *laws.__all__, *strategies.__all__, *values.__all__]

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colornet import ColorNetwork, load_default
+from colornet import ColorNetwork
+from colornet.grid import GRID_SIZE, grid_colors
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.types import Cloud, PointClouds
@@ -28,6 +29,7 @@ __all__ = [
     "camera_clouds",
     "decided_clouds",
     "frames",
+    "lattice_clouds",
     "networks",
     "packed",
     "rotations",
@@ -36,11 +38,11 @@ __all__ = [
 
 Points = NDArray[np.float64]
 
+LATTICE = 1 / 2048
+"""Step of the coordinates of `lattice_clouds`, metres."""
+
 BODY_COPIES = 8
 """Number of symmetric copies of each body point of a decided cloud."""
-
-N_REGIONS = 5
-"""Number of regions of a generated colour network."""
 
 
 def seeds() -> st.SearchStrategy[int]:
@@ -136,32 +138,67 @@ def camera_clouds(kinds: Sequence[str] = KINDS, max_points: int = 512) -> st.Sea
     return st.builds(_camera_cloud, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
 
 
-def _aligned_cloud(seed: int, kind: str, n: int, config: DescriptorConfig, reach: float) -> Cloud:
+def _lattice_cloud(seed: int, kind: str, exponent: int) -> Cloud:
+    points, rgb = _camera_cloud(seed, kind, 2**exponent)
+    return np.round(points / np.float32(LATTICE)).clip(-1023, 2047) * np.float32(LATTICE), rgb
+
+
+def lattice_clouds(kinds: Sequence[str] = KINDS) -> st.SearchStrategy[Cloud]:
+    """Generate camera clouds on which sums and means are exact in float32, so that properties hold without tolerance.
+
+    Coordinates are integer multiples of `LATTICE` below 1 m, and the number of points is a power of two up to 512.
+    Multiplied by sigma_s = 5/2 they are integer multiples of 2^-12. A sum of 512 of them, even if shifted by up to 1 m,
+    is less than 2^24 such units, and a mean of 2^k of them needs no more bits than the sum.
+    """
+    return st.builds(_lattice_cloud, seeds(), st.sampled_from(kinds), st.integers(0, 9))
+
+
+def settled(points: Points, config: DescriptorConfig, margin: float = 0.1) -> Points:
+    """Move aligned points [n, 3] within their strip and slice, away from the borders of both.
+
+    Afterwards x and z are at least `margin` widths away from a border, so that rounding moves no point across one.
+    Coordinates of exactly 0 are kept: aligned clouds touch 0, and there is no strip below.
+
+    Args:
+        points: scaled units, first octant.
+        config: gives the widths of strips and slices.
+        margin: share of a width, below 1/2.
+    """
+    moved = points.copy()
+    for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
+        inside = _move_inside(points[:, axis] / width, margin) * width
+        moved[:, axis] = np.where(points[:, axis] == 0, 0, inside)
+    return moved
+
+
+def _aligned_cloud(seed: int, kind: str, n: int, config: DescriptorConfig, margin: float, reach: float) -> Cloud:
     rng = np.random.default_rng(seed)
     points = _MAKERS[kind](rng, n) @ Rotation.random(random_state=seed).as_matrix().T
     points = points - points.min(axis=0, initial=np.inf)
     # Scale the longest side to a share of the extent of the descriptor along each axis.
     window = np.array([config.n_strips * config.sigma_2, config.window, config.n_slices * config.sigma_1])
     points *= window * rng.uniform(0.2, reach, 3) / max(points.max(initial=0), 1e-9)
-    # Away from the borders, so that rounding moves no point across one; aligned clouds touch 0.
-    for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
-        inside = _move_inside(points[:, axis] / width, 0.1) * width
-        points[:, axis] = np.where(points[:, axis] == 0, 0, inside)
-    return points.astype(np.float32), _colors(rng, len(points))
+    return settled(points, config, margin).astype(np.float32), _colors(rng, len(points))
 
 
-def aligned_clouds(config: DescriptorConfig, max_points: int = 512, reach: float = 1.0) -> st.SearchStrategy[Cloud]:
-    """Generate clouds as `align` returns them, in scaled units and the first octant, and settled in their cells.
-
-    Where x and z are not exactly 0, they are at least a tenth of a width away from the borders of strip and slice.
+def aligned_clouds(
+    config: DescriptorConfig,
+    kinds: Sequence[str] = KINDS,
+    max_points: int = 512,
+    margin: float = 0.1,
+    reach: float = 1.0,
+) -> st.SearchStrategy[Cloud]:
+    """Generate clouds as `align` returns them, in scaled units and the first octant, and `settled`.
 
     Args:
         config: gives widths and numbers of slices and strips.
+        kinds: a selection of `KINDS`.
         max_points: largest number of points; clouds may be empty.
+        margin: the margin of `settled`.
         reach: longest side as a share of the extent of the descriptor; above 1, some clouds overflow.
     """
-    make = functools.partial(_aligned_cloud, config=config, reach=reach)
-    return st.builds(make, seeds(), st.sampled_from(KINDS), st.integers(0, max_points))
+    make = functools.partial(_aligned_cloud, config=config, margin=margin, reach=reach)
+    return st.builds(make, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
 
 
 def _decided_cloud(seed: int, n_body: int, config: DescriptorConfig) -> Cloud:
@@ -214,7 +251,14 @@ def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.Search
     Args:
         config: with alpha = pi/4.
         max_points: largest number of points, at least 136.
+
+    Raises:
+        ValueError: `config` has another alpha, or `max_points` is too small.
     """
+    if config.alpha != math.pi / 4 or max_points < 17 * BODY_COPIES:
+        raise ValueError(
+            f"alpha is {config.alpha}, max_points {max_points}; expected pi/4 and at least {17 * BODY_COPIES}"
+        )
     make = functools.partial(_decided_cloud, config=config)
     return st.builds(make, seeds(), st.integers(16, max_points // BODY_COPIES - 1))
 
@@ -224,29 +268,40 @@ def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.Sea
     return st.lists(clouds, min_size=size, max_size=size).map(lambda batch: PointClouds.pack(batch, capacity))
 
 
-def _network(seed: int) -> ColorNetwork:
+def _network(seed: int, n_regions: int) -> ColorNetwork:
     rng = np.random.default_rng(seed)
-    bits = rng.permutation(load_default().region_bits) & np.uint32(2**N_REGIONS - 1)
-    bits[bits == 0] = 1
-    places = rng.uniform(5, 50, N_REGIONS).cumsum()
+    colors = grid_colors().astype(np.float64)
+    # Slabs along a random direction; a tenth of each is shared with the next.
+    along = colors @ rng.normal(size=3)
+    place = np.argsort(np.argsort(along)) / GRID_SIZE * n_regions
+    region = place.astype(np.uint32)
+    shared = (place - region > 0.9) & (region < n_regions - 1)
+    bits = np.uint32(1) << region | np.where(shared, np.uint32(2) << region, np.uint32(0))
+    member = (bits[:, None] >> np.arange(n_regions, dtype=np.uint32)) & 1
+    counts = member.sum(axis=0).astype(np.int64)
+    weights = rng.uniform(5, 50, max(n_regions - 1, 0))
+    at = np.concatenate([[0], np.cumsum(weights)])
     return ColorNetwork(
-        mean_rgb=rng.uniform(0, 255, (N_REGIONS, 3)),
-        member_counts=(bits[:, None] >> np.arange(N_REGIONS, dtype=np.uint32) & 1).sum(axis=0, dtype=np.int64),
-        edges=np.zeros((0, 2), np.int64),
-        edge_weights=np.zeros(0),
-        cyclic=np.zeros(0, bool),
-        similarity=1 / (1 + np.abs(places[:, None] - places)),
-        region_bits=bits,
-        n_raw_nodes=N_REGIONS,
+        mean_rgb=member.T @ colors / counts[:, None],
+        member_counts=counts,
+        edges=np.stack([np.arange(n_regions - 1), np.arange(1, n_regions)], axis=1).astype(np.int64),
+        edge_weights=weights,
+        cyclic=np.zeros(n_regions - 1, bool),
+        similarity=1 / (1 + np.abs(at[:, None] - at)),
+        region_bits=bits.astype(np.uint32),
+        n_raw_nodes=n_regions,
     )
 
 
-def networks() -> st.SearchStrategy[ColorNetwork]:
-    """Generate networks of five regions with random colours and similarities; some colours are in several regions.
+def networks(n_regions: int = 5) -> st.SearchStrategy[ColorNetwork]:
+    """Generate networks whose regions are overlapping slabs of the colour cube, connected in a chain.
 
-    All networks have the same number of region sets, so that they share compiled functions.
+    All networks with R regions have 2 R - 1 region sets, so that they share compiled functions.
+
+    Args:
+        n_regions: R, 1 to 32.
     """
-    return st.builds(_network, seeds())
+    return st.builds(_network, seeds(), st.just(n_regions))
 
 
 def _frame(seed: int, height: int, width: int, n_objects: int) -> RGBDFrame:
@@ -268,11 +323,14 @@ def _frame(seed: int, height: int, width: int, n_objects: int) -> RGBDFrame:
     return RGBDFrame(color, np.rint(depth * 1000).astype(np.uint16), labels, intrinsics)
 
 
-def frames() -> st.SearchStrategy[RGBDFrame]:
+def frames(max_side: int = 120, max_objects: int = 5) -> st.SearchStrategy[RGBDFrame]:
     """Generate frames of ellipsoids in front of a slanted plane; some are occluded or cut by the border.
 
-    Depth is in millimetres, uint16, with missing values; labels are uint8 and not consecutive. Sides are 8 to 120
-    pixels; there are up to five instances, of which later ones occlude earlier ones.
+    Depth is in millimetres, uint16, with missing values; labels are uint8 and not consecutive.
+
+    Args:
+        max_side: largest height and width in pixels, at least 8.
+        max_objects: largest number of instances; later ones occlude earlier ones.
     """
-    side = st.integers(8, 120)
-    return st.builds(_frame, seeds(), side, side, st.integers(0, 5))
+    side = st.integers(8, max_side)
+    return st.builds(_frame, seeds(), side, side, st.integers(0, max_objects))
