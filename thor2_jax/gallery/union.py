@@ -85,11 +85,11 @@ class ClassUnion:
     def combine(self, probabilities: Values | None, scores: Values) -> Values:
         """Combine the confidences of the classifiers with the scores of the gallery.
 
-        The shares of the names are the confidence c of a trained class, and (1 - c) times the odds of its score for an
-        enrolled object, which is what the best class leaves to 1, divided between the object and unknown objects. The
-        name of the largest share is the answer. Its value is the probability that the object is known at all,
-        (c + m) / (1 + m) for the largest shares c of a class and m of an object; the others are in proportion. So an
-        enrolled object lowers no confidence in another one, and takes the name only where its score is high.
+        The shares of the names are the confidence of a trained class, and for an enrolled object what the best class
+        leaves to 1, times the odds of the object's score. The largest share is the answer. A class that is the answer
+        keeps its confidence c. If an object is, or has a share in it, the answer has the probability that it is known
+        at all, (c + m) / (1 + m), where c and m are the largest shares of a class and of an object. The values of the
+        others are in proportion. So an enrolled object takes the name only where its score is high.
 
         Args:
             probabilities: [B, C], fused; None if the gallery alone answers.
@@ -100,8 +100,9 @@ class ClassUnion:
         """
         nothing: Values = np.zeros((len(scores), len(self.names)))
         trained = nothing if probabilities is None else self.of_classifiers(probabilities)
-        rest = (1 - trained.max(axis=1, keepdims=True, initial=0)).clip(0)
-        enrolled = rest * score_odds(self.of_gallery(scores))
-        shares, best = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
-        known = (trained.max(axis=1, keepdims=True, initial=0) + best) / (1 + best)
-        return shares / np.maximum(shares.max(axis=1, keepdims=True, initial=0), np.finfo(np.float32).tiny) * known
+        c = trained.max(axis=1, keepdims=True, initial=0)
+        enrolled = (1 - c).clip(0) * score_odds(self.of_gallery(scores))
+        shares, m = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
+        largest = shares.max(axis=1, keepdims=True, initial=0)
+        value = np.where(largest > c, (c + m) / (1 + m), c)
+        return shares / np.maximum(largest, np.finfo(np.float32).tiny) * value
