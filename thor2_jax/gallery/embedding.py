@@ -423,8 +423,8 @@ class Embedding:
                 one. The message names the file.
         """
         path, network = Path(path), network or colornet.load_default()
-        expected = "an embedding of this version; copy the whole run directory, or train the run again"
-        with decoding(f"embedding: {path} cannot be used", expected):
+        advice = "an embedding of this version; copy the whole run directory, or train the run again"
+        with decoding(f"embedding: {path} cannot be used", advice):
             content = read_file(path)
             about = json.loads(safetensors_metadata(content)[_METADATA])
             arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
