@@ -28,6 +28,7 @@ __all__ = [
     "atomic_write",
     "check_output_directory",
     "check_output_file",
+    "check_writable",
     "content_digest",
     "errors_name",
     "file_digest",
@@ -80,7 +81,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
                 f"out: {directory} already contains {', '.join(names[:3])}; expected a new or empty directory"
                 f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
             )
-        _check_writable(directory)
+        check_writable(directory)
 
 
 def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], bool] = lambda path: True) -> None:
@@ -99,7 +100,7 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
         return
     with _refusal_named(f"{name}: {path} is not a file"):
         check_replaceable(path)
-        _check_writable(path.absolute().parent)
+        check_writable(path.absolute().parent)
     if path.exists() and not is_own(path):
         raise InputError(f"{name} is {path}, a file that this command has not written; choose another name")
 
@@ -114,7 +115,7 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
     return all(isinstance(row, dict) and row.keys() >= set(keys) for row in rows)
 
 
-def _check_writable(directory: Path) -> None:
+def check_writable(directory: Path) -> None:
     """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
     existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
     with tempfile.TemporaryFile(dir=existing):

@@ -16,7 +16,6 @@ complexes, and no distances between diagrams. Use GUDHI for these.
 """
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +26,12 @@ from thor2_jax.errors import InputError
 from thor2_jax.types import Diagrams
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
+
+_Ranges = tuple[jax.Array, jax.Array, jax.Array]
+"""For the range of vertices and edges behind each vertex: lowest vertex, highest edge and its index, each [N]."""
+
+_Walk = tuple[jax.Array, jax.Array, jax.Array]
+"""For the walk from each vertex: the vertex reached so far, the highest edge on the way and its index, each [N]."""
 
 
 def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Diagrams:
@@ -80,8 +85,9 @@ def _sublevel_diagrams(heights: jax.Array, edges: jax.Array | None) -> Diagrams:
         edges = jnp.where(edges > lowest, edges, lowest)
     if edges.size == 0:
         return Diagrams(jnp.zeros_like(heights), jnp.zeros_like(heights), jnp.zeros(heights.shape, bool))
-    deaths = jnp.vectorize(_deaths, signature="(n),(m)->(n)")(heights, edges)
-    mask = jnp.isfinite(heights) & jnp.isfinite(deaths) & (deaths > heights)
+    index = jnp.vectorize(_death_edges, signature="(n),(m)->(n)")(*jax.lax.stop_gradient((heights, edges)))
+    deaths = jnp.take_along_axis(edges, jnp.maximum(index, 0), axis=-1)
+    mask = (index >= 0) & jnp.isfinite(heights) & (deaths > heights)
     return Diagrams(births=jnp.where(mask, heights, 0), deaths=jnp.where(mask, deaths, 0), mask=mask)
 
 
@@ -89,47 +95,58 @@ def _nan_as_infinity(values: jax.Array) -> jax.Array:
     return jnp.where(jnp.isnan(values), jnp.inf, values)
 
 
-def _deaths(heights: jax.Array, edges: jax.Array) -> jax.Array:
-    """Return the height at which the component born at each vertex dies, [N]; infinity if it never does.
+def _death_edges(heights: jax.Array, edges: jax.Array) -> jax.Array:
+    """Return the edge at which the component born at each vertex dies, [N] int32; -1 if it never does.
 
     A component reaches a lower vertex on the side whose highest edge on the way there is lower.
     """
-    right = _highest_to_lower(heights, edges, or_equal=False)
-    left = _highest_to_lower(heights[::-1], edges[::-1], or_equal=True)[::-1]
-    return jnp.minimum(left, right)
+    right, right_index = _edges_to_lower(heights, edges, or_equal=False)
+    left, left_index = _edges_to_lower(heights[::-1], edges[::-1], or_equal=True)
+    left, left_index = left[::-1], len(edges) - 1 - left_index[::-1]
+    never = jnp.isinf(jnp.minimum(left, right))
+    return jnp.where(never, -1, jnp.where(right < left, right_index, left_index))
 
 
-def _highest_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> jax.Array:
-    """Return the height of the highest edge between each vertex and the next lower one to its right, [N].
+def _edges_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> tuple[jax.Array, jax.Array]:
+    """Return the highest edge between each vertex and the next lower one to its right: its height and index, [N].
 
     The height is infinite if no vertex there is lower (or equal, with `or_equal`).
     """
     vertices = jnp.arange(len(heights), dtype=jnp.int32)
     # Behind the last vertex stands one that is lower than all, over an edge that is never reached.
-    lowest = jnp.append(heights[1:], -jnp.inf)  # of the vertices i + 1 .. i + 2^k, for k = 0
-    highest = jnp.append(edges, jnp.inf)  # of the edges i .. i + 2^k - 1
+    low = jnp.append(heights[1:], -jnp.inf)  # lowest of the vertices i + 1 .. i + 2^k, for k = 0
+    high, at = jnp.append(edges, jnp.inf), vertices  # highest of the edges i .. i + 2^k - 1, and its index
 
-    def double(ranges: Any, width: jax.Array) -> Any:
-        lowest, highest = ranges
-        inside, second = vertices + width < len(heights), jnp.minimum(vertices + width, len(heights) - 1)
+    def double(ranges: _Ranges, width: jax.Array) -> tuple[_Ranges, _Ranges]:
+        low, high, at = ranges
+        second = vertices + width
+        inside, second = second < len(heights), jnp.minimum(second, len(heights) - 1)
+        second_high = jnp.where(inside, high[second], jnp.inf)
         doubled = (
-            jnp.minimum(lowest, jnp.where(inside, lowest[second], -jnp.inf)),
-            jnp.maximum(highest, jnp.where(inside, highest[second], jnp.inf)),
+            jnp.minimum(low, jnp.where(inside, low[second], -jnp.inf)),
+            jnp.maximum(high, second_high),
+            jnp.where(second_high > high, at[second], at),
         )
         return doubled, ranges
 
-    def walk(state: Any, ranges: Any) -> Any:
-        position, passed_edges = state
-        (lowest, highest), width = ranges
-        passed = (lowest[position] > heights) if or_equal else (lowest[position] >= heights)
-        higher = jnp.where(passed, highest[position], -jnp.inf)
-        return (jnp.where(passed, position + width, position), jnp.maximum(passed_edges, higher)), None
+    def walk(state: _Walk, ranges: tuple[_Ranges, jax.Array]) -> tuple[_Walk, None]:
+        (low, high, at), width = ranges
+        position = state[0]
+        passed = (low[position] > heights) if or_equal else (low[position] >= heights)
+        return (jnp.where(passed, position + width, position), *_higher(state, high, at, passed)), None
 
     widths = jnp.array([2**k for k in range((len(heights) - 1).bit_length())], jnp.int32)
-    _, tables = jax.lax.scan(double, (lowest, highest), widths)
-    start = vertices, jnp.full_like(heights, -jnp.inf)
-    (position, passed_edges), _ = jax.lax.scan(walk, start, (tables, widths), reverse=True)
-    return jnp.maximum(passed_edges, jnp.append(edges, jnp.inf)[position])
+    _, tables = jax.lax.scan(double, (low, high, at), widths)
+    start = vertices, jnp.full_like(heights, -jnp.inf), vertices
+    state, _ = jax.lax.scan(walk, start, (tables, widths), reverse=True)
+    return _higher(state, high, at, jnp.ones_like(vertices, bool))
+
+
+def _higher(state: _Walk, high: jax.Array, at: jax.Array, passed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the highest edge on each walk, with those of the next range if it is passed: height and index."""
+    position, highest, index = state
+    higher = passed & (high[position] > highest)
+    return jnp.where(higher, high[position], highest), jnp.where(higher, at[position], index)
 
 
 def images(

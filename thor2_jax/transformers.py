@@ -104,6 +104,9 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         network = self.network
         if not (network is None or isinstance(network, ColorNetwork)):
             raise InputError(f"network is {network!r}; expected a ColorNetwork, or None for the packaged one")
+        capacity = self.capacity
+        if not (capacity is None or (type(capacity) is int and capacity > 0)):
+            raise InputError(f"capacity is {capacity!r}; expected a positive integer, or None for the point buckets")
         return config, colornet.load_default() if network is None else network
 
     def _clouds(self, X: Sequence[Any]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

@@ -263,10 +263,15 @@ def describe_stream(
     """
     if batch < 1:
         raise InputError(f"batch is {batch}; expected at least 1")
-    unread = iter(clouds)
+    return _stream(iter(clouds), network, config, capacity, batch)
+
+
+def _stream(
+    clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
+) -> Iterator[Descriptors]:
     empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     running: list[tuple[int, Descriptors]] = []
-    while chunk := list(itertools.islice(unread, batch)):
+    while chunk := list(itertools.islice(clouds, batch)):
         packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
         running.append((len(chunk), describe(packed, network, config)))
         if len(running) > 1:

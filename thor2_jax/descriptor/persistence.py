@@ -104,8 +104,8 @@ def persistence_power(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:
 def persistence_images(
     diagrams: Diagrams,
     config: DescriptorConfig,
-    variance: ArrayLike,
-    persistence_weight: ArrayLike,
+    variance: ArrayLike | None = None,
+    persistence_weight: ArrayLike | None = None,
 ) -> jax.Array:
     """Return the sum over pairs of persistence**n times a Gaussian, integrated over each pixel; the paper's n is 1.
 
@@ -115,8 +115,8 @@ def persistence_images(
     Args:
         diagrams: fields [..., J].
         config: static.
-        variance: [], variance of the Gaussian.
-        persistence_weight: [], exponent n.
+        variance: [], variance of the Gaussian; by default `config.image_variance`.
+        persistence_weight: [], exponent n; by default `config.persistence_weight`.
 
     Returns:
         [..., P, P] float32, axes birth and persistence, both over [-sigma_2, (P - 1) sigma_2]. The image of an empty
@@ -128,7 +128,10 @@ def persistence_images(
     padding = -len(births) % 8
     persistence = jnp.pad(persistence, [(0, 0)] * (persistence.ndim - 1) + [(0, padding)])
     births = jnp.pad(births, (0, padding))
-    weight = persistence_power(persistence, persistence_weight)
+    variance = config.image_variance if variance is None else variance
+    weight = persistence_power(
+        persistence, config.persistence_weight if persistence_weight is None else persistence_weight
+    )
     edges = (jnp.arange(config.image_size + 1, dtype=births.dtype) - 1) * config.sigma_2
     by_persistence = cumulative_at_edges(persistence, variance, edges) * weight[..., None, :]
     by_birth = jnp.diff(cumulative_at_edges(births, variance, edges), axis=-2)

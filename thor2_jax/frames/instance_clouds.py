@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import KDTree
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
@@ -55,6 +54,8 @@ def voxel_downsample(
     """
     if len(points) == 0:
         return points.copy(), colors.copy()
+    if not np.isfinite(points).all():
+        raise InputError("points has rows that are not finite; expected finite coordinates")
     exact = points.T.astype(np.float64, order="C")  # coordinates in contiguous rows, which reductions read faster
     places = np.floor((exact - (exact.min(axis=1, keepdims=True) - size / 2)) / size)
     if not np.prod(places.max(axis=1) + 1) < 2.0**62:
@@ -179,6 +180,8 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
+        from scipy.spatial import KDTree  # takes .1 s to import, and rendering needs none
+
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
         among[rest] = distances.mean(axis=1) <= MAX_NEIGHBOR_DISTANCE

@@ -268,8 +268,9 @@ class Embedding:
         further: networks from `create_further`, fitted as `model` was from other random weights. `class_probabilities`
             averages all networks, which separates unknown objects more reliably (Lakshminarayanan et al., "Simple and
             Scalable Predictive Uncertainty Estimation using Deep Ensembles", NeurIPS 2017). Only `model` embeds.
-        references: embedded views of the classes and of the background, for galleries; None in embeddings of earlier
-            versions, whose galleries know less of what is unknown. Not a part of `fingerprint`.
+        references: embedded views of the classes and of the background, for galleries and, with `sizes.views`, for the
+            classification; None in embeddings of earlier versions, whose galleries know less of what is unknown. Not a
+            part of `fingerprint`.
     """
 
     config: DescriptorConfig
@@ -422,7 +423,8 @@ class Embedding:
                 one. The message names the file.
         """
         path, network = Path(path), network or colornet.load_default()
-        with decoding(f"embedding: {path} cannot be used", "an embedding of this version; train the run again"):
+        advice = "an embedding of this version; copy the whole run directory, or train the run again"
+        with decoding(f"embedding: {path} cannot be used", advice):
             content = read_file(path)
             about = json.loads(safetensors_metadata(content)[_METADATA])
             arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}

@@ -1,7 +1,8 @@
 """Reference views: embedded views of the classes of a run and of the background, objects that are none of its names.
 
 They take part in the regression of a gallery (`Gallery.scores`), so that an enrolled object is recognized by what
-distinguishes it from them, and a gallery with a single object already knows what is unknown.
+distinguishes it from them, and a gallery with a single object already knows what is unknown. With
+`EmbeddingSizes.views`, those of the classes also take part in the classification (`Embedding.class_probabilities`).
 """
 
 import dataclasses
@@ -56,7 +57,8 @@ class References:
         Raises:
             InputError: the file is missing or damaged, or of another embedding. The message names the file.
         """
-        with decoding(f"embedding: {path} cannot be used", "the views of the embedding beside it; train the run again"):
+        expected = "the views of the embedding beside it; copy both files, or train the run again"
+        with decoding(f"embedding: {path} cannot be used", expected):
             open_file(path).close()
             with safetensors.safe_open(path, "numpy") as stored:
                 about = json.loads(stored.metadata()[_METADATA])

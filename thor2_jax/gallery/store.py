@@ -334,7 +334,8 @@ def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
     if (directory / "objects").is_symlink():  # Another gallery may share the files behind it.
         return
     for path, _ in _own_objects(directory, used):
-        path.unlink(missing_ok=True)
+        if not path.is_symlink():
+            path.unlink(missing_ok=True)
 
 
 def _rebuilt(directory: Path) -> Gallery:

@@ -181,4 +181,5 @@ def ros_message(value: Any) -> Any:
         return SimpleNamespace(**{name: ros_message(field) for name, field in value.items()})
     if not isinstance(value, list):
         return value
-    return [ros_message(each) for each in value] if not value or isinstance(value[0], Mapping) else np.array(value)
+    is_sequence = not value or isinstance(value[0], Mapping)
+    return [ros_message(each) for each in value] if is_sequence else np.array(value, np.float64)

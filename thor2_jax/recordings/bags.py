@@ -44,8 +44,11 @@ __all__ = ["Bag"]
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
 
-_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex", "": "ros2 bag reindex"}
-"""Suffix of a recording (a directory has none) -> the command that repairs it."""
+MAX_TOPICS = 1000
+"""Largest number of image and camera topics: finding the first message of each may read the whole recording."""
+
+_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
+"""Suffix of a file -> the command that repairs it; directories have that of .db3."""
 
 
 class Bag:
@@ -112,7 +115,7 @@ class Bag:
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
-                    raise ValueError("it has no metadata.yaml; repair it: ros2 bag reindex")
+                    raise ValueError("it has no metadata.yaml")
                 # rosbags would expand aliases without a limit, and fail to close other values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
@@ -204,6 +207,10 @@ class Bag:
             if not all(isinstance(name, str) for name in (*types, *types.values())):
                 raise ValueError("a topic has a name that is no text")
             images = [topic for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)]
+            if len(images) > MAX_TOPICS:
+                raise InputError(
+                    f"bag: {self.path} has {len(images)} topics of images and cameras; expected at most {MAX_TOPICS}"
+                )
             overlap = largest_overlap(self._reader, {c.id for c in self._reader.connections if c.topic in images})
             if overlap > MAX_OVERLAPPING:
                 raise InputError(
@@ -239,10 +246,11 @@ class Bag:
         except Exception as error:
             reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
+            repair = _REPAIR.get(".db3" if self.path.is_dir() else self.path.suffix)
             raise InputError(
                 f"bag: {self.path} is damaged or of another format{after} ({reason}); expected a ROS 1 bag (.bag), a "
                 f"ROS 2 bag (directory, .db3) or MCAP of ROS 2"
-                + (f"; repair it: {_REPAIR[self.path.suffix]} {self.path.name}" if self.path.suffix in _REPAIR else "")
+                + (f"; repair it: {repair} {self.path.name}" if repair else "")
             ) from None
 
 

@@ -22,7 +22,7 @@ from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.class_scores import padded_points
 from thor2_jax.explanation.explain import explained_kinds
-from thor2_jax.files import check_output_file
+from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
@@ -293,7 +293,13 @@ def _load(settings: Settings) -> Recognizer:
         raise InputError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
-        check_output_file("gallery", (directory or settings.model / GALLERY_DIRECTORY) / INDEX_FILE)
+        directory = directory or settings.model / GALLERY_DIRECTORY
+        try:
+            check_writable(directory)
+        except OSError as error:
+            raise InputError(
+                f"gallery: {directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
+            ) from None
     return recognizer
 
 

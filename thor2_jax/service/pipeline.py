@@ -306,6 +306,9 @@ class Service:
             RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
                 `prepare_view`. Nothing is enrolled.
         """
+        with gallery_errors(self.engine.objects.directory, 409, "name"):
+            self.engine.objects.refresh()
+            self.engine.objects.check(name, **flags)
         prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))

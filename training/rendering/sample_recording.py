@@ -65,7 +65,7 @@ def _encoded(pixels: np.ndarray, kind: str, **options: Any) -> np.ndarray:
 
 
 def _camera_info(camera: Intrinsics) -> dict[str, Any]:
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64)
     region = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     return {
         "height": CAMERA.height, "width": CAMERA.width, "distortion_model": "plumb_bob", "d": np.zeros(5),

@@ -118,7 +118,7 @@ def expected_image(
 @pytest.mark.parametrize("n", [1, 2, 7, 31])
 def test_against_persim(n: int) -> None:
     births, deaths = random_pairs(n, n)
-    image = jax.jit(persistence_images, static_argnums=1)(diagram(births, deaths), GUDHI, 0.00025, 1.0)
+    image = jax.jit(persistence_images, static_argnums=1)(diagram(births, deaths), GUDHI)
     expected = imager().transform(np.stack([births, deaths], axis=1), skew=True)
     assert expected.shape == image.shape == (32, 32)
     np.testing.assert_allclose(image, expected, atol=TOLERANCE)

@@ -157,11 +157,11 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ("{", "is not valid JSON"),
         ("[" * 70_000, "is not valid JSON"),
         ("\xff", "is neither JSON, YAML"),
-        ("[500, 500, 3, 2]", "intrinsics is [500, 500, 3, 2]; expected fx, 0, cx"),
+        ("[500, 500, 3, 2]", "intrinsics is a list of shape (4,)"),
         ('{"fx": 1' + "0" * 400 + ', "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is 1000"),
         ("K: [1, 0, 3, 0, 2, 2, 0, 0]", "expected fx, 0, cx"),
         ('{"K": "one"}', "expected fx, 0, cx"),
-        ("615 0 318 0 616 241 0 0", "[615. 0. 318. 0. 616. 241. 0. 0.]; expected fx, 0, cx"),
+        ("615 0 318 0 616 241 0 0", "shape (8,)"),
         ("615 0 318 7 616 241 0 0 1", "expected fx, 0, cx"),
         ("615 0 318 0 616 241 0 0 one", "is a str"),
         ("a: [", "neither JSON, YAML"),
@@ -191,6 +191,7 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
 def test_invalid_npy_files() -> None:
     for content in (
         as_npy(MATRIX)[:100],
+        as_npy(MATRIX[:2]),
         as_npy(np.array([Pickled()] * 9, object)),
         as_npy(MATRIX + 0j),
         as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),

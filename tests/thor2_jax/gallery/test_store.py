@@ -196,6 +196,15 @@ def test_nothing_behind_a_symbolic_link_is_removed(directory: Path, tmp_path: Pa
     assert before.items() <= files_of(tmp_path / "shared").items()
 
 
+def test_symbolic_links_to_objects_are_not_removed(directory: Path, tmp_path: Path) -> None:
+    (file,) = (directory / "objects").glob(f"{load_gallery(directory).objects['mug'].file}.*")
+    file.rename(tmp_path / file.name)
+    file.symlink_to(tmp_path / file.name)
+    for seed in (5, 6):
+        update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
+    assert file.is_symlink() and (tmp_path / file.name).is_file()
+
+
 def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
     update_gallery(directory, add("mug", 5, replace=True), FINGERPRINT)
     expected = load_gallery(directory)

@@ -162,10 +162,16 @@ def test_the_largest_overlap_of_chunks() -> None:
     assert overlap((0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)) == 50
 
 
-def test_chunks_of_the_same_time_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("limit", "value", "message"),
+    [("MAX_OVERLAPPING", 1000, "chunks of the same time; expected at most 1000"), ("MAX_TOPICS", 2, "3 topics of")],
+)
+def test_chunks_of_the_same_time_and_topics_have_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, message: str
+) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
-    monkeypatch.setattr(bags, "MAX_OVERLAPPING", 1000)
-    with pytest.raises(InputError, match="chunks of the same time; expected at most 1000"), Bag(path):
+    monkeypatch.setattr(bags, limit, value)
+    with pytest.raises(InputError, match=message), Bag(path):
         pass
 
 
@@ -243,7 +249,7 @@ def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
     ("write", "message"),
     [
         (lambda path: None, "No such file"),
-        (lambda path: path.mkdir(), "metadata.yaml"),
+        (lambda path: path.mkdir(), "metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"),
         (lambda path: path.write_bytes(b"#ROSBAG V2.0\n"), "damaged or of another format"),
     ],
 )

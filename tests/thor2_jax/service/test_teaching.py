@@ -88,6 +88,7 @@ def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: File
 def test_extend_replace_and_undo(http: httpx.Client, files: Files) -> None:
     enroll(http, files, "tall")
     check_refused(enroll(http, files, "tall", 7), 409, "name", "extend")
+    check_refused(enroll(http, files, "tall", 9), 409, "name")  # before the view is prepared
     assert enroll(http, files, "tall", 7, extend="true").json()["views"] == 2
     assert enroll(http, files, "tall", 7, replace="true").json()["views"] == 1
     # A trained class needs one of them, too.
@@ -142,7 +143,7 @@ def test_unusable_galleries_are_refused_at_the_start(
         with pytest.raises(InputError, match="thor2 objects --reembed --model RUN --gallery"):
             InferenceEngine(Settings(teaching_run, gallery=gallery, teach=teach))
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="gallery: .*can be written"):
+    with pytest.raises(InputError, match="gallery: .*gallery cannot be written.*--gallery"):
         InferenceEngine(Settings(teaching_run, gallery=tmp_path / "file" / "gallery", teach=True))
 
 
