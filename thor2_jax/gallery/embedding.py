@@ -157,10 +157,9 @@ class EmbeddingNetwork(nnx.Module):
             x = self.dropout(x, deterministic=not train, rngs=rngs)
         return _unit(self.head(x))
 
-    def class_logits(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
-        """Return one logit for each proxy [B, n_proxies]; the arguments are those of `learned`."""
-        cosines = class_cosines(self.learned(descriptors, statistics), self.proxies[...])
-        return jnp.exp(self.log_scale[...]) * cosines
+    def class_logits(self, learned: jax.Array) -> jax.Array:
+        """Return one logit for each proxy [B, n_proxies] from learned blocks [B, learned]."""
+        return jnp.exp(self.log_scale[...]) * class_cosines(learned, self.proxies[...])
 
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
         """Return the embeddings [B, D], of unit length.
@@ -204,20 +203,21 @@ class _ClassViews(nnx.Module):
     """The learned blocks of the reference views of the classes.
 
     Attributes:
-        learned: [n, L], of unit length.
-        label: [n] index of the class.
+        learned: [C, n, L], of unit length, or zeros beyond the views of a class.
     """
 
-    def __init__(self, references: References, length: int) -> None:
-        of_class = references.label >= 0
-        learned = references.embeddings[of_class, :length].astype(np.float32)
-        self.learned = nnx.Variable(learned / np.linalg.norm(learned, axis=1, keepdims=True))
-        self.label = nnx.Variable(references.label[of_class])
+    def __init__(self, references: References, n_classes: int, length: int) -> None:
+        learned = references.embeddings[:, :length].astype(np.float32)
+        learned /= np.linalg.norm(learned, axis=1, keepdims=True)
+        of_class = [learned[references.label == label] for label in range(n_classes)]
+        padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
+        for label, views in enumerate(of_class):
+            padded[label, : len(views)] = views
+        self.learned = nnx.Variable(padded)
 
     def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
         """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
-        cosines = jnp.einsum("bkl,nl->bkn", learned, self.learned[...])
-        return jnp.where(self.label[...] == label[:, None, None], cosines, -1).max(axis=-1, initial=-1)
+        return jnp.einsum("bkl,bnl->bkn", learned, self.learned[...][label]).max(axis=-1, initial=-1)
 
 
 def _class_probabilities(
@@ -230,7 +230,8 @@ def _class_probabilities(
     probable one.
     """
     networks = models[:n_networks]
-    logits = jnp.stack([model.class_logits(*oriented.flat) for model in networks])
+    learned = [model.learned(*oriented.flat) for model in networks]
+    logits = jnp.stack([model.class_logits(block) for model, block in zip(networks, learned, strict=True)])
     if nearest:
         largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
         logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
@@ -238,8 +239,8 @@ def _class_probabilities(
     fused = oriented.fuse(logits.mean(axis=0))
     probabilities = fused[:, :n_classes]
     for views in models[n_networks:]:
-        learned = networks[0].learned(*oriented.flat).reshape(*oriented.weights.shape, -1)
-        similarity = (oriented.weights * views.similarity(learned, probabilities.argmax(axis=1))).sum(axis=1)
+        looks = learned[0].reshape(*oriented.weights.shape, -1)
+        similarity = (oriented.weights * views.similarity(looks, probabilities.argmax(axis=1))).sum(axis=1)
         probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
         probabilities /= (probabilities.sum(axis=1) + fused[:, n_classes:].sum(axis=1))[:, None]
     return probabilities
@@ -372,7 +373,7 @@ class Embedding:
         models = [self._embedder, *map(_split, self.further)]
         static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
         if self.sizes.views and self.references is not None:
-            models.append(nnx.split(_ClassViews(self.references, self.sizes.learned)))
+            models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
         return compiled(_class_probabilities, models, *static)
 
     @functools.cached_property
