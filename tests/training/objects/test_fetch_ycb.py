@@ -167,6 +167,7 @@ def test_unknown_objects_and_addresses_that_cannot_be_read(
     ):
         assert_refused("expected", fetch_ycb, [NAME], tmp_path, url=url)
     assert_refused("network", fetch_ycb, [NAME], tmp_path, url=f"http://127.0.0.1:{free_port()}")
+    monkeypatch.setenv("no_proxy", "")
     for proxy in ("socks5://127.0.0.1:1", "ftp://127.0.0.1:1"):
         monkeypatch.setenv("all_proxy", proxy)
         assert_refused("url: .*proxy", fetch_ycb, [NAME], tmp_path, url=server.url)
