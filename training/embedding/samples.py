@@ -339,5 +339,5 @@ def _is_own(path: Path) -> bool:
     """Return whether a file is one of these, also of an earlier version, and may be replaced or removed."""
     try:
         return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, AttributeError):
         return False

@@ -37,7 +37,7 @@ def load_metadata(path: Path) -> dict[str, str]:
     try:
         with path.open("rb") as stream:
             return safetensors_metadata(stream.read(2**20))
-    except (OSError, TypeError, AttributeError) as error:
+    except (OSError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(str(error)) from None
 
 

@@ -80,9 +80,12 @@ def test_samples_are_built_once(
 
 def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callable[..., int]) -> None:
     cache.mkdir(parents=True)
-    users = [cache / name for name in ("mine.safetensors", f"distractors-{'0' * 64}.safetensors", "notes.txt")]
-    for path in users:
-        path.write_bytes(b"a user's")
+    headers = (b"a user's", b"[" * 10**5, b"[]", b'{"__metadata__": 1}', b'{"__metadata__": {"format": 1}}')
+    contents = [len(header).to_bytes(8, "little") + header for header in headers]
+    users = {cache / f"distractors-{k:064}.safetensors": content for k, content in enumerate(contents)}
+    users |= {cache / name: b"a user's" for name in ("mine.safetensors", "notes.txt")}
+    for path, content in users.items():
+        path.write_bytes(content)
     for seed in range(3):
         assert counted({"seed": seed}) == 1
     for path in files(cache):
@@ -90,7 +93,7 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     assert counted({"seed": 0}) == 0  # the file used last
     assert counted({"seed": 3}) == 1
     own = [path for path in files(cache) if path not in users]
-    assert len(own) == 3 and all(path.read_bytes() == b"a user's" for path in users)
+    assert len(own) == 3 and all(path.read_bytes() == users[path] for path in users)
     assert counted({"seed": 0}) == 0
 
 

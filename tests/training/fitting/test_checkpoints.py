@@ -84,6 +84,10 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
         for damaged in (content[:place], content[:place] + bytes([content[place] ^ 255]) + content[place + 1 :]):
             file.write_bytes(damaged)
             assert_refused(f"checkpoint: {file} cannot be read", lambda: Checkpoints(tmp_path).last(state(0)))
+    for metadata in ("1", '{"score": []}', '{"score": null}'):
+        header = f'{{"__metadata__": {metadata}}}'.encode()
+        file.write_bytes(len(header).to_bytes(8, "little") + header)
+        assert_refused(f"checkpoint: {file} cannot be read", Checkpoints, tmp_path)
     file.write_bytes(content)
     assert_equal(Checkpoints(tmp_path).last(state(0)), state(1))
 
