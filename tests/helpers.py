@@ -7,6 +7,7 @@ import functools
 import io
 import json
 import os
+import resource
 import socket
 import struct
 import subprocess
@@ -284,6 +285,17 @@ def files_of(folder: Path) -> dict[str, bytes]:
 def full_disk(*_: Any, **__: Any) -> None:
     """Fail as a function that writes does on a full disk."""
     raise OSError(errno.ENOSPC, "No space left on device", "/tmp/secret")
+
+
+@contextlib.contextmanager
+def small_disk(size: int) -> Iterator[None]:
+    """Limit the size of the files that this process writes, in bytes: a larger one is an OSError."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def json_lines(text: str) -> list[dict[str, Any]]:

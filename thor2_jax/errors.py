@@ -58,10 +58,13 @@ def needs_extra(subject: str, package: str, extra: str) -> Iterator[None]:
 
     Raises:
         InputError: the package is missing.
+        ImportError: a module of this software is missing or has an error.
     """
     try:
         yield
     except ImportError as error:
+        if (error.name or "").partition(".")[0] in ("thor2_jax", "training"):
+            raise
         raise InputError(
             f"{subject} needs {package} ({error}); run pip install -c constraints.txt '.[{extra}]'"
         ) from None

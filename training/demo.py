@@ -8,8 +8,9 @@ import dataclasses
 import json
 import resource
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from training.augmentation.simulated_cameras import CHOOSE, through_camera
 from training.embedding.samples import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.job import answer_frames
-from training.evaluation.results import compute_results
+from training.evaluation.results import compute_results, fuse_answers
 from training.evaluation.runs import Run, load_runs
 from training.fitting.job import VIEWS, is_finished, train_run
 from training.fitting.protocol import DEFAULT
@@ -127,7 +128,7 @@ def run_demo(
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     summary = DemoSummary(NAMES, accuracy, counts, time.perf_counter() - start, peak)
-    content = {"figures": dataclasses.asdict(summary)}
+    content = {"figures": dataclasses.asdict(summary), "instances": list(_instances(run, answers))}
     write_text(out / "demo.json", json.dumps(content, indent=1) + "\n")
     _write_report(out, summary, len(objects), trained.record["dataset"]["views"])
     return summary
@@ -168,6 +169,27 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))
         progress("recognize scenes", number + 1, N_SCENES, "")
     return grouped
+
+
+def _instances(run: Run, answers: Sequence[FrameAnswers]) -> Iterator[dict[str, Any]]:
+    """Yield the answers of every fusion for each instance."""
+    for frame in answers:
+        described = [i for i in frame.instances if i.probabilities is not None]
+        fused = {name: by_run[0] for name, by_run in fuse_answers(described, [run]).items()}
+        rows = {instance.label: row for row, instance in enumerate(described)}
+        for instance in frame.instances:
+            row = rows.get(instance.label)
+            yield {
+                "frame": frame.frame,
+                "label": instance.label,
+                "truth": instance.truth,
+                "attributes": frame.attributes,
+                "answers": {}
+                if row is None
+                else {name: (run.classes[p.class_index[row]], float(p.confidence[row])) for name, p in fused.items()},
+                "occluded": instance.occluded,
+                "reason": instance.reason,
+            }
 
 
 def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int) -> None:

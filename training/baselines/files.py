@@ -118,8 +118,9 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], s
     about["digest"] = _digest(stored.arrays, about)
     arrays = {name: np.ascontiguousarray(array) for name, array in stored.arrays.items()}
     path.parent.mkdir(exist_ok=True)
+    content = safetensors.numpy.save(arrays, {"about": json.dumps(about)})
     with atomic_write(path) as temporary:
-        safetensors.numpy.save_file(arrays, temporary, {"about": json.dumps(about)})
+        temporary.write_bytes(content)
 
 
 def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:

@@ -127,7 +127,8 @@ def fit_pointnet(task: FitTask) -> StoredBaseline:
         """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
         first = int(rng.integers(STORED_POINTS - POINTS + 1))
         window = slice(first, first + POINTS)
-        x = np.array(*point_features(xyz[rows, window].astype(np.float32), rgb[rows, window], box[rows]))
+        (features,) = point_features(xyz[rows, window].astype(np.float32), rgb[rows, window], box[rows])
+        x = np.array(features)
         x[..., :2] *= rng.choice(np.array([-1, 1], np.float32), (len(rows), 1, 2))
         return (x,)
 

@@ -184,6 +184,10 @@ def main() -> None:
         if package not in TRAINING_PACKAGES:
             raise
         _exit_with(f"{package} is not installed; recognition works without it, this does not: see docs/install.md")
+    except RuntimeError as error:
+        if "Symlink loop" not in str(error):  # of Path.resolve
+            raise
+        _exit_with(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")

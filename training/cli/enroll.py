@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import check_name
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
@@ -51,12 +52,15 @@ def enroll(
     folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which an object
     is unknown depends on its number of views; see --unknown-below of `thor2 recognize`.
     """
+    name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
     has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
     if name is None and (label_name is not None or instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
+    if extend and replace:
+        raise InputError("extend and replace are both given; choose one")
     for option, value in (("label_name", label_name), ("instance", instance)):
         if mesh is not None and value is not None:
             raise InputError(f"{option} is {value}; it belongs to frames")

@@ -53,6 +53,7 @@ def build_embedding(
     samples = build_samples(sources, network, config, views, pool=local_workers(workers), progress=show)
     embedding = fit_embedding(samples, network, config, epochs, progress=show)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
+    out.parent.mkdir(parents=True, exist_ok=True)
     embedding.save(out)
     print(f"{out}: {embedding.fingerprint}")
 

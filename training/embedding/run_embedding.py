@@ -51,7 +51,7 @@ RENDER, DESCRIBE, FIT = STAGES
 def _distractor_samples(
     distractors: Distractors, directory: Path, network: ColorNetwork, config: DescriptorConfig, progress: Progress
 ) -> Samples:
-    """Render and sample the distractors, unless the user's cache has their samples."""
+    """Render and sample the distractors, unless the user's cache or the directory has their samples."""
     sources = distractors.sources
     objects = [mesh_digest(load_mesh(source)) if isinstance(source, Path) else source for source in sources]
 
@@ -69,7 +69,8 @@ def _distractor_samples(
         "seed": SEED,
         "augmentations": AUGMENTATIONS.record(),
     }
-    samples = stored_samples(job, cache_directory("distractors") or directory, build)
+    cache = cache_directory("distractors")
+    samples = stored_samples(job, [directory] if cache is None else [cache, directory], build)
     progress(RENDER, len(sources), len(sources), "")
     return samples
 
@@ -89,7 +90,7 @@ def fit_run_embedding(
         source: normalized views of the classes.
         held_out: label -> indices of the views of the held-out set.
         settings: those of the run, with distractors.
-        directory: for the samples of the distractors, from which an interrupted training resumes if there is no cache.
+        directory: for the samples of the distractors, if the user's cache cannot be used.
         progress: called with (stage, done, total, note).
         checkpoints: see `fit_embedding`.
         epoch_done: likewise.

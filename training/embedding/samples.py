@@ -272,45 +272,55 @@ LIBRARY_CODE = (".", "descriptor", "frames")
 log = logging.getLogger(__name__)
 
 
-def stored_samples(job: Mapping[str, Any], directory: Path, build: Callable[[], Samples]) -> Samples:
-    """Return the samples of a job from a directory, or build them and store them there.
+def stored_samples(job: Mapping[str, Any], directories: Sequence[Path], build: Callable[[], Samples]) -> Samples:
+    """Return the samples of a job from a directory, or build them and store them in the first that can be written.
 
-    A directory that cannot be used costs the time to build the samples, and is logged as a warning.
+    A directory that cannot be used is logged as a warning.
 
     Args:
         job: record of everything that determines the samples beside the software and the kind of processor.
-        directory: the user's cache, or a directory of the training.
+        directories: the user's cache, if there is one, and a directory of the training.
         build: returns the samples.
 
     Raises:
         InputError: as `build`.
         OSError: as `build`.
     """
-    file = directory / f"distractors-{json_digest({**job, **_software()})}.safetensors"
-    try:
-        if file.is_file():
-            samples = Samples(**load_arrays(file))
-            with contextlib.suppress(OSError):  # a read-only cache is used as it is
-                os.utime(file)
-            return samples
-    except (OSError, ValueError, TypeError) as error:
-        advice = "" if _is_own(file) else "; delete this file"
-        log.warning("%s cannot be used (%s); the distractors are rendered again%s", file, error, advice)
+    name = f"distractors-{json_digest({**job, **_software()})}.safetensors"
+    for file in (directory / name for directory in directories):
+        try:
+            if file.is_file():
+                samples = Samples(**load_arrays(file))
+                with contextlib.suppress(OSError):  # a read-only cache is used as it is
+                    os.utime(file)
+                return samples
+        except (OSError, ValueError, TypeError) as error:
+            log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
     samples = build()
+    for directory in directories:
+        if _store(samples, directory / name):
+            break
+    return samples
+
+
+def _store(samples: Samples, file: Path) -> bool:
+    """Store samples unless the file is a user's, or another process is writing; return whether they are stored."""
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with locked(directory):
-            remove_leftovers(directory)
-            if not file.exists() or _is_own(file):
-                save_arrays(file, samples.arrays(), {"format": FORMAT})
-            own = [path for path in directory.iterdir() if _is_own(path)]
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with locked(file.parent):
+            remove_leftovers(file.parent)
+            if file.exists() and not _is_own(file):
+                return False
+            save_arrays(file, samples.arrays(), {"format": FORMAT})
+            own = [path for path in file.parent.iterdir() if _is_own(path)]
             for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
                 path.unlink(missing_ok=True)
+            return True
     except InputError:
-        pass  # another process is writing, usually the same file
+        return False  # another process is writing, usually the same file
     except OSError as error:
         log.warning("the distractors cannot be kept for the next training: %s", error)
-    return samples
+        return False
 
 
 def _software() -> dict[str, str]:
@@ -329,5 +339,5 @@ def _is_own(path: Path) -> bool:
     """Return whether a file is one of these, also of an earlier version, and may be replaced or removed."""
     try:
         return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
-    except (ValueError, KeyError):
+    except (ValueError, KeyError, AttributeError):
         return False

@@ -1,7 +1,7 @@
 """Pictures of an evaluation, drawn while the frames are in memory: judged frames, and crops of instances."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class FramePictures:
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        list(self._most_confident(answers))  # records the confidences
+        self._record(answers)
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
@@ -68,20 +68,22 @@ class FramePictures:
             OSError: a file cannot be written.
         """
         color, labels = item.frame.color, item.frame.label_image
-        for instance, name in self._most_confident(answers):
+        for instance, name in self._record(answers):
             draw_crop(color, labels == instance.label, self.confusion_path(instance.truth, name))
         if number in self.shown:
             draw_judged(color, labels, self._judge(answers), self.frame_path(number))
 
-    def _most_confident(self, answers: FrameAnswers) -> Iterator[tuple[InstancePrediction, str]]:
-        """Yield instance and name of each wrong name that is more confident than all equal ones so far."""
+    def _record(self, answers: FrameAnswers) -> list[tuple[InstancePrediction, str]]:
+        """Record the confidences; return instance and wrong name where it is the most confident equal one so far."""
+        most_confident = []
         for _, instance, name, confidence in named_answers(answers.instances, self._runs):
             if instance.truth not in self._names:
                 self._names.append(instance.truth)
             if name in (None, instance.truth) or confidence <= self._highest.get((instance.truth, str(name)), -1.0):
                 continue
             self._highest[instance.truth, str(name)] = confidence
-            yield instance, str(name)
+            most_confident.append((instance, str(name)))
+        return most_confident
 
     def _judge(self, answers: FrameAnswers) -> list[Annotation]:
         """Return what the first run answers, incorrect answers first; an unknown object should have no name."""

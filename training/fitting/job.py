@@ -247,7 +247,8 @@ class _Fold(NamedTuple):
             def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
                 self.progress(stage, done, total, metrics.describe(settings.fit.epochs))
 
-            context, (checkpoints, epoch_done) = FitContext(name, settings.network, settings.config), self.begin(name)
+            context = FitContext(name, settings.network, settings.config)
+            checkpoints, epoch_done = self.begin(name)
             classifiers[name], best_epochs[name] = fit(
                 samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
             )
@@ -263,7 +264,8 @@ class _Fold(NamedTuple):
         def report(stage: str, done: int, total: int, note: str = "") -> None:
             self.progress(settings.of_fold(stage, self.number), done, total, note)
 
-        labels, directory = np.unique(samples.label), self.out / CHECKPOINTS / "distractors"
+        labels = np.unique(samples.label)
+        directory = self.out / CHECKPOINTS / "distractors"
         views = {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels}
         embedding, kept = fit_run_embedding(self.source, views, settings, directory, report, *self.begin(EMBEDDING))
         report(CALIBRATE, 0, 1)

@@ -185,7 +185,8 @@ class Checkpoints:
         self._scores[epoch] = score
         for old in self._scores.keys() - {self.last_epoch, self.best_epoch}:
             del self._scores[old]
-            self._path(old).unlink(missing_ok=True)
+            if jax.process_index() == 0:
+                self._path(old).unlink(missing_ok=True)
 
     def last(self, like: Any) -> Any:
         """Return the state of the last checkpoint, as NumPy arrays.
@@ -210,7 +211,7 @@ class Checkpoints:
         """Raise InputError if a checkpoint cannot be read in the block."""
         try:
             yield
-        except (ValueError, KeyError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise InputError(
                 f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
             ) from None

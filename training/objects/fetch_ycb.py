@@ -6,6 +6,7 @@ written to `<directory>/<object>`, where `find_meshes` finds `textured.obj`.
 
 import gzip
 import re
+import shutil
 import tarfile
 import zlib
 from collections.abc import Sequence
@@ -109,7 +110,10 @@ def _download(address: str, archive: Path, name: str, progress: Progress | None)
                     stream.write(block)
                     if progress:
                         progress(name, have // 1000, max(have, total) // 1000, "kB")
-    except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as error:  # the last from the resolution of names
+    except InputError:
+        raise
+    # The last two are raised for proxies of other kinds and by the resolution of names.
+    except (httpx.HTTPError, httpx.InvalidURL, ImportError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
             f"url: {address} cannot be read ({reason}); expected an address such as {YCB_URL}; check the network, then "
@@ -134,8 +138,12 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
                     total += member.size
                     if total > MAX_BYTES:
                         raise InputError(f"more than {MAX_BYTES:,} bytes")
-                    if member.isfile() and path.parent.name == "google_16k" and not path.name.startswith("."):
-                        content.extract(member.replace(name=path.name), folder, set_attrs=False, filter="data")
+                    if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
+                        continue
+                    source = content.extractfile(member)
+                    assert source is not None  # of a regular file
+                    with source, (folder / path.name).open("xb") as target:
+                        shutil.copyfileobj(source, target)
                 while stream.read(CHUNK_BYTES):
                     pass
             load_mesh(folder / MESH_FILE)

@@ -1,14 +1,14 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_table
+from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.image_files import check_size
 from thor2_jax.printable import check_name
 from training.objects.mesh import TexturedMesh, merge_meshes
@@ -37,17 +37,21 @@ MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
-def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
-    """Convert one geometry of a file.
+def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> TexturedMesh:
+    """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
         InputError: The geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
         ValueError: It is inconsistent.
     """
+    from trimesh.transformations import transform_points
     from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
     vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
+    vertices = transform_points(vertices, transform)
     faces = np.reshape(np.asarray(geometry.faces, np.int32), (-1, 3))
+    if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored part stays the right way out
+        faces = np.fliplr(faces).copy()
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
@@ -134,12 +138,12 @@ def _parsed(path: Path) -> TexturedMesh:
     missing: list[str] = []
 
     class Files(trimesh.resolvers.FilePathResolver):
-        """Remembers missing files: without its material or texture, trimesh loads a mesh as grey."""
+        """Remembers missing files and pipes: without its material or texture, trimesh loads a mesh as grey."""
 
         def get(self, name: str) -> bytes:
             try:
-                return super().get(name)
-            except OSError:
+                return read_file(Path(self.parent) / name.strip())
+            except (OSError, ValueError):
                 missing.append(name)
                 raise
 
@@ -147,15 +151,13 @@ def _parsed(path: Path) -> TexturedMesh:
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
-            raise InputError(f"its file {missing[0]!r} is missing")
+            raise InputError(f"its file {missing[0]!r} is missing or unreadable")
         parts = []
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
             geometry = scene.geometry[name]
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-                part = _part(geometry)
-                vertices = trimesh.transform_points(part.vertices, transform)
-                parts.append(dataclasses.replace(part, vertices=vertices))
+                parts.append(_part(geometry, transform))
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)

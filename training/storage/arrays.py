@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
     Raises:
         OSError: the file cannot be written; an older one stays.
     """
+    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    content = safetensors.numpy.save(contiguous, {**metadata, "sha256": _digest(contiguous)})
     with atomic_write(path) as temporary:
-        safetensors.numpy.save_file(dict(arrays), temporary, {**metadata, "sha256": _digest(arrays)})
+        temporary.write_bytes(content)  # `save_file` has an error of its own for a full disk
 
 
 def load_metadata(path: Path) -> dict[str, str]:
@@ -34,7 +37,7 @@ def load_metadata(path: Path) -> dict[str, str]:
     try:
         with path.open("rb") as stream:
             return safetensors_metadata(stream.read(2**20))
-    except (OSError, TypeError, AttributeError) as error:
+    except (OSError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(str(error)) from None
 
 

@@ -136,9 +136,6 @@ def local_workers(workers: int = 1) -> WorkerPool:
     With several workers, the calling script needs an `if __name__ == "__main__"` guard. If a worker dies, only its item
     is computed again. The map raises ChildProcessError if workers die repeatedly at an item, for example because memory
     runs out.
-
-    Raises:
-        InputError: if `workers` is not positive.
     """
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:

@@ -39,7 +39,7 @@ from training.views import crops, mesh_views
 from training.views.crops import CROP_SIZE, QuantizedCrop, crop_file, intact_content
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view
-from training.views.normalized_views import COORDINATE_STEP, normalize_views
+from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
 __all__ = ["dataset_job", "mesh_digest", "render_crops", "render_dataset"]
 
@@ -53,6 +53,20 @@ def mesh_digest(mesh: TexturedMesh) -> str:
     for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
         parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
     return content_digest(parts)
+
+
+def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
+    """Check every mesh and return the names and digests of the objects."""
+    objects = []
+    for name, mesh in mesh_views.checked_meshes(meshes, angles):
+        diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        if SIGMA_S * diameter > MAX_VIEW_LENGTH:
+            raise InputError(
+                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
+                "stored; scale the mesh to metres"
+            )
+        objects.append({"name": name, "mesh": mesh_digest(mesh)})
+    return objects
 
 
 def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
@@ -132,8 +146,7 @@ def dataset_job(
     if seed < 0:
         raise InputError(f"seed is {seed}; it must be at least 0")
     angles = view_angles(azimuth_step, polar_step)
-    checked = mesh_views.checked_meshes(meshes, angles)
-    objects = [{"name": name, "mesh": mesh_digest(mesh)} for name, mesh in checked]
+    objects = _objects(meshes, angles)
     plan = _plan(len(objects), len(angles), clouds_per_view(augmentations))
     camera = TRAINING_CAMERA
     # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
@@ -179,8 +192,8 @@ def render_dataset(
         seed: seed for the augmentations. The copies of an object do not depend on the other objects.
 
     Raises:
-        InputError: Nothing is written if there are no meshes, a mesh is unreadable or never visible, a step or
-            the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
+        InputError: Nothing is written if there are no meshes, a mesh is unreadable, too large or never visible, a step
+            or the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
             written by another process.
         OSError: `out` cannot be written; the rendering can be resumed.
     """

@@ -142,14 +142,17 @@ def test_arguments_are_checked_before_anything_is_loaded(
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged.ply").write_text("ply")
     for arguments, text in (
+        (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
+        (("mug\u200b", "--frames", frames), "visible"),
         (("--mesh", tmp_path / "one.ply"), "name is missing"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
         (("mug", "--mesh", tmp_path / "damaged.ply"), "damaged.ply"),
         (("mug", "--mesh", tmp_path / "empty"), "no .glb"),
         (("mug", "--mesh", tmp_path / "two"), "none of a, b is 'mug'"),
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "--mesh-scale"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "extend and replace"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
     ):
@@ -202,8 +205,6 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--frames", frames), "'new'", True),
         (("new", *frame_options(frames / "000")), "--instance", True),
         (("new", *one_frame(frames / "000", 4)), "instance is 4", True),
-        (("mug\u200b", "--frames", frames), "visible", True),
-        (("brick", "--frames", frames, "--extend", "--replace"), "extend and replace", True),
     ):
         assert words in refused("enroll", *given, "--model", model)
         if is_bad_for_any_run:

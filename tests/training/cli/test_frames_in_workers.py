@@ -1,5 +1,6 @@
 """Frames that worker processes recognize and evaluate: equal answers, workers that die, Ray nodes that die."""
 
+import dataclasses
 import json
 import pickle
 import threading
@@ -49,6 +50,7 @@ def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path
     for one, other in zip(answers, expected, strict=True):
         assert one.frame is not None and other.frame is not None
         np.testing.assert_array_equal(one.frame.labels, other.frame.labels)
+        assert vars(one.frame).keys() == {field.name for field in dataclasses.fields(one.frame)}
 
 
 def test_answers_before_an_unreadable_frame_are_kept(

@@ -155,7 +155,7 @@ def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_an_embedding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "embedding.safetensors"
+    out = tmp_path / "new" / "embedding.safetensors"
     build_embedding(out, objects=24, views=6, epochs=1, workers=1)
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
-    assert {path.name for path in tmp_path.iterdir()} == {out.name, REFERENCES_FILE}
+    assert {path.name for path in out.parent.iterdir()} == {out.name, REFERENCES_FILE}

@@ -1,5 +1,6 @@
 """Samples of distractors in the user's cache: kept, renewed, bounded, and unusable caches."""
 
+import contextlib
 import logging
 import os
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, full_disk, write_box
+from helpers import SMALL_CONFIG, small_disk, write_box
 
 import colornet
 import thor2_jax as thor2
@@ -41,9 +42,11 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def counted(tmp_path: Path) -> Callable[..., int]:
     """Return a function that asks for samples, checks them and returns how often they were built."""
 
-    def get(job: dict[str, Any] | None = None) -> int:
+    def get(job: dict[str, Any] | None = None, with_run: bool = False) -> int:
         build = mock.Mock(return_value=SAMPLES)
-        samples = stored_samples(job or {"seed": 0}, cache_directory("distractors") or tmp_path / "run", build)
+        directory = cache_directory("distractors")
+        directories = [each for each in (directory, tmp_path / "run" if with_run else None) if each is not None]
+        samples = stored_samples(job or {"seed": 0}, directories, build)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
         return build.call_count
@@ -58,7 +61,7 @@ def files(cache: Path) -> list[Path]:
 def test_samples_are_built_once(
     cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Each job and each version of the code has its own samples. Without a cache, they are in the run's directory."""
+    """Each job and each version of the code has its own samples."""
     with locked(cache):
         assert counted() == 1  # does not wait for another process
     assert [counted(), counted(), counted({"seed": 1}), counted(), counted({"seed": 1})] == [1, 0, 1, 0, 0]
@@ -69,8 +72,6 @@ def test_samples_are_built_once(
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
     monkeypatch.setattr(module.training, "__file__", str(code.parent / "__init__.py"))
-    monkeypatch.setenv("THOR2_CACHE", "off")
-    assert [counted(), counted()] == [1, 0] and files(tmp_path / "run") and len(files(cache)) == 3
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
     assert [counted(), counted()] == [1, 0] and files(tmp_path / "elsewhere") and len(files(cache)) == 3
     monkeypatch.delenv("THOR2_CACHE")
@@ -79,9 +80,12 @@ def test_samples_are_built_once(
 
 def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callable[..., int]) -> None:
     cache.mkdir(parents=True)
-    users = [cache / name for name in ("mine.safetensors", f"distractors-{'0' * 64}.safetensors", "notes.txt")]
-    for path in users:
-        path.write_bytes(b"a user's")
+    headers = (b"a user's", b"[" * 10**5, b"[]", b'{"__metadata__": 1}', b'{"__metadata__": {"format": 1}}')
+    contents = [len(header).to_bytes(8, "little") + header for header in headers]
+    users = {cache / f"distractors-{k:064}.safetensors": content for k, content in enumerate(contents)}
+    users |= {cache / name: b"a user's" for name in ("mine.safetensors", "notes.txt")}
+    for path, content in users.items():
+        path.write_bytes(content)
     for seed in range(3):
         assert counted({"seed": seed}) == 1
     for path in files(cache):
@@ -89,7 +93,7 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     assert counted({"seed": 0}) == 0  # the file used last
     assert counted({"seed": 3}) == 1
     own = [path for path in files(cache) if path not in users]
-    assert len(own) == 3 and all(path.read_bytes() == b"a user's" for path in users)
+    assert len(own) == 3 and all(path.read_bytes() == users[path] for path in users)
     assert counted({"seed": 0}) == 0
 
 
@@ -117,13 +121,25 @@ def test_a_damaged_file_costs_one_warning(
         assert counted() == 0
 
 
+@pytest.mark.parametrize("fault", ["off", "locked", "read-only"])
+def test_folds_share_samples_without_a_cache(
+    fault: str, cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """They are in the directory of the training, which a resumed training reads, too."""
+    if fault in ("off", "read-only"):
+        monkeypatch.setenv("THOR2_CACHE", {"off": "off", "read-only": "/proc/no-such-directory"}[fault])
+    with locked(cache) if fault == "locked" else contextlib.nullcontext():
+        assert [counted(with_run=True), counted(with_run=True)] == [1, 0]
+    assert counted(with_run=True) == 0
+    assert len(files(tmp_path / "run")) == 1 and files(cache) == []
+
+
 def test_a_full_or_unwritable_disk_costs_one_warning(
     cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "save_arrays", full_disk)
+    with small_disk(200):
         assert counted() == 1
-    assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
+    assert files(cache) == [] and "too large" in caplog.records[-1].getMessage()
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
     assert counted() == 1 and len(caplog.records) == 2
 
@@ -131,7 +147,7 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
 def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
     network, jobs = colornet.load_default(), list[dict[str, Any]]()
-    monkeypatch.setattr(run_embedding, "stored_samples", lambda job, directory, build: jobs.append(job))
+    monkeypatch.setattr(run_embedding, "stored_samples", lambda job, directories, build: jobs.append(job))
 
     def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> dict[str, Any]:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}

@@ -150,7 +150,9 @@ def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
 
 
-def test_unknown_objects_and_addresses_that_cannot_be_read(server: Server, tmp_path: Path) -> None:
+def test_unknown_objects_and_addresses_that_cannot_be_read(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for names in ([], ["cracker box"], ["../003_cracker_box"], ["004_sugar_box"]):
         assert_refused("objects", fetch_ycb, names, tmp_path, url=server.url)
     for url in (
@@ -165,6 +167,10 @@ def test_unknown_objects_and_addresses_that_cannot_be_read(server: Server, tmp_p
     ):
         assert_refused("expected", fetch_ycb, [NAME], tmp_path, url=url)
     assert_refused("network", fetch_ycb, [NAME], tmp_path, url=f"http://127.0.0.1:{free_port()}")
+    monkeypatch.setenv("no_proxy", "")
+    for proxy in ("socks5://127.0.0.1:1", "ftp://127.0.0.1:1"):
+        monkeypatch.setenv("all_proxy", proxy)
+        assert_refused("url: .*proxy", fetch_ycb, [NAME], tmp_path, url=server.url)
 
 
 def test_command_shows_the_licence(server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

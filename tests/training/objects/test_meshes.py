@@ -1,6 +1,7 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -151,8 +152,25 @@ def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
     (material,) = tmp_path.glob("*.mtl")
     picture.unlink()
     check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing")
+    os.mkfifo(picture)
+    check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing or unreadable")
     material.unlink()
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing")
+    os.mkfifo(material)
+    check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing or unreadable")
+
+
+def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
+        scene.add_geometry(
+            textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))), transform=np.diag([*scale, 1.0])
+        )
+    scene.export(tmp_path / "scene.glb")
+    mesh = load_mesh(tmp_path / "scene.glb")
+    expected = trimesh.load_scene(tmp_path / "scene.glb", process=False).to_mesh()
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], expected.triangles)
+    np.testing.assert_array_equal(mesh.uv, expected.visual.uv[expected.faces].astype(np.float32))
 
 
 def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """HTML pages, plots and the demo."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -117,4 +118,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     page = ParsedPage((tmp_path / "report.html").read_text())
     assert page.open == [] and len(page.pictures) == 11
     assert all((tmp_path / str(picture["src"])).is_file() for picture in page.pictures)
-    assert dataclasses.asdict(summary).keys() <= set((tmp_path / "demo.json").read_text().split('"'))
+    content = json.loads((tmp_path / "demo.json").read_text())
+    assert content["figures"].keys() == dataclasses.asdict(summary).keys()
+    assert len(content["instances"]) == summary.instances["all"]
+    assert {"frame", "label", "truth", "answers", "occluded", "reason"} <= content["instances"][0].keys()

@@ -209,6 +209,7 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
+        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
     ]:
         assert_refused(message, render_dataset, meshes, out, *steps, **options)
         assert not out.exists()
