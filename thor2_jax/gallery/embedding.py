@@ -208,7 +208,7 @@ class _ClassViews(nnx.Module):
 
     def __init__(self, references: References, n_classes: int, length: int) -> None:
         learned = references.embeddings[:, :length].astype(np.float32)
-        learned /= np.linalg.norm(learned, axis=1, keepdims=True)
+        learned /= np.maximum(np.linalg.norm(learned, axis=1, keepdims=True), 1e-6)
         of_class = [learned[references.label == label] for label in range(n_classes)]
         padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
         for label, views in enumerate(of_class):
