@@ -33,7 +33,8 @@ sys.path.append(sys.argv[1])
 from helpers import SMALL_CONFIG, brick_and_stick
 import colornet, thor2_jax as thor2
 from training.fitting.loop import FitOptions
-from training.fitting.job import RunSettings, train_run
+from training.fitting.job import train_run
+from training.fitting.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 clouds = brick_and_stick(8)
@@ -43,7 +44,7 @@ for homology in ("gudhi", "closed_form"):
     descriptors = thor2.describe(packed, colornet.load_default(), thor2.DescriptorConfig(homology=homology))
     hasher.update(np.asarray(descriptors.tops2).tobytes())
 with tempfile.TemporaryDirectory() as folder:
-    settings = RunSettings(("tops2",), FitOptions(2, batch_size=4, seed=5), SMALL_CONFIG)
+    settings = Protocol(("tops2",), FitOptions(2, batch_size=4, seed=5), SMALL_CONFIG)
     (run,) = train_run(MemoryViews(clouds, SMALL_CONFIG), Path(folder) / "run", settings)
 for path, leaf in sorted(nnx.to_flat_state(nnx.state(run.classifiers["tops2"])), key=lambda pair: str(pair[0])):
     hasher.update(str(path).encode() + np.asarray(leaf[...]).tobytes())
