@@ -304,7 +304,11 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
     (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
     columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
     window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    return ~ndimage.minimum_filter(window, 2 * RIM + 1, mode="nearest")[window]
+    # As `scipy.ndimage.minimum_filter`, in half of the time.
+    padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
+    inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
+    inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
+    return ~inside[window]
 
 
 def unit_question(frame: RGBDFrame) -> str:

@@ -207,13 +207,12 @@ class _ClassViews(nnx.Module):
     """
 
     def __init__(self, references: References, n_classes: int, length: int) -> None:
-        learned = references.embeddings[:, :length].astype(np.float32)
-        learned /= np.maximum(np.linalg.norm(learned, axis=1, keepdims=True), 1e-6)
+        learned = np.asarray(_unit(jnp.asarray(references.embeddings[:, :length], jnp.float32)))
         of_class = [learned[references.label == label] for label in range(n_classes)]
         padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
         for label, views in enumerate(of_class):
             padded[label, : len(views)] = views
-        self.learned = nnx.Variable(padded)
+        self.learned = nnx.Variable(jnp.asarray(padded))
 
     def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
         """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
@@ -238,7 +237,8 @@ def _class_probabilities(
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
     fused = oriented.fuse(logits.mean(axis=0))
     probabilities = fused[:, :n_classes]
-    for views in models[n_networks:]:
+    if len(models) > n_networks:
+        views = models[n_networks]
         looks = learned[0].reshape(*oriented.weights.shape, -1)
         similarity = (oriented.weights * views.similarity(looks, probabilities.argmax(axis=1))).sum(axis=1)
         probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
@@ -373,7 +373,8 @@ class Embedding:
         models = [self._embedder, *map(_split, self.further)]
         static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
         if self.sizes.views and self.references is not None:
-            models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
+            with jax.ensure_compile_time_eval():  # as in `_split`; on the device, or every call would copy the views
+                models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
         return compiled(_class_probabilities, models, *static)
 
     @functools.cached_property

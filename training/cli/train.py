@@ -186,9 +186,9 @@ def train(
         embedding = 0 if protocol.distractors is None else default.procedural
     others = None
     if embedding or distractors is not None:
-        found = {} if distractors is None else find_meshes(distractors)
+        further = {} if distractors is None else find_meshes(distractors)
         passes = default.epochs if epochs is None else epochs
-        others = dataclasses.replace(default, procedural=embedding, meshes=found, epochs=passes, workers=workers)
+        others = dataclasses.replace(default, procedural=embedding, meshes=further, epochs=passes, workers=workers)
     features = protocol.classifiers if others is not None else FEATURES
     if classifiers is not None:
         features = check_features(options.split_names(classifiers), "classifiers")

@@ -66,8 +66,8 @@ def watch(
         segmenter = load_segmenter(segment or TABLE)
         frames: Iterator[RecordedFrame]
         if folder is not None:
-            found = enumerate(options.FrameOptions([folder]).sources(segment))
-            frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in found)
+            numbered = enumerate(options.FrameOptions([folder]).sources(segment))
+            frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in numbered)
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:

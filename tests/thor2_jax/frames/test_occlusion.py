@@ -19,10 +19,10 @@ BACK, FRONT = 1, 2
 def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, PreparedInstance]:
     frame = RGBDFrame(np.zeros((*labels.shape, 3), np.uint8), depth, labels, CAMERA)
     clouds = instance_clouds(frame)
-    found = [find_occlusion(frame, cloud) for cloud in clouds]
+    boundaries = [find_occlusion(frame, cloud) for cloud in clouds]
     return {
         cloud.label: dataclasses.replace(cloud, occluded=occluded, boundary=boundary)
-        for cloud, (occluded, boundary) in zip(clouds, found, strict=True)
+        for cloud, (occluded, boundary) in zip(clouds, boundaries, strict=True)
     }
 
 
