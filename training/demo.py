@@ -24,10 +24,9 @@ from training.evaluation.answers import FrameAnswers
 from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results, fuse_answers
 from training.evaluation.runs import Run, load_runs
-from training.fitting.job import VIEWS, is_finished, train_run
-from training.fitting.protocol import DEFAULT
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
+from training.protocol import DEFAULT
 from training.readers.labelled import LabelledFrame
 from training.rendering.scenes import Scene, compose_scene
 from training.rendering.view_sphere import camera_pose
@@ -36,6 +35,7 @@ from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
 from training.storage.jobs import Progress, check_same_job, of_stage
 from training.storage.workers import local_workers
+from training.train_run import VIEWS, is_finished, train_run
 from training.views.dataset import remove_views
 from training.views.mesh_views import view_cloud
 from training.views.render_job import render_dataset

@@ -17,14 +17,14 @@ from thor2_jax.printable import normal_name
 from training.baselines.files import check_baselines
 from training.baselines.job import check_weights, crop_size, pretrained_files, train_baselines
 from training.enrollment import labelled_views
-from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
-from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
+from training.protocol import DEFAULT, PAPER, Protocol
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
 from training.storage.jobs import Display, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
+from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import WithLabelledViews, digest_of_instances

@@ -8,9 +8,9 @@ from helpers import Interrupted, brick_and_stick, files_of, stop_when
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.fitting.job import train_run
 from training.fitting.loop import FitOptions
-from training.fitting.protocol import Protocol
+from training.protocol import Protocol
+from training.train_run import train_run
 from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)

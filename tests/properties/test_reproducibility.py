@@ -33,8 +33,8 @@ sys.path.append(sys.argv[1])
 from helpers import SMALL_CONFIG, brick_and_stick
 import colornet, thor2_jax as thor2
 from training.fitting.loop import FitOptions
-from training.fitting.job import train_run
-from training.fitting.protocol import Protocol
+from training.train_run import train_run
+from training.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 clouds = brick_and_stick(8)

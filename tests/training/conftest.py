@@ -18,11 +18,11 @@ from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
-from training.embedding import run_embedding
-from training.fitting import job, protocol
+from training import train_run
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
+from training.protocol import DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS
 
 SAVEFIG = Figure.savefig
 
@@ -48,18 +48,18 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
     metrics = functools.partial(EpochMetrics, 1, 1.0, 0.5, 1.0)
 
     def fit(samples: Samples, context: FitContext, *others: Any) -> tuple[MLP, int]:
-        _, _, held_out, _, epoch_done = others
-        epoch_done(metrics(held_out_accuracy=None if held_out is None else 0.5))
+        _, checkpoints, held_out, _ = others
+        checkpoints.log(metrics(held_out_accuracy=None if held_out is None else 0.5))
         inputs = input_size(context.feature, context.config, context.network.n_regions)
         return random_classifier(inputs, len(samples.classes), 0), 1
 
-    def fit_embedding(source: Any, *others: Any) -> tuple[Embedding, list[Any]]:
-        _, settings, _, report, _, epoch_done = others
-        for stage in protocol.STAGES:
-            report(stage, 1, 1)
-        epoch_done(metrics())
+    def fit_embedding(fold: Any, distractors: Any) -> tuple[Embedding, list[Any]]:
+        for stage in (RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS):
+            fold.report(stage, 1, 1)
+        fold.checkpoints("embedding").log(metrics())
+        settings, classes = fold.settings, fold.samples.classes
         created = Embedding.create(
-            settings.config, settings.network, run_embedding.SIZES, classes=tuple(source.classes), distractors=9
+            settings.config, settings.network, train_run.RUN_SIZES, classes=classes, distractors=9
         )
         views = References(np.zeros((1, created.size), np.float16), np.full(1, BACKGROUND, np.int32))
         return dataclasses.replace(created, references=views), []
@@ -67,9 +67,9 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
     @contextlib.contextmanager
     def patched() -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(job, "fit", fit)
-            patch.setattr(job, "fit_run_embedding", fit_embedding)
-            patch.setattr(job, "fit_calibration", lambda *_: (None, 0.5))
+            patch.setattr(train_run, "fit", fit)
+            patch.setattr(train_run._Fold, "fit_embedding", fit_embedding)
+            patch.setattr(train_run, "fit_calibration", lambda *_: (None, 0.5))
             yield
 
     return patched

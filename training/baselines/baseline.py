@@ -19,7 +19,7 @@ from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
-from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
+from training.fitting.loop import Checkpoints, FitOptions, Steps, of_fit, run_epochs
 from training.fitting.samples import fold_of_views
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource
@@ -192,11 +192,9 @@ def fit_network(
         rate = np.float32(fit.rate(number, steps.epochs * steps.of_epoch))
         return _step(graph, fit.inputs, fit.optimizer, state, *batch, rate)
 
-    def report(done: int, total: int, metrics: EpochMetrics) -> None:
-        task.progress(f"fit {task.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
-
     checkpoints = Checkpoints(task.scratch / fit.directory)
-    state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=report)
+    shown = of_fit(task.progress, f"fit {task.name}", steps.epochs)
+    state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=shown)
     return nnx.merge(graph, state.params, state.rest)
 
 

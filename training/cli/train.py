@@ -17,7 +17,7 @@ class _TrainCommand(options.ManyFrames):
 
     def insert_values(self) -> None:
         """Insert the values into the help; the protocols take a second to import, so this is not done before."""
-        from training.fitting.protocol import DEFAULT, PAPER, QUICK
+        from training.protocol import DEFAULT, PAPER, QUICK
 
         parameters: list[Any] = self.params
         for option in parameters:
@@ -172,8 +172,9 @@ def train(
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.model.classifier import FEATURES, check_features
     from thor2_jax.model.run_record import RUN_FILE
-    from training.fitting.protocol import DEFAULT, PAPER, QUICK, Distractors
+    from training.embedding.distractors import Distractors
     from training.objects.meshes import find_meshes
+    from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
     from training.train_job import TrainJob, run_train_job
 

@@ -21,8 +21,9 @@ from thor2_jax.files import check_output_file
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import fit_embedding, reference_views
 from training.embedding.samples import ObjectSource, build_samples
-from training.fitting.loop import EpochMetrics
+from training.fitting.loop import of_fit
 from training.objects.meshes import find_meshes
+from training.storage.jobs import of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding"]
@@ -46,12 +47,12 @@ def build_embedding(
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
     start = time.monotonic()
 
-    def show(done: int, total: int, metrics: EpochMetrics | None = None) -> None:
-        stage = "render for the embedding" if metrics is None else f"embedding, loss {metrics.loss:.3f}"
-        print(f"{time.monotonic() - start:6.0f} s  {stage}: {done} of {total}", file=sys.stderr, flush=True)
+    def show(stage: str, done: int, total: int, note: str) -> None:
+        print(f"{time.monotonic() - start:6.0f} s  {stage}: {done} of {total}, {note}", file=sys.stderr, flush=True)
 
-    samples = build_samples(sources, network, config, views, pool=local_workers(workers), progress=show)
-    embedding = fit_embedding(samples, network, config, epochs, progress=show)
+    rendered, fitted = of_stage(show, "render", "objects"), of_fit(show, "fit", epochs)
+    samples = build_samples(sources, network, config, views, pool=local_workers(workers), progress=rendered)
+    embedding = fit_embedding(samples, network, config, epochs, progress=fitted)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
     out.parent.mkdir(parents=True, exist_ok=True)
     embedding.save(out)

@@ -33,7 +33,10 @@ from training.embedding.samples import Batch, Samples
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
-__all__ = ["batch_descriptors", "fit_embedding", "reference_views"]
+__all__ = ["RUN_SIZES", "batch_descriptors", "fit_embedding", "reference_views"]
+
+RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
+"""Sizes of each network of a run; several small networks are steadier than fewer large ones."""
 
 BASIS_SAMPLES = 2048
 """Samples whose features determine the principal components."""
@@ -130,7 +133,6 @@ def fit_embedding(
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     classes: tuple[str, ...] = (),
     checkpoints: Checkpoints | None = None,
-    epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
     *,
     networks: int = 1,
     seed: int = 0,
@@ -149,7 +151,6 @@ def fit_embedding(
         classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
             objects as distractors, are kept. None by default: the proxies are discarded.
         checkpoints: of this fit only, written after each epoch; None writes none.
-        epoch_done: called after each epoch, before its checkpoint is written.
         networks: number of networks, fitted together on the same batches from different weights. Only the first one
             embeds; all classify. Use 1 without classes.
         seed: seed for weights, proxies, sample order and dropout.
@@ -191,7 +192,6 @@ def fit_embedding(
         step,
         checkpoints,
         progress=progress,
-        epoch_done=epoch_done,
         place=lambda states: jax.tree.map(jnp.asarray, states),
     )
     models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]

@@ -6,36 +6,26 @@ A sample stores only its occupied strips, about a tenth of all, and the statisti
 
 Views of objects are rendered from random cameras, with stronger augmentation than for classifiers: an embedding is used
 on cameras and objects that it never saw; a classifier is fitted on its own objects.
-
-Samples of distractors are kept in the user's cache: all runs use the same ones, and rendering them takes minutes. Each
-file holds the samples of one record of everything that determines them, and is named by the record's digest.
 """
 
-import contextlib
 import dataclasses
 import functools
-import logging
-import os
-import re
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-import thor2_jax
-import training
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, json_digest, remove_leftovers
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.orientation import reorient
@@ -43,11 +33,9 @@ from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import Camera, camera_pose, random_angles
-from training.storage.arrays import load_arrays, load_metadata, save_arrays
-from training.storage.jobs import locked, processor
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
-from training.views.normalized_views import padded_batches
+from training.views.normalized_views import ViewSource, padded_batches
 
 __all__ = [
     "AUGMENTATIONS",
@@ -57,7 +45,7 @@ __all__ = [
     "build_samples",
     "render_clouds",
     "sample_clouds",
-    "stored_samples",
+    "sample_views",
 ]
 
 CLOUDS_PER_BATCH = 64
@@ -259,85 +247,41 @@ def build_samples(
     return Samples.concatenated(chunks)
 
 
-MAX_FILES = 3
-"""Number of files that are kept; the ones that were used last."""
-
-FORMAT = "thor2 samples of distractors"
-NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
-
-CODE = ("augmentation", "embedding", "objects", "rendering", "views")
-LIBRARY_CODE = (".", "descriptor", "frames")
-"""Packages of training and of the library whose code determines the samples."""
-
-log = logging.getLogger(__name__)
-
-
-def stored_samples(job: Mapping[str, Any], directories: Sequence[Path], build: Callable[[], Samples]) -> Samples:
-    """Return the samples of a job from a directory, or build them and store them in the first that can be written.
-
-    A directory that cannot be used is logged as a warning.
+def sample_views(
+    source: ViewSource,
+    held_out: Mapping[int, NDArray[np.integer[Any]]],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    copies: int,
+    seed: int,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> tuple[Samples, list[tuple[int, Cloud]]]:
+    """Sample normalized views, except those of the held-out set.
 
     Args:
-        job: record of everything that determines the samples beside the software and the kind of processor.
-        directories: the user's cache, if there is one, and a directory of the training.
-        build: returns the samples.
+        source: normalized views.
+        held_out: label -> indices of the views of the held-out set.
+        network: colour network.
+        config: descriptor. Static.
+        copies: samples of each view, in random orientations.
+        seed: seed for the orientations.
+        progress: called with (shards done, number of shards).
 
-    Raises:
-        InputError: as `build`.
-        OSError: as `build`.
+    Returns:
+        The samples, and label and cloud, in metres, of each view of the held-out set. The clouds have no rim and no
+        boundary.
     """
-    name = f"distractors-{json_digest({**job, **_software()})}.safetensors"
-    for file in (directory / name for directory in directories):
-        try:
-            if file.is_file():
-                samples = Samples(**load_arrays(file))
-                with contextlib.suppress(OSError):  # a read-only cache is used as it is
-                    os.utime(file)
-                return samples
-        except (OSError, ValueError, TypeError) as error:
-            log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
-    samples = build()
-    for directory in directories:
-        if _store(samples, directory / name):
-            break
-    return samples
-
-
-def _store(samples: Samples, file: Path) -> bool:
-    """Store samples unless the file is a user's, or another process is writing; return whether they are stored."""
-    try:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with locked(file.parent):
-            remove_leftovers(file.parent)
-            if file.exists() and not _is_own(file):
-                return False
-            save_arrays(file, samples.arrays(), {"format": FORMAT})
-            own = [path for path in file.parent.iterdir() if _is_own(path)]
-            for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
-                path.unlink(missing_ok=True)
-            return True
-    except InputError:
-        return False  # another process is writing, usually the same file
-    except OSError as error:
-        log.warning("the distractors cannot be kept for the next training: %s", error)
-        return False
-
-
-def _software() -> dict[str, str]:
-    """Return the record of the software: users of a checkout change code within a version."""
-    root = Path(training.__file__).parent
-    folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
-    files = (file for folder in folders for file in sorted(folder.glob("*.py")))
-    return {
-        "version": thor2_jax.__version__,
-        "code": content_digest(file.read_bytes() for file in files),
-        "platform": f"{jax.default_backend()} {processor()}",
-    }
-
-
-def _is_own(path: Path) -> bool:
-    """Return whether a file is one of these, also of an earlier version, and may be replaced or removed."""
-    try:
-        return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
-    except (ValueError, KeyError, AttributeError):
-        return False
+    fitted: list[Samples] = []
+    kept: list[tuple[int, Cloud]] = []
+    for index, shard in enumerate(source.shards):
+        views, rng = source.read(index), np.random.default_rng([seed, index])
+        is_kept = np.isin(views.view, held_out.get(shard.label, []))
+        clouds = list(itertools.compress(views.clouds(), ~is_kept))
+        if clouds:
+            labels = [views.label] * len(clouds)
+            fitted.append(sample_clouds(clouds, labels, network, config, copies, rng, are_normal=True))
+        for xyz, rgb in itertools.compress(views.clouds(), is_kept):
+            # A copy, since a slice would keep all views of the shard in memory.
+            kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
+        progress(index + 1, len(source.shards))
+    return Samples.concatenated(fitted), kept

@@ -16,7 +16,6 @@ from sklearn.linear_model import LogisticRegression
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, class_probabilities
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
@@ -105,24 +104,21 @@ KEPT = 0.95
 """Share of the correct held-out answers whose confidence reaches the threshold of a run."""
 
 
-def fit_calibration(
-    run: TrainedRun, embedding: Embedding, held_out: Sequence[tuple[int, Cloud]]
-) -> tuple[Calibration | None, float]:
+def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:
     """Fit the confidence of a run; None if no held-out answer is correct, or no object is unknown.
 
     The clouds are recognized in the looks of the run. Known and unknown objects have equal weights in the score,
     whatever their numbers.
 
     Args:
-        run: run with its classifiers, which are fused as recognition does by default.
-        embedding: embedding of the run.
+        run: run with its classifiers, which are fused as recognition does by default, and its embedding.
         held_out: label and cloud, in metres, of each view of the held-out set; labels from the number of classes on are
             of unknown objects.
 
     Returns:
         The calibration, and the accuracy on known objects.
     """
-    model = Model.of_run(dataclasses.replace(run, embedding=embedding))
+    model = Model.of_run(run)
     held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
     label = np.array([label for label, _ in held_out])
     batches = padded_batches([cloud for _, cloud in held_out], CLOUDS_PER_BATCH)

@@ -200,7 +200,6 @@ def fit(
     checkpoints: Checkpoints,
     held_out: NDArray[np.bool_] | None = None,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
-    epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
     rows: NDArray[np.intp] | None = None,
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, or resume from the last checkpoint.
@@ -214,7 +213,6 @@ def fit(
         checkpoints: of this fit only; written after each epoch.
         held_out: [M], True for samples of the held-out set; by default there is none.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
-        epoch_done: called after each epoch, before its checkpoint is written.
         rows: the samples that take part; by default all.
 
     Returns:
@@ -277,7 +275,6 @@ def fit(
         step,
         checkpoints,
         progress=progress,
-        epoch_done=epoch_done,
         held_out_accuracy=held_out_accuracy,
         place=lambda state: _to_devices(state, PartitionSpec()),
     )

@@ -29,6 +29,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, remove_leftovers, write_text
 from thor2_jax.model.run_record import RUN_FILE
 from training.storage.arrays import load_arrays, load_metadata, save_arrays
+from training.storage.jobs import Progress
 
 __all__ = [
     "BEGUN",
@@ -40,6 +41,7 @@ __all__ = [
     "append_metrics",
     "discard_later_epochs",
     "find_run_directories",
+    "of_fit",
     "read_metrics",
     "run_epochs",
     "wait_for_all",
@@ -94,12 +96,15 @@ class EpochMetrics:
     samples_per_second: float
     held_out_accuracy: float | None = None
 
-    def describe(self, epochs: int) -> str:
-        """Return the metrics as a note for a progress display, of `epochs` in all."""
-        return (
-            f"epoch {self.epoch}/{epochs}, loss {self.loss:.3f}, accuracy {self.accuracy:.3f}, "
-            f"{self.samples_per_second:,.0f} samples/s"
-        )
+
+def of_fit(progress: Progress, stage: str, epochs: int) -> Callable[[int, int, EpochMetrics], object]:
+    """Return the callback of a stage that fits networks in so many epochs: its note has the metrics."""
+
+    def show(done: int, total: int, metrics: EpochMetrics) -> None:
+        note = f"epoch {metrics.epoch}/{epochs}, loss {metrics.loss:.3f}, accuracy {metrics.accuracy:.3f}"
+        progress(stage, done, total, f"{note}, {metrics.samples_per_second:,.0f} samples/s")
+
+    return show
 
 
 def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
@@ -143,14 +148,18 @@ BEGUN = "begun.json"
 class Checkpoints:
     """Checkpoints in one directory, which all processes of a training share; the first process writes them."""
 
-    def __init__(self, directory: str | Path) -> None:
+    def __init__(self, directory: str | Path, log: Callable[[EpochMetrics], object] = lambda metrics: None) -> None:
         """Open or create the directory.
+
+        Args:
+            directory: of this fit only.
+            log: called with the metrics of each epoch by the process that writes, before its checkpoint is written.
 
         Raises:
             InputError: a checkpoint is damaged.
             OSError: the directory cannot be created.
         """
-        self.directory = Path(directory).absolute()
+        self.directory, self.log = Path(directory).absolute(), log
         self.directory.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.directory)
         self._scores: dict[int, float] = {}
@@ -277,7 +286,6 @@ def run_epochs(
     checkpoints: Checkpoints | None = None,
     *,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
-    epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
     held_out_accuracy: Callable[[State], float | None] = lambda state: None,
     place: Callable[[State], State] = lambda state: state,
 ) -> State:
@@ -295,7 +303,6 @@ def run_epochs(
         checkpoints: of this fit only, written after each epoch; None writes none. The score of one is the held-out
             accuracy or, without one, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
-        epoch_done: called after each epoch, before its checkpoint is written.
         held_out_accuracy: function of the state after an epoch; None without a held-out set.
         place: function that moves a state to the devices.
 
@@ -329,8 +336,9 @@ def run_epochs(
             metrics = EpochMetrics(epoch, loss, accuracy, rate)
             progress((epoch - 1) * steps.of_epoch + number, steps.epochs * steps.of_epoch, metrics)
         metrics = dataclasses.replace(metrics, held_out_accuracy=held_out_accuracy(state))
-        epoch_done(metrics)
         if checkpoints is not None:
+            if jax.process_index() == 0:
+                checkpoints.log(metrics)
             score = -metrics.loss if metrics.held_out_accuracy is None else metrics.held_out_accuracy
             checkpoints.save(epoch, state, score)
     return state

@@ -23,7 +23,7 @@ from training.baselines.job import crop_size, load_baselines, pretrained_files, 
 from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.baselines.templates import compare
-from training.fitting.protocol import DEFAULT
+from training.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
 from training.views.normalized_views import MemoryViews

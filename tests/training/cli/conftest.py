@@ -12,9 +12,9 @@ from thor2_jax.gallery import embedding, objects
 from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
-from training.embedding import fit, run_embedding
-from training.fitting import protocol
-from training.fitting.protocol import DEFAULT, PAPER
+from training import protocol, train_run
+from training.embedding import fit
+from training.protocol import DEFAULT, PAPER
 from training.views import mesh_views
 
 COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
@@ -40,7 +40,7 @@ def small_descriptors() -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
     with pytest.MonkeyPatch.context() as patch:
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
-        patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
         patch.setattr(fit, "BATCH_SIZE", 64)
         patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
         patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))

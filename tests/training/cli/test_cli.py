@@ -15,10 +15,9 @@ import colornet
 from thor2_jax.files import temporary_directory
 from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import load_run, save_run
-from training import train_job
-from training.fitting import protocol
-from training.fitting.protocol import DEFAULT, PAPER, QUICK
+from training import protocol, train_job
 from training.objects.builtin_objects import builtin_objects
+from training.protocol import DEFAULT, PAPER, QUICK
 from training.rendering.scenes import Scene, compose_scene
 from training.train_job import TrainJob
 

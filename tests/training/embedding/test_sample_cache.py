@@ -14,10 +14,9 @@ from helpers import SMALL_CONFIG, small_disk, write_box
 
 import colornet
 import thor2_jax as thor2
-from training.embedding import run_embedding
-from training.embedding import samples as module
-from training.embedding.samples import Samples, stored_samples
-from training.fitting.protocol import Distractors
+from training.embedding import distractors as module
+from training.embedding.distractors import Distractors, distractor_samples, stored_samples
+from training.embedding.samples import Samples
 from training.storage.jobs import cache_directory, locked
 
 SAMPLES = Samples(
@@ -147,12 +146,12 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
 def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
     network, jobs = colornet.load_default(), list[dict[str, Any]]()
-    monkeypatch.setattr(run_embedding, "stored_samples", lambda job, directories, build: jobs.append(job))
+    monkeypatch.setattr(module, "stored_samples", lambda job, directories, build: jobs.append(job))
 
     def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> dict[str, Any]:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}
         distractors = Distractors(**{"procedural": 10, **options}, meshes=meshes)
-        run_embedding._distractor_samples(distractors, tmp_path / "new", network, config, lambda *values: None)
+        distractor_samples(distractors, tmp_path / "new", network, config, lambda *values: None)
         return jobs[-1]
 
     same, box = key(), key(box=0.1)

@@ -109,7 +109,7 @@ def fit(fused: np.ndarray, embedded: np.ndarray, held_out: Views) -> tuple[Calib
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibration, "infer_clouds", lambda *_: inference)
-        return calibration.fit_calibration(run, run.embedding, held_out)
+        return calibration.fit_calibration(run, held_out)
 
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
@@ -148,7 +148,7 @@ def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) 
     assert run.embedding is not None
     sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
-    fitted, accuracy = calibration.fit_calibration(run, run.embedding, views)
+    fitted, accuracy = calibration.fit_calibration(run, views)
     assert fitted is not None
     ((_, clouds),) = padded_batches([cloud for _, cloud in views], CLOUDS_PER_BATCH)
     thresholds = []

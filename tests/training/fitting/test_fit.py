@@ -5,6 +5,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -46,8 +47,10 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     """Return `fit` on the separable samples, with a new checkpoint directory for each call."""
     folders = (tmp_path / str(number) for number in range(99))
 
-    def run(options: FitOptions = QUICK, samples: Samples = separable, **arguments: object) -> tuple[MLP, int]:
-        return fit(samples, TOPS2, options, Checkpoints(next(folders)), **arguments)
+    def run(
+        options: FitOptions = QUICK, samples: Samples = separable, log: Any = lambda metrics: None, **arguments: object
+    ) -> tuple[MLP, int]:
+        return fit(samples, TOPS2, options, Checkpoints(next(folders), log), **arguments)
 
     return run
 
@@ -65,7 +68,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
     model, best = fitted(
-        epoch_done=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
+        log=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
     )
     assert (answers(model, separable) == separable.label).all()
     assert [metrics.epoch for metrics in curve] == list(range(1, 9))
@@ -80,7 +83,7 @@ def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fi
     held_out = np.arange(48) % 5 == 0
     mislabelled = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
     curve: list[EpochMetrics] = []
-    model, best = fitted(samples=mislabelled, held_out=held_out, epoch_done=curve.append)
+    model, best = fitted(samples=mislabelled, held_out=held_out, log=curve.append)
     correct = answers(model, separable)[held_out] == 0
     assert max(metrics.held_out_accuracy or 0 for metrics in curve) == curve[best - 1].held_out_accuracy
     assert curve[best - 1].held_out_accuracy == pytest.approx(correct.mean())
@@ -93,7 +96,7 @@ def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples,
     refuse = lambda *_: pytest.fail("the fit made a step")  # noqa: E731
     options = dataclasses.replace(QUICK, epochs=2)
     first = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"))
-    second = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c"), None, refuse, refuse)
+    second = fit(separable, TOPS2, options, Checkpoints(tmp_path / "c", refuse), None, refuse)
     again, other = fitted(options=options), fitted(options=dataclasses.replace(options, seed=4))
     assert first[1] == second[1] == again[1]
     for model in (second[0], again[0]):

@@ -1,18 +1,15 @@
 """Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
-from training.embedding.samples import AUGMENTATIONS, ObjectSource
+from training.embedding.distractors import Distractors
+from training.embedding.samples import AUGMENTATIONS
 from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
@@ -20,11 +17,11 @@ __all__ = [
     "CALIBRATE",
     "DEFAULT",
     "DESCRIBE",
-    "ONE_HELD_OUT_OF",
+    "DESCRIBE_EMBEDDED",
+    "FIT_NETWORKS",
     "PAPER",
     "QUICK",
-    "STAGES",
-    "Distractors",
+    "RENDER_DISTRACTORS",
     "Protocol",
 ]
 
@@ -34,7 +31,7 @@ DESCRIBE = "describe"
 CALIBRATE = "fit the confidence"
 """Name of the last stage, with an embedding."""
 
-STAGES = ("render distractors", "describe for the embedding", "fit networks")
+RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS = "render distractors", "describe for the embedding", "fit networks"
 """Names of the stages of the embedding."""
 
 DESCRIBE_SHARE = 0.3
@@ -45,60 +42,6 @@ CALIBRATE_SHARE = 0.1
 
 EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
 """The same of an epoch of a classifier, or of one network of the embedding."""
-
-
-ONE_HELD_OUT_OF = 10
-"""One of so many distractors is held out."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Distractors:
-    """Objects that are none of the classes, and how the embedding is fitted on them and the classes.
-
-    Attributes:
-        procedural: number of procedural objects.
-        meshes: name -> file of other objects.
-        views: views of each distractor.
-        epochs: passes over the samples.
-        networks: number of networks in the embedding; docs/decisions.md says why there are several.
-        workers: rendering processes; they do not affect the result.
-
-    Raises:
-        InputError: there are fewer than ten distractors.
-    """
-
-    procedural: int = 1500
-    meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    views: int = 8
-    epochs: int = 8
-    networks: int = 5
-    workers: int = 1
-
-    def __post_init__(self) -> None:
-        count = self.procedural + len(self.meshes)
-        if count < ONE_HELD_OUT_OF:
-            raise InputError(f"distractors: there are {count} objects; expected at least {ONE_HELD_OUT_OF}; give more")
-
-    @property
-    def sources(self) -> list[ObjectSource]:
-        """The meshes and the procedural objects in a random order, always the same, so that both kinds are held out."""
-        mixed: list[ObjectSource] = [*self.meshes.values(), *range(self.procedural)]
-        return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
-
-    def check(self, classes: Sequence[str]) -> None:
-        """Raise InputError if a distractor has the name of a class."""
-        shared = sorted(set(self.meshes) & set(classes))
-        if shared:
-            raise InputError(
-                f"distractors: {shared[0]!r} is also a class; expected other objects; remove its mesh from one of the "
-                "two directories"
-            )
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """All that determines the embedding, as JSON holds it."""
-        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
-        return named | {"meshes": sorted(self.meshes)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +93,8 @@ class Protocol:
         if self.distractors is not None:
             fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
             # Rendering distractors takes no time if they are in the cache.
-            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True)) | {CALIBRATE: CALIBRATE_SHARE}
+            of_fold |= {RENDER_DISTRACTORS: 0.0, DESCRIBE_EMBEDDED: DESCRIBE_SHARE, FIT_NETWORKS: fit_share}
+            of_fold[CALIBRATE] = CALIBRATE_SHARE
         folds = range(self.folds)
         described = {DESCRIBE: DESCRIBE_SHARE} if self.classifiers else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}

@@ -16,13 +16,14 @@ from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
-from training.embedding import fit, run_embedding
+from training import train_run as module
+from training.embedding import distractors, fit
+from training.embedding.distractors import Distractors
 from training.embedding.samples import render_clouds
-from training.fitting import job
 from training.fitting.calibration import fit_calibration
-from training.fitting.job import check_trained, train_run
 from training.fitting.loop import Checkpoints, FitOptions, read_metrics
-from training.fitting.protocol import Distractors, Protocol
+from training.protocol import Protocol
+from training.train_run import check_trained, train_run
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
@@ -37,7 +38,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     directory = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THOR2_CACHE", str(directory))
-        patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        patch.setattr(module, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
         patch.setattr(fit, "BATCH_SIZE", 64)
         yield directory
 
@@ -60,10 +61,10 @@ class Whole(NamedTuple):
 def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     """An uninterrupted training."""
     out, stages = tmp_path_factory.mktemp("whole") / "run", dict[str, int]()
-    with mock.patch.object(job, "fit_calibration", wraps=fit_calibration) as calibrate:
+    with mock.patch.object(module, "fit_calibration", wraps=fit_calibration) as calibrate:
         (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
     assert set(stages.values()) == {0}
-    return Whole(out, run, list(stages), calibrate.call_args.args[2])
+    return Whole(out, run, list(stages), calibrate.call_args.args[1])
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -90,7 +91,7 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
     _, run, _, views = whole
     assert run.embedding is not None and run.embedding.distractors == 9 and run.embedding.sizes.nearest
     assert sorted(label for label, _ in views) == [0, 1, 2, 2, 2, 2]
-    expected = render_clouds({0: DISTRACTORS.sources[0]}, 4, run_embedding.SEED)
+    expected = render_clouds({0: DISTRACTORS.sources[0]}, 4, distractors.SEED)
     for (label, (xyz, rgb)), (_, (points, colors)) in zip(views[2:], expected, strict=True):
         assert label == 2 and np.array_equal(xyz, points) and np.array_equal(rgb, colors)
     for name, (label, cloud) in zip(CLASSES, views, strict=False):  # normalized before, but described as they were
@@ -107,8 +108,8 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     """Without a cache, the samples of the distractors are those of the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
     out = tmp_path / "run"
-    render = mock.Mock(wraps=run_embedding.build_samples)
-    monkeypatch.setattr(run_embedding, "build_samples", render)
+    render = mock.Mock(wraps=distractors.build_samples)
+    monkeypatch.setattr(distractors, "build_samples", render)
     for stage, step in (("describe for the embedding", 1), ("fit networks", 2)):
         with pytest.raises(Interrupted):
             train(out, progress=stop_when(stage, step))

@@ -13,8 +13,9 @@ An interrupted training resumes when it is called again. run.json is written las
 
 import contextlib
 import dataclasses
+import functools
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,24 +28,32 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature
-from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE
-from training.embedding.run_embedding import fit_run_embedding
+from thor2_jax.types import Cloud
+from training.embedding.distractors import (
+    COPIES,
+    Distractors,
+    distractor_samples,
+    held_out_clouds,
+    with_fitted_distractors,
+)
+from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
+from training.embedding.samples import sample_views
 from training.fitting.calibration import fit_calibration, temperatures
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
     BEGUN,
     CHECKPOINTS,
     Checkpoints,
-    EpochMetrics,
     append_metrics,
     discard_later_epochs,
+    of_fit,
     read_metrics,
     wait_for_all,
 )
-from training.fitting.protocol import CALIBRATE, DESCRIBE, Protocol
 from training.fitting.samples import Samples, build_samples, fold_of_views
+from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource
@@ -201,38 +210,14 @@ class _Fold(NamedTuple):
 
     def train(self) -> TrainedRun:
         """Train and publish the run, unless it is finished, and read it back."""
-        out, settings, samples = self.out, self.settings, self.samples
-        directory = out if settings.folds == 1 else out / f"fold-{self.number}"
+        directory = self.out if self.settings.folds == 1 else self.out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
             classifiers, best_epochs, calibrated = self.fit_classifiers()
             if jax.process_index() == 0:
-                run = TrainedRun(settings.config, settings.network, samples.classes, classifiers, {})
-                embedding, fitted = self.fit_embedding(run)
-                rows = read_metrics(out / METRICS)
-                names = dict.fromkeys(row["classifier"] for row in rows)
-                draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES)
-                record = settings.record(self.source.digest)
-                record |= {"dataset": self.source.record, "samples": len(samples.label), "fold": self.number}
-                record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
-                record["temperatures"] = calibrated
-                if fitted is not None:
-                    calibration, record["held_out_accuracy"][EMBEDDING] = fitted
-                    record |= {"calibration": dataclasses.asdict(calibration)} if calibration is not None else {}
-                _publish(dataclasses.replace(run, record=record, embedding=embedding), self.scratch / "run", directory)
+                run = self.completed(classifiers, best_epochs, calibrated)
+                _publish(run, self.scratch / "run", directory)
             wait_for_all("published")
         return load_run(directory)
-
-    def begin(self, name: str) -> tuple[Checkpoints, Callable[[EpochMetrics], object]]:
-        """Return the checkpoints of a fit, and what logs an epoch; logged epochs without a checkpoint are removed."""
-        checkpoints, first = Checkpoints(self.scratch / name), jax.process_index() == 0
-        if first:
-            discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
-
-        def epoch_done(metrics: EpochMetrics) -> None:
-            if first:
-                append_metrics(self.out / METRICS, self.number, name, metrics)
-
-        return checkpoints, epoch_done
 
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
         """Fit the classifiers; return them, the epochs that they are from, and their temperatures."""
@@ -242,36 +227,83 @@ class _Fold(NamedTuple):
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         for name in settings.classifiers:
-            stage = settings.of_fold(f"fit {name}", self.number)
-
-            def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
-                self.progress(stage, done, total, metrics.describe(settings.fit.epochs))
-
-            context = FitContext(name, settings.network, settings.config)
-            checkpoints, epoch_done = self.begin(name)
-            classifiers[name], best_epochs[name] = fit(
-                samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
-            )
+            context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
+            shown = of_fit(self.report, f"fit {name}", settings.fit.epochs)
+            fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
+            classifiers[name], best_epochs[name] = fitted
         calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
         return classifiers, best_epochs, calibrated
 
-    def fit_embedding(self, run: TrainedRun) -> tuple[Embedding | None, tuple[Calibration | None, float] | None]:
-        """Fit the embedding, and the confidence and the accuracy on the held-out set; None without distractors."""
-        settings, samples, held_out = self.settings, self.samples, self.held_out
-        if settings.distractors is None or held_out is None:
-            return None, None
+    def completed(
+        self,
+        classifiers: Mapping[Feature, MLP],
+        best_epochs: Mapping[Feature, int],
+        calibrated: Mapping[str, float],
+    ) -> TrainedRun:
+        """Return the run with its classifiers, the embedding if it has one, the fitted confidence and the record."""
+        settings = self.settings
+        run = TrainedRun(settings.config, settings.network, self.samples.classes, classifiers, {})
+        accuracy, confidence = {}, {}
+        if settings.distractors is not None:
+            embedding, held_out = self.fit_embedding(settings.distractors)
+            run = dataclasses.replace(run, embedding=embedding)
+            self.report(CALIBRATE, 0, 1)
+            calibration, accuracy[EMBEDDING] = fit_calibration(run, held_out)
+            self.report(CALIBRATE, 1, 1)
+            confidence = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
+        rows = read_metrics(self.out / METRICS)
+        names = dict.fromkeys(row["classifier"] for row in rows)
+        draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, self.out / CURVES)
+        record = settings.record(self.source.digest)
+        record |= {"dataset": self.source.record, "samples": len(self.samples.label), "fold": self.number}
+        record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
+        record["held_out_accuracy"] |= accuracy
+        record |= {"temperatures": calibrated, **confidence}
+        return dataclasses.replace(run, record=record)
 
-        def report(stage: str, done: int, total: int, note: str = "") -> None:
-            self.progress(settings.of_fold(stage, self.number), done, total, note)
+    def fit_embedding(self, distractors: Distractors) -> tuple[Embedding, list[tuple[int, Cloud]]]:
+        """Fit the embedding on the views and the distractors.
 
-        labels = np.unique(samples.label)
-        directory = self.out / CHECKPOINTS / "distractors"
-        views = {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels}
-        embedding, kept = fit_run_embedding(self.source, views, settings, directory, report, *self.begin(EMBEDDING))
-        report(CALIBRATE, 0, 1)
-        calibration = fit_calibration(run, embedding, kept)
-        report(CALIBRATE, 1, 1)
-        return embedding, calibration
+        Returns:
+            The embedding, which recognizes the classes, and label and cloud, in metres, of each view of the held-out
+            set: those of distractors have labels from the number of classes on.
+        """
+        settings, views, held_out, checkpoints = self.settings, self.samples, self.held_out, self.checkpoints(EMBEDDING)
+        network, seed, n_classes = settings.network, settings.fit.seed, len(views.classes)
+        config = dataclasses.replace(settings.config, homology="closed_form")
+        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
+        others = distractor_samples(distractors, scratch, network, config, shown)
+        unknown = held_out_clouds(distractors, n_classes)
+        kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(n_classes)}
+        shown = of_stage(self.report, DESCRIBE_EMBEDDED)
+        samples, known = sample_views(self.source, kept, network, config, COPIES, seed, shown)
+        samples = with_fitted_distractors(samples, others, n_classes)
+        embedding = fit_embedding(
+            samples,
+            network,
+            config,
+            distractors.epochs,
+            RUN_SIZES,
+            of_fit(self.report, FIT_NETWORKS, distractors.epochs),
+            views.classes,
+            checkpoints,
+            networks=distractors.networks,
+            seed=seed,
+        )
+        references = reference_views(embedding, samples, seed)
+        return dataclasses.replace(embedding, references=references), known + unknown
+
+    def checkpoints(self, name: str) -> Checkpoints:
+        """Open the checkpoints of a fit, which log its metrics; logged epochs without a checkpoint are removed."""
+        log = functools.partial(append_metrics, self.out / METRICS, self.number, name)
+        checkpoints = Checkpoints(self.scratch / name, log)
+        if jax.process_index() == 0:
+            discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+        return checkpoints
+
+    def report(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Show the progress of a stage of this fold."""
+        self.progress(self.settings.of_fold(stage, self.number), done, total, note)
 
 
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:

@@ -15,12 +15,12 @@ from PIL import Image
 import thor2_jax as thor2
 from thor2_jax.model.classifier import model_arrays
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from training import train_run as module
 from training.evaluation.runs import load_runs
-from training.fitting import job as module
 from training.fitting import loop
-from training.fitting.job import train_run
 from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
-from training.fitting.protocol import Protocol
+from training.protocol import Protocol
+from training.train_run import train_run
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")

@@ -18,8 +18,8 @@ import numpy as np
 import thor2_jax as thor2
 from thor2_jax.model.classifier import model_arrays
 from training.fitting.loop import FitOptions
-from training.fitting.job import train_run
-from training.fitting.protocol import Protocol
+from training.train_run import train_run
+from training.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
 rng = np.random.default_rng(0)
