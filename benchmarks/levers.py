@@ -43,7 +43,7 @@ from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
-from training.objects.meshes import find_meshes, read_names
+from training.objects.meshes import find_meshes
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import begin_job
 from training.views.mesh_views import mesh_views
@@ -155,7 +155,7 @@ class Table:
         """
         self.out: Path = options.out
         self.options = options
-        self.meshes = find_meshes(options.meshes, read_names(options.names) if options.names else None)
+        self.meshes = find_meshes(options.meshes, options.names)
         self.frames: list[LabelledFrame] = labelled_frames(options.frames, options.ignore)
         job = {
             "meshes": {name: str(path.resolve()) for name, path in self.meshes.items()},

@@ -32,7 +32,7 @@ from training.baselines.files import baseline_file, check_baselines
 from training.baselines.job import check_weights, crop_size, pretrained_files
 from training.evaluation.runs import load_runs
 from training.fitting.loop import find_run_directories
-from training.objects.meshes import find_meshes, read_names
+from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrames
 from training.readers.uwis import UWISOccluded
@@ -69,7 +69,7 @@ class Comparison:
         self.datasets = _datasets(options)
         tables = {"scenes": options.scene_names, "frames": options.frame_names}
         for name in self.datasets:
-            find_meshes(options.meshes, read_names(tables[name]) if tables[name] else None)
+            find_meshes(options.meshes, tables[name])
         for name in self.baselines if options.weights else ():
             check_weights(options.weights, name)
         weights = sorted(options.weights.glob("*.safetensors")) if options.weights else []

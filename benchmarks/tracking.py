@@ -41,7 +41,7 @@ from thor2_jax.tracking.poses import merge_views, transform
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
 from training.evaluation.scores import placement_accuracy, steadiness
 from training.objects.mesh import TexturedMesh
-from training.objects.meshes import find_meshes, load_mesh, read_names
+from training.objects.meshes import find_meshes, load_mesh
 from training.readers.labelled import LabelledFrame, sequence_of
 from training.rendering.scenes import Scene, compose_views
 from training.rendering.view_sphere import Camera
@@ -220,7 +220,7 @@ def summarize_scenes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def read_meshes(directory: Path, names: Path | None, classes: Sequence[str]) -> dict[str, TexturedMesh]:
     """Return the meshes of the classes."""
-    paths = find_meshes(directory, read_names(names) if names else None)
+    paths = find_meshes(directory, names)
     return {name: load_mesh(path) for name, path in paths.items() if name in classes}
 
 

@@ -44,7 +44,7 @@ from training.fitting.fit import scale_inputs
 from training.fitting.loop import FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
-from training.objects.meshes import find_meshes, read_names
+from training.objects.meshes import find_meshes
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded
 from training.rendering.scenes import compose_scene
 from training.views.mesh_views import render_views
@@ -208,7 +208,7 @@ def load_sets(options: argparse.Namespace) -> tuple[Mapping[str, Any], dict[str,
         streams = np.random.SeedSequence(0).spawn(N_SCENES)
         scenes = [compose_scene(objects, np.random.default_rng(stream), light=LIGHT) for stream in streams]
         return objects, {"built-in scenes": [LabelledFrame(f"{k}", s.frame, s.truth, {}) for k, s in enumerate(scenes)]}
-    meshes = find_meshes(options.meshes, read_names(options.names) if options.names else None)
+    meshes = find_meshes(options.meshes, options.names)
     sets: dict[str, Iterable[LabelledFrame]] = {str(path): UWISOccluded(path) for path in options.evaluate_uwis}
     return meshes, sets | {str(path): FrameFolder(path) for path in options.evaluate_frames}
 

@@ -1,4 +1,4 @@
-"""Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
+"""Enrolling objects in the gallery of a run directory.
 
 from training.views.mesh_views import mesh_views
 enroll_objects(Path("run"), lambda sigma_s: (["mug"], iter([mesh_views(Path("mug.glb"))])), "mesh")
@@ -8,68 +8,16 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_directory
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import enrolled_views, instance_view
+from thor2_jax.gallery.enrollment import enrolled_views
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.model.run_directory import TrainedRun, save_run
-from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
-from training.readers.frames import FrameFolder
 from training.storage.jobs import Progress
 
-__all__ = ["enroll_objects", "labelled_views"]
-
-
-def labelled_views(
-    frames: FrameFolder,
-    sigma_s: float,
-    label_name: str | None = None,
-    instance: int | None = None,
-    on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
-) -> tuple[dict[str, list[PreparedInstance]], list[str]]:
-    """Return object -> its views in frames, and why each of the other instances cannot be used.
-
-    Args:
-        frames: the frames.
-        sigma_s: scaled units per metre, see `DescriptorConfig`.
-        label_name: only the object that labels.json gives this name, and the only one of frames without names.
-        instance: number of the object called `label_name`, in place of labels.json.
-        on_view: called with the frame, the label and the object of each usable instance, in the order of the views.
-
-    Raises:
-        InputError: a folder or a frame cannot be read, or an object has no usable view. Instances whose name
-            `check_name` refuses are skipped.
-    """
-    views: dict[str, list[PreparedInstance]] = {}
-    skipped = [("", frames.note)] if frames.note else []
-    for item in frames:
-        labels: list[tuple[int | None, str]] = [*sorted(item.truth.items())]
-        if label_name is not None:
-            labels = [(label, label_name) for label, name in labels if normal_name(name) == normal_name(label_name)]
-            if instance is not None or not frames.named:
-                labels = [(instance, label_name)]
-        for label, name in labels:
-            try:
-                with with_context(item.identifier):
-                    name = check_name(name) if label_name is None else name
-                    of_object = views.setdefault(name, [])
-                    of_object.append(instance_view(item.frame, label, sigma_s))
-                    on_view(item.frame, of_object[-1].label, name)
-            except InputError as error:
-                skipped.append((name, str(error)))
-    empty = [name for name, of_object in views.items() if not of_object]
-    if empty:
-        reason = next(reason for name, reason in skipped if name == empty[0])
-        raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
-    if not views:
-        if skipped:
-            raise InputError(f"frames: {skipped[0][1]}")
-        wanted = "an object" if label_name is None else repr(label_name)
-        raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
-    return views, [reason for _, reason in skipped]
+__all__ = ["enroll_objects"]
 
 
 def enroll_objects(

@@ -2,32 +2,27 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
 from training.baselines.files import check_baselines
 from training.baselines.job import check_weights, crop_size, pretrained_files, train_baselines
-from training.enrollment import labelled_views
 from training.objects.mesh import TexturedMesh
-from training.objects.meshes import find_meshes, read_names, scaled_meshes
+from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
 from training.storage.jobs import Display, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
-from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
-from training.views.labelled_views import WithLabelledViews, digest_of_instances
+from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 from training.views.render_job import dataset_job, render_crops, render_dataset
 
@@ -35,20 +30,6 @@ __all__ = ["TrainJob", "run_train_job"]
 
 RENDER, RENDER_CROPS = "render", "render crops"
 """Names of stages."""
-
-
-class LabelledInstances(NamedTuple):
-    """The instances of labelled frames.
-
-    Attributes:
-        views: object -> its usable instances.
-        skipped: why each of the others cannot be used.
-        crops: object -> the crops of its usable instances; None if no baseline reads them.
-    """
-
-    views: Mapping[str, Sequence[PreparedInstance]]
-    skipped: Sequence[str]
-    crops: Mapping[str, Sequence[QuantizedCrop]] | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +147,7 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     protocol, left_out = job.protocol, sorted(set(job.leave_out))
     steps = protocol.azimuth_step, protocol.polar_step
     dataset = dataset_job(_find_meshes(job), *steps, protocol.augmentations, protocol.fit.seed)
-    frames = digest_of_instances(labelled.views) if labelled else None
+    frames = labelled.digest if labelled else None
     requested = {"dataset": dataset, "frames": frames, "leave_out": left_out}
     stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
     trained = {"dataset": stored.get("job"), "frames": of_frames, "leave_out": stored.get("classes_left_out", [])}
@@ -182,7 +163,7 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
     assert job.meshes is not None
-    return scaled_meshes(find_meshes(job.meshes, read_names(job.names) if job.names else None), job.mesh_scale)
+    return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
 
 
 def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances | None:
@@ -199,16 +180,8 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         )
     if "thor" in baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
-    size = crop_size(baselines, job.weights is not None)
-    crops: dict[str, list[QuantizedCrop]] = {}
-
-    def crop(frame: RGBDFrame, label: int, name: str) -> None:
-        if size is not None:
-            crops.setdefault(name, []).append(quantized(rgbd_crop(frame, label, size)))
-
     frames = FrameFolder([source for path in job.frames for source in find_frames([path])])
-    views, skipped = labelled_views(frames, job.protocol.config.sigma_s, on_view=crop)
-    return LabelledInstances(views, skipped, crops if size is not None else None)
+    return read_instances(frames, job.protocol.config.sigma_s, crop_size=_crop_size(job))
 
 
 def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
@@ -258,6 +231,6 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
             if size is not None:
                 render_crops(meshes, source, size, workers, of_stage(progress, RENDER_CROPS), *drawn)
     if labelled is not None:
-        source = WithLabelledViews(labelled.views, job.protocol.config, source, labelled.skipped, labelled.crops)
+        source = WithLabelledViews(labelled, job.protocol.config, source)
     assert source is not None
     return source

@@ -48,6 +48,7 @@ from training.fitting.loop import (
     Checkpoints,
     append_metrics,
     discard_later_epochs,
+    find_run_directories,
     of_fit,
     read_metrics,
     wait_for_all,
@@ -102,7 +103,7 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     Raises:
         InputError: The run cannot be read.
     """
-    return load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
+    return load_run(find_run_directories([out])[0]).record
 
 
 def train_run(

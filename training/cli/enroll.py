@@ -79,15 +79,17 @@ def enroll(
         for file in meshes.values():
             load_mesh(file, mesh_scale)
         # These take seconds to import.
-        from training.enrollment import enroll_objects, labelled_views
+        from training.enrollment import enroll_objects
+        from training.views.labelled_views import read_instances
 
         def read(sigma_s: float) -> tuple[Iterable[str], Iterator[Sequence["PreparedInstance"]]]:
             if frames is None:
                 return meshes, views_of_meshes
-            views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-            skipped.extend(f"skipped: {reason}" for reason in unusable)
-            views = views if name is None else {name: [view for each in views.values() for view in each]}
-            return views, iter(views.values())
+            instances = read_instances(frames, sigma_s, label_name or name, instance)
+            skipped.extend(f"skipped: {reason}" for reason in instances.skipped)
+            if name is None:
+                return instances.views, iter(instances.views.values())
+            return [name], iter([[view for views in instances.views.values() for view in views]])
 
         source, changes = "frames" if mesh is None else "mesh", {"extend": extend, "replace": replace}
         with show_progress(quiet) as progress:

@@ -53,14 +53,14 @@ def render(
     small variants 96).
     """
     from training.augmentation.augmentations import Augmentations
-    from training.objects.meshes import find_meshes, read_names, scaled_meshes
+    from training.objects.meshes import find_meshes, scaled_meshes
     from training.storage.jobs import of_stage
     from training.storage.workers import IN_PROCESS
     from training.views.render_job import render_crops, render_dataset
 
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
-    sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
+    sources = scaled_meshes(find_meshes(meshes, names), mesh_scale)
     with show_progress(quiet) as progress:
         shown = of_stage(progress, "render")
         dataset = render_dataset(sources, out, azimuth_step, polar_step, pool, shown, augmentations, seed)

@@ -40,7 +40,7 @@ MAX_BYTES = 2**29
 
 
 def fetch_ycb(
-    objects: Sequence[str], directory: str | Path, *, url: str = YCB_URL, progress: Progress | None = None
+    objects: Sequence[str], directory: str | Path, *, url: str = YCB_URL, progress: Progress = lambda *_: None
 ) -> dict[str, Path]:
     """Download the meshes of YCB objects: object name -> mesh file, in the order of `objects`.
 
@@ -82,7 +82,7 @@ def fetch_ycb(
     return meshes
 
 
-def _download(address: str, archive: Path, name: str, progress: Progress | None) -> None:
+def _download(address: str, archive: Path, name: str, progress: Progress) -> None:
     """Download to `archive`, from the end of what it contains on."""
     have = archive.stat().st_size if archive.exists() else 0
     if have:
@@ -108,8 +108,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress | None)
                         size = f"more than {MAX_BYTES:,} bytes"
                         raise InputError(f"url: {archive.name[1:]} has {size}; expected an archive of the YCB set")
                     stream.write(block)
-                    if progress:
-                        progress(name, have // 1000, max(have, total) // 1000, "kB")
+                    progress(name, have // 1000, max(have, total) // 1000, "kB")
     except InputError:
         raise
     # The last two are raised for proxies of other kinds and by the resolution of names.

@@ -193,20 +193,21 @@ def _mesh_in(folder: Path) -> Path | None:
     return None
 
 
-def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> dict[str, Path]:
+def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = None) -> dict[str, Path]:
     """Find mesh files: object name -> file, sorted by name.
 
     Args:
         folder: directory with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subdirectories with one mesh file each, or
             both.
-        names: object name -> scan (a subdirectory's name or a file's stem). By default every scan is an object under
-            its own name.
+        names: object name -> scan (a subdirectory's name or a file's stem), or a file with this table, see
+            `read_names`. By default every scan is an object under its own name.
 
     Raises:
-        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` has an
-            unknown scan, or `check_name` refuses the name of an object.
+        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` is damaged or
+            has an unknown scan, or `check_name` refuses the name of an object.
+        OSError: The file `names` cannot be opened.
     """
-    folder = Path(folder)
+    folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
     requested = None if names is None else set(names.values())

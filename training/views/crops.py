@@ -3,47 +3,28 @@
     crop = rgbd_crop(frame, label)
     crop.color, crop.normals, crop.mask         # [224, 224, 3], [224, 224, 3], [224, 224]
 
-A rendered view is cropped alike, as a frame whose labels are `(view.depth > 0).astype(np.uint8)`.
-
-Image networks are trained on the crops of the views of a dataset, which `render_crops` writes:
-
-    crops = ViewDataset.open("views").read_crops(0, 96)      # one crop for each cloud of `read(0)`
-
-DATASET/crops/manifest.json     size of the crops, digest of the dataset, checksums of the files
-DATASET/crops/*.npz             one file for each shard, with compressed `color` and `normals`
+A rendered view is cropped alike, as a frame whose labels are `(view.depth > 0).astype(np.uint8)`. Image networks are
+trained on the crops of the views of a dataset (`ViewDataset.read_crops`).
 """
 
 import dataclasses
-import hashlib
-import io
-import json
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 
 __all__ = [
-    "CROPS",
     "CROP_SIZE",
-    "MANIFEST",
     "QuantizedCrop",
     "ViewCrops",
-    "crop_file",
-    "encode_crops",
     "fill_depth",
-    "intact_content",
     "quantized",
-    "read_manifest",
     "rgbd_crop",
     "stacked",
     "surface_normals",
-    "write_manifest",
 ]
 
 CROP_SIZE = 224
@@ -176,12 +157,6 @@ def _resized(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     return np.stack(resized, axis=-1).reshape(size, size, *image.shape[2:])
 
 
-CROPS = "crops"
-"""Directory of the crops in the directory of a dataset."""
-
-MANIFEST = "manifest.json"
-MANIFEST_FORMAT = 1
-
 QuantizedCrop = tuple[NDArray[np.uint8], NDArray[np.int8]]
 """Colour and normals of a crop as `ViewCrops` holds them, [S, S, 3] each."""
 
@@ -231,61 +206,3 @@ def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
     for row, (color, normals) in enumerate(crops):
         record.color[row], record.normals[row] = color, normals
     return record
-
-
-def encode_crops(crops: ViewCrops) -> bytes:
-    """Return the bytes of a file of crops."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, color=crops.color, normals=crops.normals)
-    return stream.getvalue()
-
-
-def write_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
-    """Write the manifest of a directory of crops.
-
-    Args:
-        directory: the directory.
-        size: side of the crops, pixels.
-        dataset: digest of the dataset.
-        files: file name -> SHA-256 of the finished files.
-
-    Raises:
-        OSError: the manifest cannot be written.
-    """
-    content = {"format": MANIFEST_FORMAT, "size": size, "dataset": dataset, "files": files}
-    write_text(directory / MANIFEST, json.dumps(content) + "\n")
-
-
-def read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
-    """Return size, dataset and files of the manifest in a directory of crops, see `write_manifest`.
-
-    Raises:
-        InputError: it is missing, damaged or of another format.
-    """
-    path = directory / MANIFEST
-    try:
-        content = json.loads(path.read_bytes())
-        if content["format"] != MANIFEST_FORMAT:
-            raise ValueError(f"its format is {content['format']!r}; expected {MANIFEST_FORMAT}")
-        return int(content["size"]), str(content["dataset"]), dict(content["files"])
-    except OSError:
-        raise InputError(
-            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
-            "`thor2 render` command with --crops"
-        ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
-        ) from None
-
-
-def crop_file(shard: str) -> str:
-    """Return the file name of the crops of a shard, given its file name."""
-    return Path(shard).with_suffix(".npz").name
-
-
-def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
-    """Return the bytes of a file; None if it is missing or has another checksum."""
-    path = directory / name
-    content = path.read_bytes() if path.is_file() else b""
-    return content if hashlib.sha256(content).hexdigest() == sha256 else None

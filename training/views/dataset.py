@@ -17,6 +17,13 @@ too few points are left out. Its directory has `manifest.json` and shards, safet
 
 The manifest has the job, everything that determines the views, and the finished shards with their checksums. It has no
 time stamps: the same job gives the same bytes.
+
+Image networks are trained on crops of the same views, which `render_crops` adds:
+
+    crops = dataset.read_crops(index, 96)          # one crop for each cloud of `read(index)`
+
+    DATASET/crops/manifest.json     size of the crops, digest of the dataset, checksums of the files
+    DATASET/crops/*.npz             one file for each shard, with compressed `color` and `normals`
 """
 
 import contextlib
@@ -34,12 +41,32 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file, remove_written, write_text
-from training.views.crops import CROPS, MANIFEST, ViewCrops, crop_file, intact_content, read_manifest
+from training.views.crops import ViewCrops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
-__all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
+__all__ = [
+    "CROPS",
+    "MANIFEST",
+    "Manifest",
+    "NormalizedViews",
+    "Shard",
+    "ViewDataset",
+    "crop_file",
+    "encode",
+    "encode_crops",
+    "intact_content",
+    "read_crop_manifest",
+    "remove_views",
+    "write_crop_manifest",
+]
 
+MANIFEST = "manifest.json"
 MANIFEST_FORMAT = 2
+
+CROPS = "crops"
+"""Directory of the crops in the directory of a dataset."""
+
+CROPS_FORMAT = 1
 
 
 def remove_views(directory: Path) -> None:
@@ -55,6 +82,13 @@ def encode(views: NormalizedViews) -> bytes:
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
     others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy")}
     return safetensors.numpy.save({"xyz": steps, **others})
+
+
+def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
+    """Return the bytes of a file; None if it is missing or has another checksum."""
+    path = directory / name
+    content = path.read_bytes() if path.is_file() else b""
+    return content if hashlib.sha256(content).hexdigest() == sha256 else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +172,57 @@ class Manifest:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
+
+
+def encode_crops(crops: ViewCrops) -> bytes:
+    """Return the bytes of a file of crops."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, color=crops.color, normals=crops.normals)
+    return stream.getvalue()
+
+
+def write_crop_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
+    """Write the manifest of a directory of crops.
+
+    Args:
+        directory: the directory.
+        size: side of the crops, pixels.
+        dataset: digest of the dataset.
+        files: file name -> SHA-256 of the finished files.
+
+    Raises:
+        OSError: the manifest cannot be written.
+    """
+    content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset, "files": files}
+    write_text(directory / MANIFEST, json.dumps(content) + "\n")
+
+
+def read_crop_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
+    """Return size, dataset and files of the manifest in a directory of crops, see `write_crop_manifest`.
+
+    Raises:
+        InputError: it is missing, damaged or of another format.
+    """
+    path = directory / MANIFEST
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] != CROPS_FORMAT:
+            raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
+        return int(content["size"]), str(content["dataset"]), dict(content["files"])
+    except OSError:
+        raise InputError(
+            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
+            "`thor2 render` command with --crops"
+        ) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
+        ) from None
+
+
+def crop_file(shard: str) -> str:
+    """Return the file name of the crops of a shard, given its file name."""
+    return Path(shard).with_suffix(".npz").name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,7 +319,7 @@ class ViewDataset:
             InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
         """
         directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
-        stored, digest, files = read_manifest(directory)
+        stored, digest, files = read_crop_manifest(directory)
         if digest != self.digest:
             raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
         if stored < size:

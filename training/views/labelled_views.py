@@ -1,8 +1,10 @@
 """Labelled real instances as views of their classes, beside rendered views or alone.
 
-source = WithLabelledViews({"mug": instances}, config, ViewDataset.open("views"))
+instances = read_instances(FrameFolder(find_frames([Path("frames")])), config.sigma_s)
+source = WithLabelledViews(instances, config, ViewDataset.open("views"))
 """
 
+import dataclasses
 import functools
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -11,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import with_context
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import augmented_view
-from training.views.crops import QuantizedCrop, ViewCrops, stacked
+from thor2_jax.gallery.enrollment import augmented_view, instance_view
+from thor2_jax.printable import check_name, normal_name
+from training.readers.frames import FrameFolder
+from training.views.crops import QuantizedCrop, ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views
 
-__all__ = ["MAX_COPIES", "WithLabelledViews", "digest_of_instances"]
+__all__ = ["MAX_COPIES", "LabelledInstances", "WithLabelledViews", "read_instances"]
 
 MAX_COPIES = 8
 """Most augmented copies of an instance."""
@@ -30,11 +34,80 @@ FIRST_VIEW = 1_000_000
 """Number of the first labelled view of a class; rendered views have smaller ones."""
 
 
-def digest_of_instances(views: Mapping[str, Sequence[PreparedInstance]]) -> str:
-    """Return the SHA-256 of the names and the clouds of labelled instances."""
-    arrays = (a for each in views.values() for view in each for a in (view.points, view.colors, view.boundary))
-    sizes = [(name, [len(view.points) for view in each]) for name, each in views.items()]
-    return content_digest([repr(sizes), *(a.tobytes() for a in arrays)])
+@dataclasses.dataclass(frozen=True)
+class LabelledInstances:
+    """The instances of labelled frames.
+
+    Attributes:
+        views: object -> its usable instances, at least one each.
+        skipped: why each of the others cannot be used.
+        crops: object -> the crops of its usable instances, of one size; None if nothing reads them.
+    """
+
+    views: Mapping[str, Sequence[PreparedInstance]]
+    skipped: Sequence[str] = ()
+    crops: Mapping[str, Sequence[QuantizedCrop]] | None = None
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the names and the clouds of the instances."""
+        each = [view for views in self.views.values() for view in views]
+        arrays = (array for view in each for array in (view.points, view.colors, view.boundary))
+        sizes = [(name, [len(view.points) for view in views]) for name, views in self.views.items()]
+        return content_digest([repr(sizes), *(array.tobytes() for array in arrays)])
+
+
+def read_instances(
+    frames: FrameFolder,
+    sigma_s: float,
+    label_name: str | None = None,
+    instance: int | None = None,
+    crop_size: int | None = None,
+) -> LabelledInstances:
+    """Read the instances of labelled frames.
+
+    Args:
+        frames: the frames.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+        label_name: only the object that labels.json gives this name, and the only one of frames without names.
+        instance: number of the object called `label_name`, in place of labels.json.
+        crop_size: side of the crops, pixels; None makes none.
+
+    Raises:
+        InputError: a folder or a frame cannot be read, or an object has no usable view. Instances whose name
+            `check_name` refuses are skipped.
+    """
+    views: dict[str, list[PreparedInstance]] = {}
+    crops: dict[str, list[QuantizedCrop]] = {}
+    skipped = [("", frames.note)] if frames.note else []
+    for item in frames:
+        labels: list[tuple[int | None, str]] = [*sorted(item.truth.items())]
+        if label_name is not None:
+            labels = [(label, label_name) for label, name in labels if normal_name(name) == normal_name(label_name)]
+            if instance is not None or not frames.named:
+                labels = [(instance, label_name)]
+        for label, name in labels:
+            try:
+                with with_context(item.identifier):
+                    name = check_name(name) if label_name is None else name
+                    of_object = views.setdefault(name, [])
+                    of_object.append(instance_view(item.frame, label, sigma_s))
+                    if crop_size is not None:
+                        crop = rgbd_crop(item.frame, of_object[-1].label, crop_size)
+                        crops.setdefault(name, []).append(quantized(crop))
+            except InputError as error:
+                skipped.append((name, str(error)))
+    empty = [name for name, of_object in views.items() if not of_object]
+    if empty:
+        reason = next(reason for name, reason in skipped if name == empty[0])
+        raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
+    if not views:
+        if skipped:
+            raise InputError(f"frames: {skipped[0][1]}")
+        wanted = "an object" if label_name is None else repr(label_name)
+        raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
+    reasons = [reason for _, reason in skipped]
+    return LabelledInstances(views, reasons, None if crop_size is None else crops)
 
 
 class WithLabelledViews:
@@ -46,24 +119,19 @@ class WithLabelledViews:
 
     def __init__(
         self,
-        views: Mapping[str, Sequence[PreparedInstance]],
+        instances: LabelledInstances,
         config: DescriptorConfig,
         rendered: ViewSource | None = None,
-        skipped: Sequence[str] = (),
-        crops: Mapping[str, Sequence[QuantizedCrop]] | None = None,
     ) -> None:
         """Keep the instances; nothing is computed yet.
 
         Args:
-            views: class -> its prepared instances, at least one each. Classes that `rendered` does not have are added
-                after its classes.
+            instances: the instances. Classes that `rendered` does not have are added after its classes.
             config: descriptor; only `sigma_s` is used.
             rendered: other views; None if there are none.
-            skipped: why further instances could not be used, for the record.
-            crops: class -> the crops of its instances, of one size; None if nothing reads them.
         """
-        self._rendered, self._views, self._config, self._skipped = rendered, dict(views), config, list(skipped)
-        self._crops = crops
+        self._rendered, self._instances, self._config = rendered, instances, config
+        self._views = views = dict(instances.views)
         self.classes = tuple(dict.fromkeys([*(rendered.classes if rendered else ()), *views]))
         shards = list(rendered.shards) if rendered else []
         clouds = [0] * len(self.classes)
@@ -82,7 +150,7 @@ class WithLabelledViews:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
         rendered = self._rendered.digest if self._rendered else None
         copies = [self._copies(name) for name in self._views]
-        return hashlib.sha256(repr((rendered, digest_of_instances(self._views), copies)).encode()).hexdigest()
+        return hashlib.sha256(repr((rendered, self._instances.digest, copies)).encode()).hexdigest()
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -92,10 +160,10 @@ class WithLabelledViews:
             "digest": self.digest,
             "views": sum(shard.views for shard in self.shards),
             "frames": {
-                "digest": digest_of_instances(self._views),
+                "digest": self._instances.digest,
                 "instances": {name: len(each) for name, each in self._views.items()},
                 "copies": {name: self._copies(name) for name in self._views},
-                "skipped": self._skipped,
+                "skipped": list(self._instances.skipped),
             },
         }
 
@@ -127,8 +195,8 @@ class WithLabelledViews:
         if index < self._first:
             assert self._rendered is not None
             return self._rendered.read_crops(index, size)
-        assert self._crops is not None
+        assert self._instances.crops is not None
         name = list(self._views)[index - self._first]
-        crops, times = self._crops[name], 1 + self._copies(name)
+        crops, times = self._instances.crops[name], 1 + self._copies(name)
         reduced = stacked(crops, len(crops[0][0])).reduced(size)
         return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

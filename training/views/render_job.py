@@ -35,9 +35,21 @@ from training.objects.mesh import TexturedMesh
 from training.rendering.view_sphere import DISTANCE, TRAINING_CAMERA, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views import crops, mesh_views
-from training.views.crops import CROP_SIZE, QuantizedCrop, crop_file, intact_content
-from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+from training.views import mesh_views
+from training.views.crops import CROP_SIZE, QuantizedCrop, quantized, rgbd_crop, stacked
+from training.views.dataset import (
+    CROPS,
+    MANIFEST,
+    Manifest,
+    Shard,
+    ViewDataset,
+    crop_file,
+    encode,
+    encode_crops,
+    intact_content,
+    read_crop_manifest,
+    write_crop_manifest,
+)
 from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
@@ -89,6 +101,13 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
+def _write(path: Path, content: bytes) -> str:
+    """Write a file and return its SHA-256."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return hashlib.sha256(content).hexdigest()
+
+
 def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
     """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
 
@@ -98,10 +117,7 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, i
     """
     numbers = [number for number, _, _ in rendered], [copy for _, copy, _ in rendered]
     views = normalize_views([cloud for _, _, cloud in rendered], label, *numbers, DescriptorConfig())
-    content = encode(views)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
-    digest, n_views = hashlib.sha256(content).hexdigest(), len(views)
+    digest, n_views = _write(path, encode(views)), len(views)
     return Shard(path.name, digest, label, n_views, left_out=planned - n_views, points=len(views.xyz))
 
 
@@ -228,7 +244,7 @@ def _crops_of_task(task: ViewTask, size: int) -> dict[tuple[int, int], Quantized
         labels = (view.depth > 0).astype(np.uint8)
         if labels.any():
             frame = RGBDFrame(view.color, view.depth, labels, view.intrinsics)
-            of_task[number, copy] = crops.quantized(crops.rgbd_crop(frame, 1, size))
+            of_task[number, copy] = quantized(rgbd_crop(frame, 1, size))
     return of_task
 
 
@@ -241,7 +257,7 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
-    stored_size, digest, files = crops.read_manifest(directory)
+    stored_size, digest, files = read_crop_manifest(directory)
     requested = {"crops": size, "dataset": dataset.digest}
     check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
     remove_leftovers(directory)
@@ -272,7 +288,7 @@ def render_crops(
         InputError: the dataset has crops of another size.
         OSError: a file cannot be written; the rendering can be resumed.
     """
-    directory = dataset.directory / crops.CROPS
+    directory = dataset.directory / CROPS
     angles = view_angles(dataset.manifest.job["azimuth_step"], dataset.manifest.job["polar_step"])
     plan = _plan(len(dataset.classes), len(angles), clouds_per_view(augmentations))
     with locked(directory):
@@ -286,10 +302,7 @@ def render_crops(
             for index, rendered in zip(missing, results, strict=True):
                 views, name = dataset.read(index), crop_file(dataset.shards[index].file)
                 of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
-                content = crops.encode_crops(crops.stacked(of_shard, size))
-                with atomic_write(directory / name) as temporary:
-                    temporary.write_bytes(content)
-                done[name] = hashlib.sha256(content).hexdigest()
-                crops.write_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
+                done[name] = _write(directory / name, encode_crops(stacked(of_shard, size)))
+                write_crop_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
                 n_done += len(views)
                 progress(n_done, len(dataset))

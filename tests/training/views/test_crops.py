@@ -166,8 +166,8 @@ def test_interrupted_crops_resume_with_the_same_bytes(
     first.write_bytes(first.read_bytes()[:-1])
     assert_refused("is missing or damaged", dataset.read_crops, 0, SIZE)
     written = []
-    encode = render_job.crops.encode_crops
-    monkeypatch.setattr(render_job.crops, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
+    encode = render_job.encode_crops
+    monkeypatch.setattr(render_job, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
     again = render_command(meshes, dataset.directory)
     assert run_thor2(*again, SIZE) == 0
     assert len(written) == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest

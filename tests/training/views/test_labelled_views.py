@@ -11,7 +11,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
 from training.views import labelled_views
-from training.views.labelled_views import FIRST_VIEW, WithLabelledViews
+from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
 from training.views.normalized_views import COORDINATE_STEP, MemoryViews, WithoutClasses
 
 CONFIG = DescriptorConfig(homology="closed_form")
@@ -34,11 +34,11 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     """The largest class has 30 clouds: 4 mugs get 30 // 4 - 1 copies, 40 pens none, and 2 boxes the most of 8."""
     instances = {"mug": 4, "pen": 40, "box": 2}
     views = {name: [instance(100 + k) for k in range(n)] for name, n in instances.items()}
-    source = WithLabelledViews(views, CONFIG, rendered(), ["too few points"])
+    source = WithLabelledViews(LabelledInstances(views, ["too few points"]), CONFIG, rendered())
     assert source.classes == ("bowl", "mug", "pen", "box")
     shards = [(shard.label, shard.views) for shard in source.shards]
     assert shards == [(0, 30), (1, 3), (1, 4 * 7), (2, 40), (3, 2 * 9)]
-    record, digest = source.record["frames"], labelled_views.digest_of_instances(views)
+    record, digest = source.record["frames"], LabelledInstances(views).digest
     assert (source.record["digest"], source.record["views"]) == (source.digest, 30 + 3 + 28 + 40 + 18)
     assert (record["digest"], record["instances"], record["skipped"]) == (digest, instances, ["too few points"])
     assert record["copies"] == {"mug": 6, "pen": 0, "box": 8}
@@ -57,7 +57,7 @@ def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.Monkey
     """Clouds with an occlusion boundary may take another half turn than the same points without one."""
     monkeypatch.setattr(labelled_views, "CLOUDS", 12)
     views = [instance(seed, 40 + seed) for seed in range(6)]
-    source = WithLabelledViews({"mug": views}, CONFIG)
+    source = WithLabelledViews(LabelledInstances({"mug": views}), CONFIG)
     assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [12]
     flat = [each for view in views for each in (view, augmented_view(view, 0))]
     normal = view_normalize(pack_instances(flat, len(flat)), CONFIG)
@@ -67,13 +67,13 @@ def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.Monkey
     np.testing.assert_allclose(read.xyz, expected, atol=COORDINATE_STEP / 2 + 1e-6)
     np.testing.assert_array_equal(read.rgb, np.concatenate([each.colors for each in flat]))
     bare = [dataclasses.replace(view, boundary=np.zeros_like(view.boundary)) for view in views]
-    assert np.abs(WithLabelledViews({"mug": bare}, CONFIG).read(0).xyz - read.xyz).max() > 0.01
+    assert np.abs(WithLabelledViews(LabelledInstances({"mug": bare}), CONFIG).read(0).xyz - read.xyz).max() > 0.01
 
 
 def test_the_digest_depends_on_everything_that_is_read() -> None:
     def digest(*seeds: int, name: str = "mug", bowls: int = 30, **changes: np.ndarray) -> str:
         views = [dataclasses.replace(instance(seed), **changes) for seed in seeds]
-        return WithLabelledViews({name: views}, CONFIG, rendered(bowls) if bowls else None).digest
+        return WithLabelledViews(LabelledInstances({name: views}), CONFIG, rendered(bowls) if bowls else None).digest
 
     colors, boundary = np.zeros((50, 3), np.uint8), np.ones(50, bool)
     digests = [digest(1, 2), digest(2, 1), digest(1), digest(1, 2, name="cup")]
@@ -85,4 +85,4 @@ def test_the_digest_depends_on_everything_that_is_read() -> None:
 def test_an_instance_that_is_too_long_is_refused() -> None:
     long = dataclasses.replace(instance(0), points=instance(0).points * np.float32(20))
     with pytest.raises(InputError, match="frames: 'mug': .*depth scale"):
-        WithLabelledViews({"mug": [long]}, CONFIG).read(0)
+        WithLabelledViews(LabelledInstances({"mug": [long]}), CONFIG).read(0)
