@@ -139,10 +139,9 @@ def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: 
         run = load_run(out)
         check_same_job(out, {"seed": run.record["seed"]}, {"seed": seed})
     else:
-        steps, show = (PROTOCOL.azimuth_step, PROTOCOL.polar_step), of_stage(progress, "render views")
-        pool = local_workers(workers)
-        dataset = render_dataset(objects, out / VIEWS, *steps, pool, show, PROTOCOL.augmentations, seed)
-        (run,) = train_run(dataset, out, PROTOCOL.replace(seed=seed), progress)
+        protocol, shown = PROTOCOL.replace(seed=seed), of_stage(progress, "render views")
+        dataset = render_dataset(protocol.render_job(objects), out / VIEWS, local_workers(workers), shown)
+        (run,) = train_run(dataset, out, protocol, progress)
     remove_views(out / VIEWS)
     return run
 

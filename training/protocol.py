@@ -1,7 +1,8 @@
 """Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import colornet
@@ -12,6 +13,8 @@ from training.embedding.distractors import Distractors
 from training.embedding.samples import AUGMENTATIONS
 from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
+from training.objects.mesh import TexturedMesh
+from training.views.render_job import RenderJob
 
 __all__ = [
     "CALIBRATE",
@@ -85,6 +88,10 @@ class Protocol:
     def network(self) -> colornet.ColorNetwork:
         """The packaged colour network."""
         return colornet.load_default()
+
+    def render_job(self, meshes: Mapping[str, Path | TexturedMesh]) -> RenderJob:
+        """Return the job that renders the views of meshes for this protocol; its seed is that of the fit."""
+        return RenderJob(meshes, self.azimuth_step, self.polar_step, self.augmentations, self.fit.seed)
 
     @property
     def stages(self) -> dict[str, float]:

@@ -24,7 +24,7 @@ from training.train_run import VIEWS, check_out, check_trained, finished_record,
 from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
-from training.views.render_job import dataset_job, render_crops, render_dataset
+from training.views.render_job import render_crops, render_dataset
 
 __all__ = ["TrainJob", "run_train_job"]
 
@@ -144,11 +144,9 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     Views of this job are removed, other ones stay: another training may read them.
     """
     record = finished_record(job.out)
-    protocol, left_out = job.protocol, sorted(set(job.leave_out))
-    steps = protocol.azimuth_step, protocol.polar_step
-    dataset = dataset_job(_find_meshes(job), *steps, protocol.augmentations, protocol.fit.seed)
+    dataset = job.protocol.render_job(_find_meshes(job)).record()
     frames = labelled.digest if labelled else None
-    requested = {"dataset": dataset, "frames": frames, "leave_out": left_out}
+    requested = {"dataset": dataset, "frames": frames, "leave_out": sorted(set(job.leave_out))}
     stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
     trained = {"dataset": stored.get("job"), "frames": of_frames, "leave_out": stored.get("classes_left_out", [])}
     check_same_job(job.out, trained, requested)
@@ -223,13 +221,12 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
-        protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
-        steps, drawn = (protocol.azimuth_step, protocol.polar_step), (protocol.augmentations, protocol.fit.seed)
+        rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), _crop_size(job)
         with display() as shown:
             progress = numbered(shown, _stages(job))
-            source = render_dataset(meshes, job.out / VIEWS, *steps, workers, of_stage(progress, RENDER), *drawn)
+            source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
             if size is not None:
-                render_crops(meshes, source, size, workers, of_stage(progress, RENDER_CROPS), *drawn)
+                render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))
     if labelled is not None:
         source = WithLabelledViews(labelled, job.protocol.config, source)
     assert source is not None

@@ -56,15 +56,15 @@ def render(
     from training.objects.meshes import find_meshes, scaled_meshes
     from training.storage.jobs import of_stage
     from training.storage.workers import IN_PROCESS
-    from training.views.render_job import render_crops, render_dataset
+    from training.views.render_job import RenderJob, render_crops, render_dataset
 
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, names), mesh_scale)
+    job = RenderJob(sources, azimuth_step, polar_step, augmentations, seed)
     with show_progress(quiet) as progress:
-        shown = of_stage(progress, "render")
-        dataset = render_dataset(sources, out, azimuth_step, polar_step, pool, shown, augmentations, seed)
+        dataset = render_dataset(job, out, pool, of_stage(progress, "render"))
         if crops is not None:
-            render_crops(sources, dataset, crops, pool, of_stage(progress, "render crops"), augmentations, seed)
+            render_crops(job, dataset, crops, pool, of_stage(progress, "render crops"))
     views = f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
     finish(views, "train on them", "train", "--dataset", out, "--out", "run")

@@ -31,7 +31,6 @@ from training.objects.meshes import load_mesh
 from training.storage.arrays import load_arrays, load_metadata, save_arrays
 from training.storage.jobs import cache_directory, locked, processor
 from training.storage.workers import local_workers
-from training.views.render_job import mesh_digest
 
 __all__ = [
     "COPIES",
@@ -131,7 +130,7 @@ def distractor_samples(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
-        "objects": [mesh_digest(load_mesh(each)) if isinstance(each, Path) else each for each in sources],
+        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
         "views": distractors.views,
         "copies": COPIES,
         "seed": SEED,

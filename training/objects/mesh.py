@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import content_digest
 
 __all__ = [
     "TexturedMesh",
@@ -52,6 +53,14 @@ class TexturedMesh:
     def centre(self) -> NDArray[np.float64]:
         """Centre of the axis-aligned bounding box [3], metres, at which training cameras look."""
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the arrays: mesh files refer to others, and meshes need not come from files."""
+        parts: list[str | bytes] = []
+        for array in (self.vertices, self.faces, self.uv, self.face_texture, self.corner_colors, *self.textures):
+            parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
+        return content_digest(parts)
 
     def transformed(self, matrix: NDArray[np.float64]) -> "TexturedMesh":
         """Return the mesh transformed by a homogeneous matrix [4, 4]; the colours are shared."""

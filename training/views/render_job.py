@@ -1,11 +1,12 @@
 """Render meshes to a dataset of normalized views on disk, which `ViewDataset` reads.
 
-    dataset = render_dataset(find_meshes("meshes"), "views", pool=local_workers(2))
+    job = RenderJob(find_meshes("meshes"))
+    dataset = render_dataset(job, "views", pool=local_workers(2))
 
 Worker processes render; this process normalizes and writes the shards one by one, in a fixed order. The bytes therefore
 do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
 
-    render_crops(meshes, ViewDataset.open("views"), size=96, pool=local_workers(2))
+    render_crops(job, dataset, size=96, pool=local_workers(2))
 
 renders the views of a dataset once more, for the crops that image networks are trained on. The dataset and its digest
 do not change: crops may be added to views that runs were trained on.
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import atomic_write, check_output_directory, content_digest, remove_leftovers
+from thor2_jax.files import atomic_write, check_output_directory, remove_leftovers
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.types import Cloud
@@ -53,32 +54,99 @@ from training.views.dataset import (
 from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
-__all__ = ["dataset_job", "mesh_digest", "render_crops", "render_dataset"]
+__all__ = ["RenderJob", "render_crops", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
 
 
-def mesh_digest(mesh: TexturedMesh) -> str:
-    """Return the SHA-256 of a mesh's arrays: mesh files refer to others, and meshes need not come from files."""
-    parts: list[str | bytes] = []
-    for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
-        parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
-    return content_digest(parts)
+@dataclasses.dataclass(frozen=True)
+class RenderJob:
+    """Everything that determines a dataset of views.
+
+    Attributes:
+        meshes: object name -> mesh file, as from `find_meshes`, or mesh.
+        azimuth_step: degrees; divides 360.
+        polar_step: degrees; divides 180.
+        augmentations: adds augmented copies of each view; None adds none.
+        seed: seed for the augmentations, at least 0. The copies of an object do not depend on the other objects.
+    """
+
+    meshes: Mapping[str, Path | TexturedMesh]
+    azimuth_step: float = 5.0
+    polar_step: float = 5.0
+    augmentations: Augmentations | None = None
+    seed: int = 0
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Azimuth and polar angle [n, 2] of the views of an object; raises InputError for an invalid step."""
+        return view_angles(self.azimuth_step, self.polar_step)
+
+    @property
+    def copies(self) -> int:
+        """Number of clouds of a view."""
+        return clouds_per_view(self.augmentations)
+
+    @functools.cached_property
+    def shards(self) -> dict[str, tuple[str, range]]:
+        """File name -> object and numbers of the views of each shard."""
+        size, n_views = max(1, CLOUDS_PER_SHARD // self.copies), len(self.angles)
+        return {
+            f"{label:04d}-{number:04d}.safetensors": (name, range(first, min(first + size, n_views)))
+            for label, name in enumerate(self.meshes)
+            for number, first in enumerate(range(0, n_views, size))
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Check the job and return it as JSON holds it.
+
+        Raises:
+            InputError: there are no meshes, a mesh is unreadable, too large or never visible, or a step or the seed is
+                invalid.
+        """
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}; it must be at least 0")
+        augmentations, camera = self.augmentations, TRAINING_CAMERA
+        objects = [
+            {"name": name, "mesh": _checked_size(name, mesh).digest}
+            for name, mesh in mesh_views.checked_meshes(self.meshes, self.angles)
+        ]
+        # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
+        intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
+        return {
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "sigma_s": SIGMA_S,
+            "voxel": DESCRIPTOR_VOXEL,
+            "step": COORDINATE_STEP,
+            "min_points": mesh_views.MIN_VIEW_POINTS,
+            "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
+            "azimuth_step": float(self.azimuth_step),
+            "polar_step": float(self.polar_step),
+            "variations": {"seed": self.seed, "cameras": "random", **augmentations.record()} if augmentations else None,
+            "objects": objects,
+            "shards": len(self.shards),
+        }
+
+    def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
+        """Yield the task of each of these shards; a mesh is read once for consecutive shards of its object."""
+        angles = self.angles
+        for name, group in itertools.groupby(map(self.shards.__getitem__, files), key=operator.itemgetter(0)):
+            mesh = mesh_views.read_mesh(self.meshes[name])
+            for _, views in group:
+                of_views = angles[views.start : views.stop]
+                yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
 
 
-def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
-    """Check every mesh and return the names and digests of the objects."""
-    objects = []
-    for name, mesh in mesh_views.checked_meshes(meshes, angles):
-        diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if SIGMA_S * diameter > MAX_VIEW_LENGTH:
-            raise InputError(
-                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
-                "stored; scale the mesh to metres"
-            )
-        objects.append({"name": name, "mesh": mesh_digest(mesh)})
-    return objects
+def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
+    """Return a mesh unless its views may be too large to be stored."""
+    diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if SIGMA_S * diameter > MAX_VIEW_LENGTH:
+        raise InputError(
+            f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
+            "stored; scale the mesh to metres"
+        )
+    return mesh
 
 
 def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
@@ -121,76 +189,11 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, i
     return Shard(path.name, digest, label, n_views, left_out=planned - n_views, points=len(views.xyz))
 
 
-def _plan(n_objects: int, n_views: int, copies: int) -> dict[str, tuple[int, range]]:
-    """Return file name -> label and numbers of the views, for the shards of objects with `copies` clouds of a view."""
-    size = max(1, CLOUDS_PER_SHARD // copies)
-    return {
-        f"{label:04d}-{number:04d}.safetensors": (label, range(first, min(first + size, n_views)))
-        for label in range(n_objects)
-        for number, first in enumerate(range(0, n_views, size))
-    }
-
-
-def _tasks(
-    meshes: Mapping[str, Path | TexturedMesh],
-    names: Sequence[str],
-    angles: NDArray[np.float64],
-    shards: Iterable[tuple[int, range]],
-    augmentations: Augmentations | None,
-    seed: int,
-) -> Iterator[ViewTask]:
-    """Yield the task of each shard; a mesh is read once for consecutive shards of its object."""
-    for label, group in itertools.groupby(shards, key=operator.itemgetter(0)):
-        mesh = mesh_views.read_mesh(meshes[names[label]])
-        for _, views in group:
-            of_views = angles[views.start : views.stop]
-            yield ViewTask(names[label], mesh, of_views, views.start, augmentations, seed)
-
-
-def dataset_job(
-    meshes: Mapping[str, Path | TexturedMesh],
-    azimuth_step: float,
-    polar_step: float,
-    augmentations: Augmentations | None,
-    seed: int,
-) -> dict[str, Any]:
-    """Return everything that determines a dataset, as JSON holds it; see `render_dataset` for the arguments.
-
-    Raises:
-        InputError: An argument is invalid.
-    """
-    if seed < 0:
-        raise InputError(f"seed is {seed}; it must be at least 0")
-    angles = view_angles(azimuth_step, polar_step)
-    objects = _objects(meshes, angles)
-    plan = _plan(len(objects), len(angles), clouds_per_view(augmentations))
-    camera = TRAINING_CAMERA
-    # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
-    intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
-    return {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "sigma_s": SIGMA_S,
-        "voxel": DESCRIPTOR_VOXEL,
-        "step": COORDINATE_STEP,
-        "min_points": mesh_views.MIN_VIEW_POINTS,
-        "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
-        "azimuth_step": float(azimuth_step),
-        "polar_step": float(polar_step),
-        "variations": {"seed": seed, "cameras": "random", **augmentations.record()} if augmentations else None,
-        "objects": objects,
-        "shards": len(plan),
-    }
-
-
 def render_dataset(
-    meshes: Mapping[str, Path | TexturedMesh],
+    job: RenderJob,
     out: str | Path,
-    azimuth_step: float = 5.0,
-    polar_step: float = 5.0,
     pool: WorkerPool = IN_PROCESS,
     progress: RenderProgress = lambda done, total: None,
-    augmentations: Augmentations | None = None,
-    seed: int = 0,
 ) -> ViewDataset:
     """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
 
@@ -198,37 +201,30 @@ def render_dataset(
     interruption. Memory holds one shard per worker, and one.
 
     Args:
-        meshes: object name -> mesh file, as from `find_meshes`, or mesh.
-        out: directory: new, empty, or with a dataset of the same arguments; created with its parents.
-        azimuth_step: degrees; divides 360.
-        polar_step: degrees; divides 180.
+        job: the job.
+        out: directory: new, empty, or with a dataset of the same job; created with its parents.
         pool: worker processes that render; does not affect the result.
         progress: called with (clouds done, total clouds) at the start and after each shard.
-        augmentations: adds augmented copies of each view; None adds none.
-        seed: seed for the augmentations. The copies of an object do not depend on the other objects.
 
     Raises:
-        InputError: Nothing is written if there are no meshes, a mesh is unreadable, too large or never visible, a step
-            or the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
-            written by another process.
+        InputError: Nothing is written if the job is invalid, see `RenderJob.record`, or `out` holds something else,
+            views of another job (names what differs) or is written by another process.
         OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)
     check_output_directory(out, MANIFEST)
-    job = dataset_job(meshes, azimuth_step, polar_step, augmentations, seed)
-    names = [entry["name"] for entry in job["objects"]]
-    angles, copies = view_angles(azimuth_step, polar_step), clouds_per_view(augmentations)
-    plan, total = _plan(len(names), len(angles), copies), len(names) * len(angles) * copies
+    record, labels = job.record(), {name: label for label, name in enumerate(job.meshes)}
+    total = len(labels) * len(job.angles) * job.copies
     with locked(out):
-        done = {shard.file: shard for shard in _begin(out, job).shards}
+        done = {shard.file: shard for shard in _begin(out, record).shards}
         progress(_clouds(done), total)
-        missing = {file: shard for file, shard in plan.items() if file not in done}
-        tasks = _tasks(meshes, names, angles, missing.values(), augmentations, seed)
-        with contextlib.closing(pool(mesh_views.render_task, tasks)) as results:
-            for (file, (label, views)), rendered in zip(missing.items(), results, strict=True):
-                with with_context(f"object {names[label]!r}"):
-                    done[file] = _store(out / file, label, copies * len(views), rendered)
-                Manifest(job, tuple(done[name] for name in plan if name in done)).write(out)
+        missing = [file for file in job.shards if file not in done]
+        with contextlib.closing(pool(mesh_views.render_task, job.tasks(missing))) as results:
+            for file, rendered in zip(missing, results, strict=True):
+                name, views = job.shards[file]
+                with with_context(f"object {name!r}"):
+                    done[file] = _store(out / file, labels[name], job.copies * len(views), rendered)
+                Manifest(record, tuple(done[file] for file in job.shards if file in done)).write(out)
                 progress(_clouds(done), total)
     return ViewDataset.open(out)
 
@@ -265,39 +261,32 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
 
 
 def render_crops(
-    meshes: Mapping[str, Path | TexturedMesh],
+    job: RenderJob,
     dataset: ViewDataset,
     size: int = CROP_SIZE,
     pool: WorkerPool = IN_PROCESS,
     progress: RenderProgress = lambda done, total: None,
-    augmentations: Augmentations | None = None,
-    seed: int = 0,
 ) -> None:
     """Render the crops of all views of a dataset; an interrupted rendering resumes.
 
     Args:
-        meshes: those that the dataset was rendered from.
+        job: the job of the dataset.
         dataset: the dataset.
         size: side of the crops, pixels, at least 1.
         pool: worker processes that render; does not affect the result.
         progress: called with (crops done, total crops) at the start and after each shard.
-        augmentations: those of the dataset.
-        seed: seed of the dataset.
 
     Raises:
         InputError: the dataset has crops of another size.
         OSError: a file cannot be written; the rendering can be resumed.
     """
     directory = dataset.directory / CROPS
-    angles = view_angles(dataset.manifest.job["azimuth_step"], dataset.manifest.job["polar_step"])
-    plan = _plan(len(dataset.classes), len(angles), clouds_per_view(augmentations))
     with locked(directory):
         done = _begin_crops(directory, dataset, size)
         missing = [index for index, shard in enumerate(dataset.shards) if crop_file(shard.file) not in done]
         n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
         progress(n_done, len(dataset))
-        shards = [plan[dataset.shards[index].file] for index in missing]
-        tasks = _tasks(meshes, dataset.classes, angles, shards, augmentations, seed)
+        tasks = job.tasks(dataset.shards[index].file for index in missing)
         with contextlib.closing(pool(functools.partial(_crops_of_task, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
                 views, name = dataset.read(index), crop_file(dataset.shards[index].file)

@@ -19,7 +19,7 @@ from training.views import render_job
 from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, quantized, rgbd_crop, stacked, surface_normals
 from training.views.dataset import ViewDataset
 from training.views.normalized_views import WithoutClasses
-from training.views.render_job import render_crops, render_dataset
+from training.views.render_job import RenderJob, render_crops, render_dataset
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)
 
@@ -153,7 +153,7 @@ def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, 
     (copied / "crops").mkdir()
     for file in (dataset.directory / "crops").glob("*.npz"):
         (copied / "crops" / file.name).write_text("a user's")
-    assert_refused("already contains", render_crops, find_meshes(meshes), ViewDataset.open(copied), SIZE)
+    assert_refused("already contains", render_crops, RenderJob(find_meshes(meshes)), ViewDataset.open(copied), SIZE)
     assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
 
 
@@ -177,9 +177,10 @@ def test_interrupted_crops_resume_with_the_same_bytes(
 
 def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
     assert_refused(f"crops of {SIZE} pixels; expected at least 25", dataset.read_crops, 0, SIZE + 1)
-    plain = render_dataset(find_meshes(meshes), tmp_path / "plain", 180, 90)
+    job = RenderJob(find_meshes(meshes), 180, 90)
+    plain = render_dataset(job, tmp_path / "plain")
     assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
-    render_crops(find_meshes(meshes), plain, 8)
+    render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
     content = json.loads(manifest.read_text())
     manifest.write_text(json.dumps({**content, "dataset": "0"}))

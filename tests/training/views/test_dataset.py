@@ -22,7 +22,7 @@ from training.views.normalized_views import (
     normalize_views,
     padded_batches,
 )
-from training.views.render_job import render_dataset
+from training.views.render_job import RenderJob, render_dataset
 
 OBJECTS = {name: builtin_objects()[name] for name in ("tennis_ball", "screwdriver")}
 CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
@@ -31,7 +31,7 @@ CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("rendered") / "views"
-    render_dataset(OBJECTS, out, 60, 45)
+    render_dataset(RenderJob(OBJECTS, 60, 45), out)
     return out
 
 

@@ -24,11 +24,11 @@ from training.storage.jobs import locked
 from training.storage.workers import local_workers, ray_workers
 from training.views import render_job
 from training.views.dataset import MANIFEST, ViewDataset
-from training.views.render_job import render_dataset
+from training.views.render_job import RenderJob, render_dataset
 
 NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
-STEPS = (180, 90)
+JOB = RenderJob(OBJECTS, 180, 90)
 """6 views an object: of 4 and 2 with the shards of these tests."""
 
 
@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "deep" / "views"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render_job, "CLOUDS_PER_SHARD", 4)
-        render_dataset(OBJECTS, out, *STEPS)
+        render_dataset(JOB, out)
     return out
 
 
@@ -71,7 +71,7 @@ def test_files_of_a_dataset(whole: Path) -> None:
 
 @pytest.mark.slow
 def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, local_workers(2))
+    render_dataset(JOB, tmp_path / "views", local_workers(2))
     assert files_of(tmp_path / "views") == files_of(whole)
 
 
@@ -91,7 +91,7 @@ def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monke
 
         return ray_workers(2)(dying, tasks)
 
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, pool)
+    render_dataset(JOB, tmp_path / "views", pool)
     assert died.exists() and not ray.is_initialized()
     assert files_of(tmp_path / "views") == files_of(whole)
 
@@ -120,12 +120,12 @@ def test_rendering_interrupted_at_any_write_resumes(
     for stop in stops:
         out, left = tmp_path / str(stop), stop
         with pytest.raises(Interrupted):
-            render_dataset(OBJECTS, out, *STEPS)
+            render_dataset(JOB, out)
         with pytest.raises(InputError, match=MANIFEST) if stop < 18 else contextlib.nullcontext():
             ViewDataset.open(out)
         left, before = 0, files_of(out)
         seen: list[tuple[int, int]] = []
-        render_dataset(OBJECTS, out, *STEPS, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
+        render_dataset(JOB, out, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
         assert files_of(out) == files_of(whole)
         # Shards that were listed are not rendered again.
         listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
@@ -144,14 +144,14 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
     bad.write_bytes(content)
     missing.unlink()
     before = changed(copied)
-    render_dataset(OBJECTS, copied, *STEPS)
+    render_dataset(JOB, copied)
     assert files_of(copied) == files_of(whole)
     same = {name for name, time in changed(copied).items() if before.get(name) == time}
     assert same - {".lock"} == {"0000-0000.safetensors", "0001-0001.safetensors"}
     before = changed(copied)
     with locked(copied), pytest.raises(InputError, match=str(copied)):
-        render_dataset(OBJECTS, copied, *STEPS)
-    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 12
+        render_dataset(JOB, copied)
+    assert len(render_dataset(JOB, copied)) == 12
     assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
@@ -160,15 +160,15 @@ def test_another_job_is_refused(copied: Path) -> None:
     ball, screwdriver = OBJECTS["tennis_ball"], OBJECTS["screwdriver"]
     moved = dataclasses.replace(ball, vertices=ball.vertices + 1e-3)
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
-    for meshes, steps, message in [
-        (OBJECTS, (90, 90), "azimuth_step 180.0, not 90.0"),
-        (OBJECTS, (180, 45), "polar_step 90.0, not 45.0"),
-        (OBJECTS | {"tennis_ball": moved}, STEPS, r"objects\[\d\].mesh "),
-        (OBJECTS | {"screwdriver": painted}, STEPS, r"objects\[\d\].mesh "),
-        (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
-        (dict(reversed(OBJECTS.items())), STEPS, r"objects\[0\].name "),
+    for changes, message in [
+        ({"azimuth_step": 90}, "azimuth_step 180.0, not 90.0"),
+        ({"polar_step": 45}, "polar_step 90.0, not 45.0"),
+        ({"meshes": OBJECTS | {"tennis_ball": moved}}, r"objects\[\d\].mesh "),
+        ({"meshes": OBJECTS | {"screwdriver": painted}}, r"objects\[\d\].mesh "),
+        ({"meshes": OBJECTS | {"apple": moved}}, r"objects\[2\] null, not \{"),
+        ({"meshes": dict(reversed(OBJECTS.items()))}, r"objects\[0\].name "),
     ]:
-        assert_refused(f"{copied} .*{message}", render_dataset, meshes, copied, *steps)
+        assert_refused(f"{copied} .*{message}", render_dataset, dataclasses.replace(JOB, **changes), copied)
         assert files_of(copied) == before
 
 
@@ -176,16 +176,17 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
     ball = {"ball": sphere(0.03)}
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
-    dataset = render_dataset(ball, out, 90, 90, augmentations=light, seed=1)
+    job = RenderJob(ball, 90, 90, light, 1)
+    dataset = render_dataset(job, out)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
     assert [shard.views for shard in dataset.shards] == [6] * 6
     views = dataset.read(1)
     assert views.view.tolist() == [2, 2, 2, 3, 3, 3] and views.copy.tolist() == [0, 1, 2] * 2
-    for options in ({}, {"augmentations": light, "seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
-        assert_refused("variations", render_dataset, ball, out, 90, 90, **options)
-    off = render_dataset(ball, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
+    for changes in ({"augmentations": None}, {"seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
+        assert_refused("variations", render_dataset, dataclasses.replace(job, **changes), out)
+    off = render_dataset(RenderJob(ball, 90, 90, Augmentations(), 2), tmp_path / "off")
     assert len(off) == 12 and off.record["job"]["variations"] is None
-    assert_refused("variations null, not {", render_dataset, ball, tmp_path / "off", 90, 90, augmentations=light)
+    assert_refused("variations null, not {", render_dataset, job, tmp_path / "off")
 
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +194,7 @@ def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatc
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 2)
     sheet, name = sphere(0.03), "../a b/ü"
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
-    dataset = render_dataset({name: sheet}, tmp_path / "views", 180, 90)
+    dataset = render_dataset(RenderJob({name: sheet}, 180, 90), tmp_path / "views")
     assert [(shard.views, shard.left_out) for shard in dataset.shards] == [(2, 0), (0, 2), (2, 0)]
     assert [dataset.read(k).view.tolist() for k in range(3)] == [[0, 1], [], [4, 5]]
     assert dataset.record["left_out"] == 2 and dataset.read(1).xyz.shape == (0, 3)
@@ -203,23 +204,24 @@ def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatc
 def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "views"
     (tmp_path / "bad.ply").write_text("not a mesh")
-    for meshes, steps, options, message in [
-        ({}, STEPS, {}, "meshes is empty"),
-        (OBJECTS, (0, 45), {}, "azimuth_step"),
-        (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
-        ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
-        ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
-        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
-    ]:
-        assert_refused(message, render_dataset, meshes, out, *steps, **options)
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"meshes": {}}, "meshes is empty"),
+        ({"azimuth_step": 0}, "azimuth_step"),
+        ({"seed": -1}, "seed is -1"),
+        ({"meshes": {**OBJECTS, "z": tmp_path / "bad.ply"}}, "bad.ply"),
+        ({"meshes": {"speck": sphere(0.003)}}, "object 'speck'"),
+        ({"meshes": {"door": sphere(0.6)}}, "object 'door' .*2.08 m"),
+    ]
+    for changes, message in cases:
+        assert_refused(message, render_dataset, dataclasses.replace(JOB, **changes), out)
         assert not out.exists()
 
 
 def test_other_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("text")
-    assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, OBJECTS, tmp_path, *STEPS)
+    assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, JOB, tmp_path)
     (tmp_path / MANIFEST).write_text('{"format": 1}')
-    assert_refused("manifest.json has format 1; expected 2", render_dataset, OBJECTS, tmp_path, *STEPS)
+    assert_refused("manifest.json has format 1; expected 2", render_dataset, JOB, tmp_path)
     assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
 
 
@@ -233,10 +235,10 @@ def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypa
     (copied / "0001-0000.safetensors").unlink()
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
         patch.setattr(os, "replace", full_for_shards)
-        render_dataset(OBJECTS, copied, *STEPS)
+        render_dataset(JOB, copied)
     assert set(files_of(whole)) - set(files_of(copied)) == {"0001-0000.safetensors"}
     assert_refused("3 of 4 shards", ViewDataset.open, copied)
-    render_dataset(OBJECTS, copied, *STEPS)
+    render_dataset(JOB, copied)
     assert files_of(copied) == files_of(whole)
 
 
