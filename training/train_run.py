@@ -53,11 +53,11 @@ from training.fitting.loop import (
     read_metrics,
     wait_for_all,
 )
-from training.fitting.samples import Samples, build_samples, fold_of_views
+from training.fitting.samples import Samples, build_samples
 from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
-from training.views.normalized_views import ViewSource
+from training.views.normalized_views import ViewSource, fold_of_views
 
 __all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.instance_clouds import flying_pixels
 from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
@@ -111,7 +110,6 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
 
 def _without_flying(view: RenderedView) -> RenderedView:
     """Remove flying pixels as recognition does: unless they are more than half of all pixels."""
-    frame = RGBDFrame(view.color, view.depth, (view.depth > 0).astype(np.uint8), view.intrinsics)
     pixels = np.flatnonzero(view.depth)
-    flying = flying_pixels(frame, pixels)
+    flying = flying_pixels(view.frame, pixels)
     return view if 2 * flying.sum() > len(pixels) else without(view, pixels[flying])

@@ -20,9 +20,8 @@ from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, of_fit, run_epochs
-from training.fitting.samples import fold_of_views
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
-from training.views.normalized_views import NormalizedViews, ViewSource
+from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
 __all__ = [
     "BaselineInputs",

@@ -29,7 +29,7 @@ from thor2_jax.types import Strips
 from training.augmentation.orientation import reorient
 from training.views.normalized_views import ViewSource, padded_batches
 
-__all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand", "fold_of_views"]
+__all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand"]
 
 MIRRORS = ("", "x")
 """Mirrors of a normalized view that change its descriptor: a mirror in y changes no strip length and no count."""
@@ -212,32 +212,3 @@ def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> St
         return Strips(low, high.reshape(shape), occupied.reshape(shape), color.reshape(*shape, n_regions), overflow)
 
     return jax.vmap(one)(batch)
-
-
-def fold_of_views(
-    label: NDArray[np.integer[Any]], view: NDArray[np.integer[Any]], classes: Sequence[str], folds: int, seed: int
-) -> NDArray[np.intp]:
-    """Return the fold of each cloud [M], from 0: the views of every class are assigned at random and evenly.
-
-    All clouds of a view (mirrored and augmented copies) are in the same fold: they are nearly equal, and the held-out
-    set must not be known from training.
-
-    Args:
-        label: [M], index into `classes`.
-        view: [M], index of the view among the views of its object.
-        classes: class names.
-        folds: number of folds; with 1, everything is in fold 0.
-        seed: seed for the assignment.
-
-    Raises:
-        InputError: a class has fewer views than folds.
-    """
-    rng = np.random.default_rng(seed)
-    fold: NDArray[Any] = np.zeros(len(label), np.intp)
-    for index, name in enumerate(classes):
-        members = label == index
-        views, number = np.unique(view[members], return_inverse=True)
-        if len(views) < folds:
-            raise InputError(f"folds is {folds}; class {name!r} has {len(views)} views; use at most that many folds")
-        fold[members] = (rng.permutation(len(views)) % folds)[number]
-    return fold

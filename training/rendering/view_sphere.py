@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 
 __all__ = ["Camera", "DISTANCE", "RenderedView", "TRAINING_CAMERA", "camera_pose", "random_angles", "view_angles"]
 
@@ -59,6 +59,11 @@ class RenderedView:
     intrinsics: Intrinsics
     pose: NDArray[np.float64]
     corner: tuple[int, int]
+
+    @property
+    def frame(self) -> RGBDFrame:
+        """The view as a frame in which the visible pixels are the instance 1."""
+        return RGBDFrame(self.color, self.depth, (self.depth > 0).astype(np.uint8), self.intrinsics)
 
 
 DISTANCE = 1.5

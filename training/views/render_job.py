@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import atomic_write, check_output_directory, remove_leftovers
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
@@ -235,13 +234,11 @@ def _clouds(shards: Mapping[str, Shard]) -> int:
 
 def _crops_of_task(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
     """Return (number of the view, of the copy) -> crop of the views of a task in which something is visible."""
-    of_task = {}
-    for number, copy, view in mesh_views.all_views(task):
-        labels = (view.depth > 0).astype(np.uint8)
-        if labels.any():
-            frame = RGBDFrame(view.color, view.depth, labels, view.intrinsics)
-            of_task[number, copy] = quantized(rgbd_crop(frame, 1, size))
-    return of_task
+    return {
+        (number, copy): quantized(rgbd_crop(view.frame, 1, size))
+        for number, copy, view in mesh_views.all_views(task)
+        if view.depth.any()
+    }
 
 
 def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, str]:

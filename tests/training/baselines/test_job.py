@@ -21,8 +21,7 @@ from training.baselines.files import CLOUD_BASELINES, StoredBaseline, check_base
 from training.baselines.forest import load_forest
 from training.baselines.job import load_baselines, train_baselines
 from training.evaluation.runs import load_runs
-from training.fitting.samples import fold_of_views
-from training.views.normalized_views import MemoryViews
+from training.views.normalized_views import MemoryViews, fold_of_views
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 

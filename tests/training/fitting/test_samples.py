@@ -16,8 +16,8 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
-from training.fitting.samples import PAPER_MIRRORS, build_samples, expand, fold_of_views
-from training.views.normalized_views import MemoryViews, SourceShard
+from training.fitting.samples import PAPER_MIRRORS, build_samples, expand
+from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

@@ -140,8 +140,7 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
     for row in np.flatnonzero(views.copy == 0):
         azimuth, polar = view_angles(180, 90)[views.view[row]]
         view = render_view(RayCaster([mesh]), camera_pose(azimuth, polar, mesh.centre))
-        frame = thor2.RGBDFrame(view.color, view.depth, (view.depth > 0).astype(np.uint8), view.intrinsics)
-        color, normals = quantized(rgbd_crop(frame, 1, SIZE))
+        color, normals = quantized(rgbd_crop(view.frame, 1, SIZE))
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
     box = WithoutClasses(dataset, ["brick"]).read_crops(0, SIZE)
