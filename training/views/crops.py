@@ -2,9 +2,9 @@
 
     crop = rgbd_crop(frame, label)
     crop.color, crop.normals, crop.mask         # [224, 224, 3], [224, 224, 3], [224, 224]
+
 A rendered view is cropped alike (`rgbd_crop(view.frame, 1)`). Image networks are trained on the crops of the views of a
 dataset (`ViewDataset.read_crops`).
-trained on the crops of the views of a dataset (`ViewDataset.read_crops`).
 """
 
 import dataclasses
