@@ -18,7 +18,7 @@ from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
-from training.storage.jobs import Display, check_same_job, numbered, of_stage
+from training.storage.jobs import Progress, check_same_job, numbered, of_stage, prefixed
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.dataset import ViewDataset, remove_views
@@ -65,8 +65,12 @@ class TrainJob:
     mesh_scale: float = 1.0
 
 
-def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun]]:
+def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedRun]]:
     """Train everything that the job asks for and that is not finished yet.
+
+    Args:
+        job: the job.
+        progress: called with (stage, done, total, note); the stages of a sequence begin with its name.
 
     Returns:
         Run directory -> the runs of its folds that this call has trained; none if they were finished.
@@ -90,7 +94,8 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
             _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    source = _open_views(job, labelled, display)
+    shown = numbered(progress, _stages(job))
+    source = _open_views(job, labelled, shown)
     if job.leave_out:
         source = WithoutClasses(source, job.leave_out)
     sources = {job.out: source}
@@ -104,13 +109,11 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
             check_trained(views.digest, directory, job.protocol)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
-        runs[directory] = []
-        with display() as shown:
-            progress = numbered(shown, _stages(job))
-            if not is_finished(directory):
-                runs[directory] = train_run(views, directory, job.protocol, progress)
-            if baselines and jax.process_index() == 0:
-                train_baselines(directory, views, baselines, progress, weights=job.weights)
+        if job.sequences is not None:
+            shown = numbered(prefixed(progress, str(directory.relative_to(job.out))), _stages(job))
+        runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown)
+        if baselines and jax.process_index() == 0:
+            train_baselines(directory, views, baselines, shown, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
         remove_leftovers(job.out)
         remove_views(job.out / VIEWS)
@@ -215,18 +218,16 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         raise InputError(f"frames: the objects are {', '.join(classes) or 'none'}; expected at least two")
 
 
-def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Display) -> ViewSource:
+def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:
     """Open the dataset, or render the meshes to `out`/views; add the labelled instances."""
     meshes = {} if job.meshes is None else _find_meshes(job)
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), _crop_size(job)
-        with display() as shown:
-            progress = numbered(shown, _stages(job))
-            source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
-            if size is not None:
-                render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))
+        source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
+        if size is not None:
+            render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))
     if labelled is not None:
         source = WithLabelledViews(labelled, job.protocol.config, source)
     assert source is not None

@@ -1,7 +1,6 @@
 """`thor2 train`: train a recognizer."""
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -207,7 +206,8 @@ def train(
         workers=workers,
         mesh_scale=mesh_scale,
     )
-    trained = run_train_job(job, functools.partial(show_progress, quiet))
+    with show_progress(quiet) as progress:
+        trained = run_train_job(job, progress)
     for directory, runs in trained.items():
         for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []) if runs else []:
             console.print(f"skipped: {reason}")

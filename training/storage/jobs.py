@@ -21,7 +21,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
 __all__ = [
-    "Display",
     "JOB_FILE",
     "LOCK",
     "Progress",
@@ -32,6 +31,7 @@ __all__ = [
     "locked",
     "numbered",
     "of_stage",
+    "prefixed",
     "processor",
 ]
 
@@ -68,9 +68,6 @@ def processor() -> str:
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
-Display = Callable[[], AbstractContextManager[Progress]]
-"""Opens a progress display, such as `training.cli.app.show_progress`."""
-
 
 def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:
     """Return the callback of a stage whose note is always the same, called with (done, total)."""
@@ -79,6 +76,11 @@ def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, i
         progress(stage, done, total, note)
 
     return show
+
+
+def prefixed(progress: Progress, name: str) -> Progress:
+    """Return a callback that puts a name before each stage."""
+    return lambda stage, done, total, note: progress(f"{name}: {stage}", done, total, note)
 
 
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:

@@ -200,7 +200,7 @@ def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
         (["templates"], r"vit_small_patch14_dinov2\.safetensors has no tensor"),
     ):
         job = TrainJob(tmp_path / "run", DEFAULT, dataset=tmp_path, weights=tmp_path, baselines=names)
-        assert_refused(f"^weights.*{message}", run_train_job, job, lambda: pytest.fail("work began"))
+        assert_refused(f"^weights.*{message}", run_train_job, job, lambda *_: pytest.fail("work began"))
     assert not (tmp_path / "run").exists()
 
 

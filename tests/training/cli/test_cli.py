@@ -186,7 +186,7 @@ def test_options_replace_values_of_the_protocols(
     jobs: list[TrainJob] = []
     monkeypatch.setattr(protocol, "DEFAULT", DEFAULT)
     monkeypatch.setattr(protocol, "PAPER", PAPER)
-    monkeypatch.setattr(train_job, "run_train_job", lambda job, display: jobs.append(job) or {})
+    monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: jobs.append(job) or {})
 
     def job(*options: object) -> TrainJob:
         assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / "run", *options) == 0
@@ -239,14 +239,17 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
 
 
 @UNFITTED
-def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: Command) -> None:
-    """Each run has the objects of its sequence; a repeated command trains only missing runs."""
+def test_train_by_sequences(
+    meshes: Path, views: Path, tmp_path: Path, refused: Command, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each run has the objects of its sequence, whose name is shown; a repeated command trains only missing runs."""
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
     arguments = ("train", "--dataset", views, "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
     assert run_thor2(*arguments) == 0
+    assert "table/a: stage 1 of 2: describe: " in capfd.readouterr().err
     first = (out / "table/a/run.json").read_bytes()
     assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
     table.write_text(json.dumps({"table/a": [soup, mug], "b": [cereal, cereal, soup]}))
