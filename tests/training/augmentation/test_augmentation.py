@@ -62,7 +62,7 @@ def same(one: RenderedView, other: RenderedView) -> bool:
     )
 
 
-# Options.
+# All augmentations.
 
 
 def test_the_record_is_json_and_no_augmentation_changes_nothing() -> None:
@@ -71,14 +71,8 @@ def test_the_record_is_json_and_no_augmentation_changes_nothing() -> None:
     record = on.record()
     assert record == json.loads(json.dumps(record)) and set(record) == {*AUGMENTATIONS, "copies"}
     assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.7]
-
-
-def test_numbers_of_copies_out_of_range_are_refused() -> None:
     for copies in (0, 1001):
         assert_refused(f"augmentations.copies is {copies}", Augmentations, copies=copies)
-
-
-# All augmentations.
 
 
 each_and_all = pytest.mark.parametrize("on", [*({name: on} for name, on in AUGMENTATIONS.items()), AUGMENTATIONS])
