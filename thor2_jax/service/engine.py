@@ -6,7 +6,6 @@ Descriptors and class probabilities for batches of a few sizes are all compiled 
 import dataclasses
 import logging
 import queue
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
@@ -68,27 +67,17 @@ Job = tuple[Sequence[PreparedInstance], Future[list[CloudResult]]]
 
 
 class Batcher:
-    """Combine the instances of several requests into batches and process them in one thread."""
+    """Process the instances of requests in one thread; those that arrive meanwhile share the next batches."""
 
-    def __init__(
-        self,
-        process_batch: Callable[[list[PreparedInstance]], list[CloudResult]],
-        count_expected: Callable[[], int],
-        max_batch: int,
-        window: float,
-    ) -> None:
+    def __init__(self, process_batch: Callable[[list[PreparedInstance]], list[CloudResult]], max_batch: int) -> None:
         """Start without requests.
 
         Args:
             process_batch: returns one result per instance, for at most `max_batch` instances.
-            count_expected: returns the number of current requests, including those that are not submitted yet.
             max_batch: maximum number of instances in a batch.
-            window: seconds for which an incomplete batch waits for expected requests.
         """
-        self._process_batch, self._count_expected = process_batch, count_expected
-        self._max_batch, self._window = max_batch, window
-        # A SimpleQueue of CPython 3.11 may wait for ever where its timeout passes before it begins to wait.
-        self._waiting: queue.Queue[Job] = queue.Queue()
+        self._process_batch, self._max_batch = process_batch, max_batch
+        self._waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
         self._device = ThreadPoolExecutor(1, thread_name_prefix="device")
 
     def submit(self, instances: Sequence[PreparedInstance]) -> Future[list[CloudResult]]:
@@ -105,19 +94,12 @@ class Batcher:
     def _process(self) -> None:
         """Process what waits, unless an earlier call has done so with its own batch."""
         jobs: list[Job] = []
-        free, window_end = self._max_batch, 0.0
-        while free > 0:
-            timeout = window_end - time.monotonic() if len(jobs) < self._count_expected() else 0.0
-            try:
-                job = self._waiting.get(timeout=max(0.0, timeout))
-            except queue.Empty:
-                break
-            if not jobs:
-                window_end = time.monotonic() + self._window
-            jobs.append(job)
-            free -= len(job[0])
-        jobs = [job for job in jobs if job[1].set_running_or_notify_cancel()]
-        instances = [instance for of_job, _ in jobs for instance in of_job]
+        instances: list[PreparedInstance] = []
+        while len(instances) < self._max_batch and not self._waiting.empty():
+            job = self._waiting.get()
+            if job[1].set_running_or_notify_cancel():
+                jobs.append(job)
+                instances += job[0]
         results: list[CloudResult] = []
         try:
             for first in range(0, len(instances), self._max_batch):

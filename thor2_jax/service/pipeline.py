@@ -124,7 +124,7 @@ class Service:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
         settings = self.settings
         self._pool = PreparationPool(settings.processes, settings.segmenter)
-        self._batcher = Batcher(self._process_batch, lambda: self._in_progress, settings.max_batch, settings.window)
+        self._batcher = Batcher(self._process_batch, settings.max_batch)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")

@@ -49,7 +49,7 @@ class Device:
 
 def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     device = Device()
-    batcher = Batcher(device, lambda: 0, max_batch=4, window=0.0)
+    batcher = Batcher(device, max_batch=4)
     first = batcher.submit([1])
     assert device.called.wait(HANG)  # The device is now processing it.
     others = [batcher.submit(numbers) for numbers in ([2, 3], [4], [5, 6, 7, 8, 9, 10])]
@@ -59,22 +59,9 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
 
 
-def test_batch_waits_briefly_for_expected_jobs() -> None:
-    device = Device(10)
-    batcher = Batcher(device, lambda: 2, max_batch=4, window=HANG)
-    jobs = [batcher.submit([number]) for number in (1, 2)]
-    assert [job.result(HANG) for job in jobs] == [[2], [4]] and device.batches == [[1, 2]]
-    batcher.close()
-    batcher = Batcher(device, lambda: 2, max_batch=4, window=0.3)
-    start = time.monotonic()
-    assert batcher.submit([3]).result(HANG) == [6]
-    assert time.monotonic() - start > 0.25
-    batcher.close()
-
-
 def test_cancelled_and_failing_jobs_are_isolated() -> None:
     device = Device()
-    batcher = Batcher(device, lambda: 0, max_batch=1, window=0.0)
+    batcher = Batcher(device, max_batch=1)
     first = batcher.submit([1])
     assert device.called.wait(HANG)
     cancelled, failing, last = (batcher.submit([number]) for number in (3, 13, 5))
