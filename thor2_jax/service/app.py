@@ -22,7 +22,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
-from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
+from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.hosts import is_allowed_host
@@ -169,7 +169,9 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
         async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
-            answer = await service.explain(files, admitted)
+            recognized = await service.recognize(files, admitted, with_label_map=True)
+            model, timings = service.engine.model, admitted.milliseconds()
+            answer = await run_in_threadpool(explained_frame, model, *recognized, timings)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
 

@@ -25,11 +25,10 @@ from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
-from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.recognizer import THOR2, Recognizer
+from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
@@ -240,27 +239,6 @@ class InferenceEngine:
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""
         return [(padded_points(n_points), by_classifiers) for by_classifiers in explained_kinds(self.model)]
-
-    def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
-        """Return the calibrated confidence of the most probable class of each cloud.
-
-        It is the confidence itself if the run has a calibration, else the confidence after temperature scaling of both
-        classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
-        gallery, and with forgotten classes.
-        """
-        temperatures, model = self.run.record.get("temperatures", {}), self.model
-        if not results or model.answers_by() != "classifiers" or self.objects.gallery.hidden:
-            return [None] * len(results)
-        probabilities: dict[str, NDArray[np.float32]] = {
-            name: np.stack([r.inference.probabilities[name] for r in results]) for name in model.classifiers.default
-        }
-        if model.calibration is not None:
-            return [float(p) for p in model.fused(probabilities).max(axis=1)]
-        if not set(THOR2) <= set(temperatures):
-            return [None] * len(results)
-        index = fused_probabilities({name: probabilities[name] for name in THOR2}).argmax(axis=1)
-        calibrated = fused_probabilities({n: with_temperature(probabilities[n], temperatures[n]) for n in THOR2})
-        return [float(p) for p in calibrated[np.arange(len(results)), index]]
 
 
 def _load(settings: Settings) -> Recognizer:

@@ -24,7 +24,7 @@ from thor2_jax.gallery.gallery import CompactClouds
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.service.answers import explained_frame, why_answer
+from thor2_jax.service.answers import why_answer
 from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
@@ -36,7 +36,7 @@ from thor2_jax.service.preparation import (
     timed,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
-from thor2_jax.service.schemas import ExplainedFrame, WhyAnswer
+from thor2_jax.service.schemas import WhyAnswer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["AdmittedRequest", "Service", "gallery_errors"]
@@ -254,13 +254,6 @@ class Service:
         self.engine.refresh()
         recognitions = self.engine.recognize(corrected, results)
         return dataclasses.replace(prepared, instances=corrected), results, recognitions
-
-    async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
-        """Recognize a frame and return the evidence as well. Raises RequestError."""
-        prepared, results, recognitions = await self.recognize(files, request, with_label_map=True)
-        confidences, config = self.engine.calibrated_confidences(results), self.engine.run.config
-        arguments = prepared, recognitions, results, confidences, config, request.milliseconds()
-        return await asyncio.to_thread(explained_frame, *arguments)
 
     async def why(self, files: dict[str, bytes], label: int, request: AdmittedRequest) -> WhyAnswer:
         """Explain the answer for one instance of a frame, one request after the other.

@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import encode_image
+from helpers import encode_image, untrained_run
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
@@ -105,7 +105,8 @@ def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray) -> Any:
     instances = [PreparedInstance(k, aligned, colors, np.zeros(len(z), bool)) for k in range(count)]
     recognitions = [thor2.Recognition(label=k, name="a") for k in range(count)]
     prepared = PreparedRequest(instances, {}, LabelMap(width=1, height=1, labels=[0], lengths=[1]))
-    return explained_frame(prepared, recognitions, [result] * count, [None] * count, config, {})
+    run = untrained_run(("a",), (), config)
+    return explained_frame(Model.of_run(run), prepared, [result] * count, recognitions, {})
 
 
 def test_details_are_limited_to_the_first_instances() -> None:
