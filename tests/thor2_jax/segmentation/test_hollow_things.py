@@ -1,16 +1,14 @@
 """Bowls and cups: their inner side, bottom and outer side are one thing."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from segmentation_scenes import CAMERA, TABLE, best_overlaps, camera_pose
+from segmentation_scenes import CAMERA, TABLE_TOP, best_overlaps, camera_pose, cast, surface
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation.table import segment_table
-from training.rendering.ray_caster import RayCaster, pixel_rays
 
 WHITE, RED = (225, 225, 220), (170, 60, 50)
 LIGHT = np.array([0.3, -0.2, 0.93])
@@ -18,28 +16,19 @@ BOWL = [(0, 0), (0.04, 0), (0.07, 0.03), (0.08, 0.06), (0.076, 0.06), (0.066, 0.
 CUP = [(0, 0), (0.04, 0), (0.04, 0.1), (0.036, 0.1), (0.036, 0.006), (0, 0.006)]
 
 
-def surface(mesh: trimesh.Trimesh, colors: Any) -> Any:
-    """Return what a ray caster needs of a mesh; the light comes from above."""
-    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ LIGHT, 0, 1)
-    of_faces = (colors * light[:, None]).astype(np.uint8)
-    return SimpleNamespace(vertices=mesh.vertices, faces=mesh.faces, colors_at=lambda face, _: of_faces[face])
-
-
 def revolved(profile: list[tuple[float, float]], x: float, color: Any, inside: Any = None) -> Any:
     """Return the solid of revolution of a closed profile (radius, height), at `x`."""
     mesh = trimesh.creation.revolve(np.array([*profile, profile[0]]), sections=48)
     is_inside = np.linalg.norm(mesh.triangles_center[:, :2], axis=1, keepdims=True) < 0.0385
     mesh.apply_translation([x, 0, 0])
-    return surface(mesh, np.where(is_inside, color if inside is None else inside, color))
+    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ LIGHT, 0, 1)
+    return surface(mesh, np.where(is_inside, color if inside is None else inside, color) * light[:, None])
 
 
 @pytest.mark.parametrize("tilt", [40, 50, 60])
 def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
-    table = surface(trimesh.creation.box((20, 20, 1), trimesh.transformations.translation_matrix([0, 0, -0.5])), TABLE)
     things = [revolved(BOWL, -0.15, WHITE), revolved(CUP, 0.02, RED, inside=WHITE), revolved(BOWL, 0.2, RED)]
-    pose = np.eye(4)
-    pose[:3, :3] = camera_pose(tilt).as_matrix()
-    hits = RayCaster([table, *things]).cast(-0.8 * pose[:3, 2], pixel_rays(CAMERA, 240, 320, pose))
+    hits = cast([TABLE_TOP, *things], camera_pose(tilt), 0.8, CAMERA, (240, 320))
     depth, truth = (values.reshape(240, 320) for values in (np.rint(hits.distance * 1000), hits.mesh))
     frame = RGBDFrame(hits.color.reshape(240, 320, 3), depth.astype(np.uint16), truth, CAMERA)
     # At the foot of a bowl, which is in the shade below its rim, a sliver may be a piece of its own.
