@@ -136,7 +136,7 @@ def calibrated_confidence(model: Model, recognition: Recognition, inference: Inf
     temperatures = model.run.record.get("temperatures", {})
     if not set(THOR2) <= set(temperatures):
         return None
-    probabilities = {name: inference.probabilities[name][None] for name in THOR2}
+    probabilities: dict[str, NDArray[np.float32]] = {name: inference.probabilities[name][None] for name in THOR2}
     scaled = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
     return float(fused_probabilities(scaled)[0, fused_probabilities(probabilities)[0].argmax()])
 

@@ -7,10 +7,10 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -35,13 +35,15 @@ from thor2_jax.service.preparation import (
     prepare_view,
     timed,
 )
-from thor2_jax.service.problem import RequestError, deadline_exceeded
+from thor2_jax.service.problem import RequestError, deadline_exceeded, field_errors
 from thor2_jax.service.schemas import WhyAnswer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["AdmittedRequest", "Service", "gallery_errors"]
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 WHY_RETRY_SECONDS = 3
 """Value of Retry-After until explanations are compiled."""
@@ -205,15 +207,18 @@ class Service:
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
-    async def admit(self, seconds: float | None = None) -> AsyncIterator[AdmittedRequest]:
-        """Admit a request for the duration of the context.
+    async def admit(
+        self, read_body: Callable[[], Awaitable[T]], seconds: float | None = None
+    ) -> AsyncIterator[tuple[AdmittedRequest, T]]:
+        """Admit a request for the duration of the context; yield it with its body.
 
         Args:
+            read_body: waits for the body of the request; it is called only if the request is admitted.
             seconds: time until its deadline; by default that of the settings.
 
         Raises:
-            RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
-                has not arrived and 504 otherwise.
+            RequestError: 503 if the service is not ready, 429 if the queue is full, or as `read_body`; at the deadline,
+                408 if the body has not arrived and 504 otherwise.
         """
         self.check_ready()
         if self._in_progress >= self.settings.queue:
@@ -225,7 +230,9 @@ class Service:
         self.metrics.in_progress.inc()
         try:
             async with asyncio.timeout(seconds):
-                yield request
+                with timed(request.seconds, "upload"):
+                    body = await read_body()
+                yield request, body
         except TimeoutError:
             if "upload" in request.seconds:
                 raise deadline_exceeded() from None
@@ -276,10 +283,8 @@ class Service:
             return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
         with timed(request.seconds, "explain"):
-            try:
+            with field_errors("instance"):
                 answer = await asyncio.wrap_future(self._explainer.submit(explained))
-            except InputError as error:
-                raise RequestError(422, "instance", f"{error}.") from None
         return answer.model_copy(update={"timings": request.milliseconds()})
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
