@@ -50,22 +50,14 @@ def instance_answer(recognition: Recognition) -> schemas.InstanceAnswer:
 
 def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
     """Return the JSON record of an explanation, with its main pictures and without timings."""
-    check = explanation.attributions.faithfulness
-    return schemas.WhyAnswer(
-        label=explanation.recognition.label,
-        name=explanation.recognition.name,
-        explained_name=explanation.name,
-        unit=explanation.scores.unit,
-        margin=check.margin,
-        loss_without_most_attributed_tenth=check.most_attributed,
-        mean_loss_without_random_tenth=check.random,
-        changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
-        pictures=[
-            schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
-            for p in main_pictures(explanation, frame)
-        ],
-        timings={},
-    )
+    record = explanation.as_json()
+    changes = [f"{change_text(change)}: {change.answer}" for change in explanation.changes]
+    pictures = [
+        schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
+        for p in main_pictures(explanation, frame)
+    ]
+    shown = {"changes": changes, "pictures": pictures, "timings": {}}
+    return schemas.WhyAnswer(**{**record, **record["faithfulness"], **shown})
 
 
 def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:

@@ -21,6 +21,7 @@ from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
     "UNIT",
+    "Describe",
     "alignment_drift",
     "assert_equal",
     "assert_near",
@@ -34,6 +35,9 @@ __all__ = [
     "taken",
     "with_points",
 ]
+
+Describe = Callable[[PointClouds], Descriptors]
+"""A function that computes the descriptors of clouds."""
 
 UNIT = 2.0**-24
 """Unit roundoff of float32."""
