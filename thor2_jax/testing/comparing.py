@@ -21,7 +21,6 @@ from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
     "UNIT",
-    "Describe",
     "alignment_drift",
     "assert_equal",
     "assert_near",
@@ -35,9 +34,6 @@ __all__ = [
     "taken",
     "with_points",
 ]
-
-Describe = Callable[[PointClouds], Descriptors]
-"""A function that computes the descriptors of clouds."""
 
 UNIT = 2.0**-24
 """Unit roundoff of float32."""

@@ -16,7 +16,6 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.testing.comparing import (
     UNIT,
-    Describe,
     assert_within,
     cloud_of,
     embedding_rounding,
@@ -26,6 +25,7 @@ from thor2_jax.testing.comparing import (
     taken,
     with_points,
 )
+from thor2_jax.testing.laws import Describe
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 
 __all__ = [
