@@ -151,6 +151,15 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
             Client(url).recognize(color=b"", depth=b"", labels=labels, intrinsics=b"")
 
 
+@pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
+def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | None, monkeypatch: Any) -> None:
+    answer = httpx.Response(503, headers={"Retry-After": retry_after}, text="<html>")
+    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: answer)
+    with pytest.raises(ServiceError) as error:
+        Client("http://robot.local").model()
+    assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
+
+
 def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:
     """This test comes last in the module: the requests above use all batch shapes."""
     for path in ("/v1/recognize", "/v1/explain"):
