@@ -29,7 +29,7 @@ from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
-from thor2_jax.service.pipeline import Service, gallery_errors
+from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
@@ -230,9 +230,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     @routes.get("/v1/objects", responses=error_responses(500))
     async def objects() -> schemas.ObjectsAnswer:
         """Return the objects that may be answered, with their views."""
-        with gallery_errors(service.engine.objects.directory, 500, "gallery"):
-            service.engine.objects.refresh()
-        known = service.engine.objects
+        known = service.known_objects()
         return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.gallery.generation)
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.adaptation.estimate import Adaptation, OnlineAdaptation, adaptation_criterion
-from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.capacity import BATCH_BUCKETS, MIN_BATCH_POINTS, POINT_BUCKETS, batch_bucket, batch_points
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.class_scores import padded_points
 from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
@@ -35,9 +34,8 @@ __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 
 log = logging.getLogger(__name__)
 
-MIN_POINTS_BUCKET, MIN_BATCH_BUCKET = 2048, 8
-"""Smallest shape of a batch. Smaller shapes run hardly faster, and each shape takes seconds to compile."""
-
+MIN_BATCH_BUCKET = 8
+"""Smallest padded number of clouds of a batch; smaller ones run hardly faster, and each takes seconds to compile."""
 
 ExplanationPrograms = tuple[int, bool]
 """Padded number of points, and kind of scores (`explained_kinds`) of what is compiled for explanations."""
@@ -194,7 +192,7 @@ class InferenceEngine:
     def batch_shapes(self) -> list[tuple[int, int]]:
         """Every batch shape that `infer` can use, as (clouds, points)."""
         batches = [b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)]
-        return [(b, n) for n in POINT_BUCKETS if n >= MIN_POINTS_BUCKET for b in batches]
+        return [(b, n) for n in POINT_BUCKETS if n >= MIN_BATCH_POINTS for b in batches]
 
     def compile(self, n_clouds: int, n_points: int) -> None:
         """Compile the programs for one of `batch_shapes`."""
@@ -207,8 +205,8 @@ class InferenceEngine:
 
     def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
         """Describe and classify at most `max_batch` clouds."""
-        largest = max(len(instance.points) for instance in instances)
-        return self._infer(instances, _padded_batch(len(instances)), max(point_bucket(largest), MIN_POINTS_BUCKET))
+        n_points = batch_points(len(instance.points) for instance in instances)
+        return self._infer(instances, _padded_batch(len(instances)), n_points)
 
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
         clouds = pack_instances(instances, n_clouds, n_points)
@@ -238,7 +236,7 @@ class InferenceEngine:
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""
-        return [(padded_points(n_points), by_classifiers) for by_classifiers in explained_kinds(self.model)]
+        return [(batch_points([n_points]), by_classifiers) for by_classifiers in explained_kinds(self.model)]
 
 
 def _load(settings: Settings) -> Recognizer:

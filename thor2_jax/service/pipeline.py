@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -39,7 +38,7 @@ from thor2_jax.service.problem import RequestError, deadline_exceeded, field_err
 from thor2_jax.service.schemas import WhyAnswer
 from thor2_jax.service.settings import Settings
 
-__all__ = ["AdmittedRequest", "Service", "gallery_errors"]
+__all__ = ["AdmittedRequest", "Service"]
 
 log = logging.getLogger(__name__)
 
@@ -56,32 +55,6 @@ COMPILER_THREAD = "compile-explanations"
 
 LOCK_SHARE = 0.8
 """Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
-
-
-@contextlib.contextmanager
-def gallery_errors(directory: Path | None, refused: int, field: str) -> Iterator[None]:
-    """Turn the errors of a gallery into error responses; they do not say where it lies.
-
-    Args:
-        directory: directory of the gallery.
-        refused: status for a change that the gallery refuses.
-        field: field of the request that is then concerned.
-
-    Raises:
-        RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it cannot be
-            written, `refused` for other errors. The gallery is as before.
-    """
-    try:
-        yield
-    except (GalleryError, OSError) as error:
-        log.error("%s", error)
-        if isinstance(error, OSError):
-            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
-            raise RequestError(507, None, message) from None
-        message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
-        raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
-    except InputError as error:
-        raise RequestError(refused, field, f"{error}.") from None
 
 
 class AdmittedRequest:
@@ -301,10 +274,10 @@ class Service:
         `extend` and `replace` of `ObjectGallery.add`.
 
         Raises:
-            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
+            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `change` and
                 `prepare_view`. Nothing is enrolled.
         """
-        with gallery_errors(self.engine.objects.directory, 409, "name"):
+        with self._gallery_errors(409, "name"):
             self.engine.objects.refresh()
             self.engine.objects.check(name, **flags)
         prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
@@ -323,20 +296,50 @@ class Service:
     ) -> ObjectGallery:
         """Change the gallery on disk in another thread, then read it again in this one, as other processes do.
 
+        Args:
+            change: changes the gallery, of which it gets a copy.
+            refused: status if the gallery refuses the change.
+            field: field of the request that is then concerned.
+            request: the request.
+
         Returns:
             The gallery after the change.
 
         Raises:
-            RequestError: as `gallery_errors`, of whose arguments `refused` and `field` are two.
+            RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it
+                cannot be written, `refused` for other errors. The gallery is as before.
         """
         with timed(request.seconds, "gallery"):
             async with self._gallery_lock:
                 copied = copy.copy(self.engine.objects)
                 copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
-                with gallery_errors(copied.directory, refused, field):
+                with self._gallery_errors(refused, field):
                     await asyncio.to_thread(change, copied)
         self.engine.refresh()
         return copied
+
+    @contextlib.contextmanager
+    def _gallery_errors(self, refused: int, field: str) -> Iterator[None]:
+        """Turn the errors of the gallery into those of `change`, which do not say where the gallery lies."""
+        try:
+            yield
+        except OSError as error:
+            log.error("%s", error)
+            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
+            raise RequestError(507, None, message) from None
+        except GalleryError as error:
+            log.error("%s", error)
+            directory = self.engine.objects.directory
+            message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
+            raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
+        except InputError as error:
+            raise RequestError(refused, field, f"{error}.") from None
+
+    def known_objects(self) -> ObjectGallery:
+        """Return the objects that may be answered, as they are on disk. Raises RequestError as `change`."""
+        with self._gallery_errors(500, "gallery"):
+            self.engine.objects.refresh()
+        return self.engine.objects
 
     async def _prepare(
         self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any

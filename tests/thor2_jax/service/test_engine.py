@@ -11,15 +11,14 @@ import pytest
 from helpers import SMALL_CONFIG, assert_same_answers, slow, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
-from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
-from thor2_jax.service import engine as service_engine
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.settings import Settings
@@ -30,9 +29,8 @@ BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
-    monkeypatch.setattr(service_engine, "MIN_POINTS_BUCKET", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     monkeypatch.setattr(estimate, "CAPACITY", 512)
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
 def write_run(folder: Path, trained: tuple[str, ...], record: dict[str, object]) -> Path:

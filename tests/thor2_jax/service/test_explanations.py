@@ -22,10 +22,10 @@ from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.errors import InputError
-from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
@@ -165,7 +165,7 @@ def test_why_returns_pictures(
     teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Almost all programs of an explanation are compiled before the first one."""
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     service = teaching_app.state.service
     service._compile_explanations(*service.engine.explanation_programs()).result(600)
     before = service.metrics.compilations._value.get()
