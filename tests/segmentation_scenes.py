@@ -1,13 +1,17 @@
-"""Synthetic frames with known instances: boxes, balls and coloured strips on a plane, by intersecting rays."""
+"""Synthetic frames with known instances: boxes, coloured strips and meshes on a table."""
 
 import dataclasses
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from training.rendering.ray_caster import Hits, RayCaster, pixel_rays
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(290.0, 290.0, 159.5, 119.5)
@@ -32,6 +36,29 @@ def camera_pose(tilt: float = 40.0, turn: float = 0.0, roll: float = 0.0) -> Rot
     return Rotation.from_euler("zxz", [turn, tilt, roll], degrees=True) * down
 
 
+def surface(mesh: trimesh.Trimesh, colors: ArrayLike) -> Any:
+    """Return what a ray caster needs of a mesh, with a colour for all faces or for each."""
+    of_faces = np.broadcast_to(np.asarray(colors, np.uint8), (len(mesh.faces), 3))
+    return SimpleNamespace(vertices=mesh.vertices, faces=mesh.faces, colors_at=lambda face, _: of_faces[face])
+
+
+def cuboid(low: ArrayLike, high: ArrayLike, color: ArrayLike) -> Any:
+    """Return the surface of a box between two corners."""
+    box = trimesh.creation.box(np.subtract(high, low))
+    box.apply_translation(np.add(low, high) / 2)
+    return surface(box, color)
+
+
+def cast(surfaces: Sequence[Any], rotation: Rotation, distance: float, camera: Intrinsics, size: Sequence[int]) -> Hits:
+    """Return what the pixels of a camera see that looks at the origin."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.as_matrix()
+    return RayCaster(surfaces).cast(-distance * pose[:3, 2], pixel_rays(camera, *size, pose))
+
+
+TABLE_TOP = cuboid((-20, -20, -1), (20, 20, 0), TABLE)
+
+
 def render(
     boxes: Sequence[Box],
     tilt: float = 40.0,
@@ -46,40 +73,22 @@ def render(
 
     Noise is that of inverse depth, per metre.
     """
-    rotation = camera_pose(tilt, turn, roll)
     scale = size[1] / WIDTH
     camera = Intrinsics(*(v * scale for v in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)))
-    row, column = np.mgrid[0 : size[0], 0 : size[1]]
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(size)], axis=-1)
-    directions = rays.reshape(-1, 3) @ rotation.as_matrix().T
-    origin = -distance * rotation.apply([0, 0, 1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = -origin[2] / directions[:, 2]
-        depth[~(depth > 0)] = np.inf
-        labels = np.zeros(len(depth), np.int32)
-        at = origin + depth[:, None] * directions
-        if not plane:
-            depth[:] = np.inf
-        for number, box in enumerate(boxes, start=1):
-            low = np.array([box.x - box.half[0], box.y - box.half[1], box.bottom])
-            high = np.array([box.x + box.half[0], box.y + box.half[1], box.bottom + box.height])
-            if box.height == 0:
-                inside = (at[:, :2] > low[:2]).all(axis=1) & (at[:, :2] < high[:2]).all(axis=1) & (labels == 0)
-                labels[inside] = number
-                continue
-            first, second = (low - origin) / directions, (high - origin) / directions
-            near, far = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
-            hit = (near < far) & (near > 0) & (near < depth)
-            depth[hit], labels[hit] = near[hit], number
-    colors = np.array([TABLE, *(box.color for box in boxes)], float)[labels]
+    surfaces = [TABLE_TOP] * plane
+    for box in boxes:
+        low = np.array([box.x - box.half[0], box.y - box.half[1], box.bottom])
+        surfaces.append(cuboid(low, low + [2 * box.half[0], 2 * box.half[1], max(box.height, 1e-5)], box.color))
+    hits = cast(surfaces, camera_pose(tilt, turn, roll), distance, camera, size)
+    is_hit = hits.mesh >= 0
     rng = np.random.default_rng(0)
-    colors += rng.normal(0, 2, colors.shape)
-    inverse = 1 / depth + rng.normal(0, noise, depth.shape)
-    metres = np.where(np.isfinite(depth) & (inverse > 0), 1 / inverse, 0)
+    colors = np.where(is_hit[:, None], hits.color, TABLE) + rng.normal(0, 2, hits.color.shape)
+    inverse = 1 / hits.distance.astype(float) + rng.normal(0, noise, is_hit.shape)
+    metres = np.where(is_hit & (inverse > 0), 1 / inverse, 0)
     return RGBDFrame(
         np.clip(colors, 0, 255).astype(np.uint8).reshape(*size, 3),
         np.rint(np.clip(metres, 0, 60) * 1000).astype(np.uint16).reshape(size),
-        labels.reshape(size),
+        (hits.mesh + (not plane)).clip(0).reshape(size),
         camera,
     )
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from thor2_jax.errors import InputError
 
-__all__ = ["BATCH_BUCKETS", "POINT_BUCKETS", "batch_bucket", "batch_points", "point_bucket"]
+__all__ = ["BATCH_BUCKETS", "MIN_BATCH_POINTS", "POINT_BUCKETS", "batch_bucket", "batch_points", "point_bucket"]
 
 POINT_BUCKETS = (512, 1024, 2048, 4096, 8192)
 """Padded numbers of points of a cloud."""
@@ -18,7 +18,8 @@ BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 """Padded numbers of clouds of a batch."""
 
 MIN_BATCH_POINTS = 2048
-"""Least padded number of points in batches of commands: fewer save a tenth of the time, and compile for seconds."""
+"""Least padded number of points in batches of commands and the service: fewer save a tenth of the time, and each size
+compiles for seconds."""
 
 
 def _smallest_bucket(buckets: tuple[int, ...], n: int, name: str, advice: str) -> int:
@@ -47,7 +48,7 @@ def batch_bucket(n_clouds: int) -> int:
 
 
 def batch_points(counts: Iterable[int]) -> int:
-    """Return the padded number of points for clouds with these numbers of points, in batches of a command.
+    """Return the padded number of points for clouds with these numbers of points, in commands and the service.
 
     It is at most the largest bucket; `PointClouds.pack` names the cloud that has more points.
     """

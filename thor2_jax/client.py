@@ -372,10 +372,11 @@ def _content(response: httpx.Response) -> bytes:
     """Return the body of an answer; raises ServiceError for one with an error status."""
     if response.is_success:
         return response.content
-    retry_after = response.headers.get("Retry-After")
+    retry_after = response.headers.get("Retry-After", "")
     try:
         problem = response.json()
         field, message = problem["field"], str(problem["message"])
     except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
         field, message = None, response.reason_phrase
-    raise ServiceError(response.status_code, field, message, None if retry_after is None else float(retry_after))
+    # Proxies may give a date.
+    raise ServiceError(response.status_code, field, message, float(retry_after) if retry_after.isdecimal() else None)

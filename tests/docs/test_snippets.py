@@ -21,9 +21,9 @@ from helpers import patches, random_clouds, run_thor2, tilted, untrained_run, wr
 from recording_files import table_frame
 
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax import recognizer as recognizer_module
 from thor2_jax.client import Client
-from thor2_jax.explanation import class_scores
 from thor2_jax.frames.frames import backproject
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings import realsense
@@ -101,7 +101,7 @@ def test_landing_page_and_first_tutorial(run: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.slow
 def test_explanation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     recognizer = thor2.Recognizer(untrained_run(("bowl", "mug")))
     names = run_blocks("docs/explain.md", 0, recognizer=recognizer, frame=FRAME)
     assert {names["explanation"].name, names["explanation"].runner_up} == {"bowl", "mug"}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_aligned_looks, describe_looks
@@ -34,9 +34,6 @@ Unit = Literal["log-odds", "similarity"]
 
 ROWS = 8
 """Variants of a cloud that are described in one call."""
-
-MIN_CAPACITY = 2048
-"""Least padded number of points: smaller clouds are hardly faster, and every further size takes long to compile."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +74,7 @@ class ClassScores:
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
-        capacity = padded_points(max((len(instance.points) for instance in instances), default=1))
+        capacity = batch_points(len(instance.points) for instance in instances)
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
             clouds = pack_instances(rows, ROWS, capacity)
@@ -116,14 +113,9 @@ class ClassScores:
         return np.concatenate(scores)
 
 
-def padded_points(n_points: int) -> int:
-    """Return the padded number of points of an instance with so many."""
-    return max(point_bucket(n_points), MIN_CAPACITY)
-
-
 def packed(instance: PreparedInstance) -> PointClouds:
     """Return an instance as a batch of one cloud, in metres."""
-    return pack_instances([instance], 1, padded_points(len(instance.points)))
+    return pack_instances([instance], 1, batch_points([len(instance.points)]))
 
 
 def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:

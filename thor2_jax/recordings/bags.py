@@ -93,7 +93,6 @@ class Bag:
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
         self.is_truncated = False
         self.notes: list[str] = []
-        self._reader: Any = None
 
     def __enter__(self) -> "Bag":
         """Open the recording, choose its topics and read the camera.
@@ -130,19 +129,16 @@ class Bag:
                 reader = Reader2(source)
                 self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
             reader.open()
+        with contextlib.ExitStack() as stack:
+            stack.callback(reader.close)
             self._reader = reader
-        try:
             self._choose()
-        except BaseException:
-            self.__exit__()
-            raise
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the recording."""
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
+        self._stack.close()
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their time stamps.

@@ -16,13 +16,24 @@ from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.model.classifier import THOR2
+from thor2_jax.model.fusion import fused_probabilities, with_temperature
+from thor2_jax.model.inference import Inference
+from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
 from thor2_jax.service.settings import MAX_EXPLAINED
 
-__all__ = ["adaptation_answer", "explained_frame", "instance_answer", "object_answers", "why_answer"]
+__all__ = [
+    "adaptation_answer",
+    "calibrated_confidence",
+    "explained_frame",
+    "instance_answer",
+    "object_answers",
+    "why_answer",
+]
 
 MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""
@@ -39,22 +50,14 @@ def instance_answer(recognition: Recognition) -> schemas.InstanceAnswer:
 
 def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
     """Return the JSON record of an explanation, with its main pictures and without timings."""
-    check = explanation.attributions.faithfulness
-    return schemas.WhyAnswer(
-        label=explanation.recognition.label,
-        name=explanation.recognition.name,
-        explained_name=explanation.name,
-        unit=explanation.scores.unit,
-        margin=check.margin,
-        loss_without_most_attributed_tenth=check.most_attributed,
-        mean_loss_without_random_tenth=check.random,
-        changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
-        pictures=[
-            schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
-            for p in main_pictures(explanation, frame)
-        ],
-        timings={},
-    )
+    record = explanation.as_json()
+    changes = [f"{change_text(change)}: {change.answer}" for change in explanation.changes]
+    pictures = [
+        schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
+        for p in main_pictures(explanation, frame)
+    ]
+    shown = {"changes": changes, "pictures": pictures, "timings": {}}
+    return schemas.WhyAnswer(**{**record, **record["faithfulness"], **shown})
 
 
 def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:
@@ -77,34 +80,57 @@ def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
 
 
 def explained_frame(
+    model: Model,
     prepared: PreparedRequest,
-    recognitions: Sequence[Recognition],
     results: Sequence[CloudResult],
-    calibrated_confidences: Sequence[float | None],
-    config: DescriptorConfig,
+    recognitions: Sequence[Recognition],
     timings: dict[str, float],
 ) -> schemas.ExplainedFrame:
     """Return the instances of a frame together with the clouds and descriptors behind their names.
 
     Args:
+        model: the model of the results.
         prepared: the decoded frame, with its label map.
-        recognitions: one per instance.
         results: one per usable instance, in the order of the instances.
-        calibrated_confidences: likewise, see `InferenceEngine.calibrated_confidences`.
-        config: configuration of the descriptors.
+        recognitions: one per instance.
         timings: stage -> milliseconds.
     """
     assert prepared.label_map is not None
-    remaining = iter(zip(results, calibrated_confidences, strict=True))
+    remaining = iter(results)
     instances: list[schemas.ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
         details = None
         if instance.reason is None:
-            result, confidence = next(remaining)
+            result = next(remaining)
             if len(instances) < MAX_EXPLAINED:
-                details = _details(instance, result, confidence, config)
+                confidence = calibrated_confidence(model, recognition, result.inference)
+                details = _details(instance, result, confidence, model.run.config)
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
+
+
+def calibrated_confidence(model: Model, recognition: Recognition, inference: Inference) -> float | None:
+    """Return the calibrated confidence of the most probable class of a cloud.
+
+    It is that of the answer if the run has a calibration, else the confidence after temperature scaling of both
+    classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
+    gallery, and with forgotten classes.
+
+    Args:
+        model: the model.
+        recognition: the answer for the cloud.
+        inference: the outputs of the model for it, without the axis of the batch.
+    """
+    if model.answers_by() != "classifiers" or model.union.hidden:
+        return None
+    if model.calibration is not None:
+        return recognition.confidence
+    temperatures = model.run.record.get("temperatures", {})
+    if not set(THOR2) <= set(temperatures):
+        return None
+    probabilities: dict[str, NDArray[np.float32]] = {name: inference.probabilities[name][None] for name in THOR2}
+    scaled = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
+    return float(fused_probabilities(scaled)[0, fused_probabilities(probabilities)[0].argmax()])
 
 
 def _details(

@@ -1,10 +1,12 @@
 """HTTP routes, the page at /, authentication and error responses."""
 
+import asyncio
 import contextlib
 import io
 import secrets
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,14 +24,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
-from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
+from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
-from thor2_jax.service.pipeline import AdmittedRequest, Service, gallery_errors
-from thor2_jax.service.preparation import timed
-from thor2_jax.service.problem import RequestError, error_responses
+from thor2_jax.service.pipeline import Service
+from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
 from thor2_jax.signals import handlers_replaced
@@ -136,17 +137,6 @@ def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
         return schemas.Readiness(status="ready", ready_workers=service.metrics.count_ready_workers(), workers=workers)
 
 
-@contextlib.asynccontextmanager
-async def _admitted_form(
-    service: Service, request: Request, form: dict[str, Any], seconds: float | None = None
-) -> AsyncIterator[tuple[AdmittedRequest, dict[str, bytes]]]:
-    """Admit a request as `Service.admit`, and read the fields of its form."""
-    async with service.admit(seconds) as admitted:
-        with timed(admitted.seconds, "upload"):
-            files = await read_form(request, form)
-        yield admitted, files
-
-
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     of_frame: dict[str, Any] = {"responses": FRAME_ERRORS, "openapi_extra": {"requestBody": schemas.FRAME_FORM}}
     if service.settings.adapt:  # A frame then changes how the next ones are recognized.
@@ -155,7 +145,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; one without labels is segmented."""
-        async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
+        async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
             prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
@@ -168,8 +158,10 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
-        async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
-            answer = await service.explain(files, admitted)
+        async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
+            recognized = await service.recognize(files, admitted, with_label_map=True)
+            model, timings = service.engine.model, admitted.milliseconds()
+            answer = await run_in_threadpool(explained_frame, model, *recognized, timings)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
 
@@ -180,7 +172,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         Until explanations of clouds of this size are compiled, which begins after the start, the status is 503.
         """
         seconds = max(service.settings.deadline, WHY_SECONDS)
-        async with _admitted_form(service, request, schemas.WHY_FORM, seconds) as (admitted, files):
+        async with service.admit(partial(read_form, request, schemas.WHY_FORM), seconds) as (admitted, files):
             return await service.why(files, parse_number(files, "instance"), admitted)
 
     arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
@@ -197,9 +189,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type not in (NPZ, "application/json"):
             raise RequestError(415, "body", f"The body must be application/json or {NPZ} (npz).")
-        async with service.admit() as admitted:
-            with timed(admitted.seconds, "upload"):
-                content = await read_body(request)
+        async with service.admit(partial(read_body, request)) as (admitted, content):
             results = await service.describe(content, content_type == NPZ, admitted)
             if content_type == NPZ:
                 return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
@@ -240,9 +230,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     @routes.get("/v1/objects", responses=error_responses(500))
     async def objects() -> schemas.ObjectsAnswer:
         """Return the objects that may be answered, with their views."""
-        with gallery_errors(service.engine.objects.directory, 500, "gallery"):
-            service.engine.objects.refresh()
-        known = service.engine.objects
+        known = service.known_objects()
         return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.gallery.generation)
 
 
@@ -264,7 +252,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
         A name that exists needs extend or replace.
         """
-        async with _admitted_form(service, request, schemas.ENROLMENT_FORM) as (admitted, files):
+        async with service.admit(partial(read_form, request, schemas.ENROLMENT_FORM)) as (admitted, files):
             name, label, flags = parse_enrolment(files)
             known = await service.enroll(files, name, label, flags, admitted)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
@@ -279,7 +267,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     )
     async def undo(request: Request) -> schemas.ChangeAnswer:
         """Take back the last change of the gallery, unless another one was made since."""
-        async with _admitted_form(service, request, schemas.UNDO_FORM) as (admitted, files):
+        async with service.admit(partial(read_form, request, schemas.UNDO_FORM)) as (admitted, files):
             generation = parse_number(files, "generation")
             known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
@@ -287,8 +275,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
         """Forget an object: its views are removed, and a trained class is never answered again."""
-        async with service.admit() as admitted:
-            admitted.seconds["upload"] = 0.0  # There is no body; a late answer gets status 504.
+        async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # There is no body.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
@@ -347,4 +334,5 @@ async def _on_error(_: Request, error: Exception) -> Response:
 
 
 def _problem_response(error: RequestError, headers: dict[str, str] | None = None) -> JSONResponse:
-    return JSONResponse(error.problem.model_dump(exclude_defaults=True), error.status, headers)
+    problem = Problem(field=error.field, message=error.message, further=error.further)
+    return JSONResponse(problem.model_dump(exclude_defaults=True), error.status, headers)

@@ -18,7 +18,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
-from thor2_jax.service.problem import RequestError, parse_fields
+from thor2_jax.service.problem import RequestError, field_errors, parse_fields
 from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import MAX_BODY, MAX_CLOUD_COORDINATE, MAX_CLOUDS
 
@@ -65,10 +65,8 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
 
 def check_instances(frame: RGBDFrame) -> None:
     """Raise RequestError (422) if the labels of a frame have more than `MAX_INSTANCES` instances."""
-    try:
+    with field_errors("labels"):
         count = len(frame.instances)
-    except InputError as error:
-        raise RequestError(422, "labels", f"{error}.") from None
     if count > MAX_INSTANCES:
         raise RequestError(422, "labels", f"labels has {count} instances; expected at most {MAX_INSTANCES}.")
 
@@ -77,10 +75,8 @@ def _decode_intrinsics(content: bytes) -> Intrinsics:
     if len(content) > MAX_INTRINSICS_BYTES:
         message = f"intrinsics has {len(content)} bytes; expected at most {MAX_INTRINSICS_BYTES}."
         raise RequestError(413, "intrinsics", message)
-    try:
+    with field_errors("intrinsics"):
         return parse_intrinsics(content)
-    except InputError as error:
-        raise RequestError(422, "intrinsics", f"{error}.") from None
 
 
 def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:

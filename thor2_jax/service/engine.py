@@ -6,7 +6,6 @@ Descriptors and class probabilities for batches of a few sizes are all compiled 
 import dataclasses
 import logging
 import queue
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
@@ -16,30 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.adaptation.estimate import Adaptation, OnlineAdaptation, adaptation_criterion
-from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.capacity import BATCH_BUCKETS, MIN_BATCH_POINTS, POINT_BUCKETS, batch_bucket, batch_points
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.class_scores import padded_points
 from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
-from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.recognizer import THOR2, Recognizer
+from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 
 log = logging.getLogger(__name__)
 
-MIN_POINTS_BUCKET, MIN_BATCH_BUCKET = 2048, 8
-"""Smallest shape of a batch. Smaller shapes run hardly faster, and each shape takes seconds to compile."""
-
+MIN_BATCH_BUCKET = 8
+"""Smallest padded number of clouds of a batch; smaller ones run hardly faster, and each takes seconds to compile."""
 
 ExplanationPrograms = tuple[int, bool]
 """Padded number of points, and kind of scores (`explained_kinds`) of what is compiled for explanations."""
@@ -68,27 +64,17 @@ Job = tuple[Sequence[PreparedInstance], Future[list[CloudResult]]]
 
 
 class Batcher:
-    """Combine the instances of several requests into batches and process them in one thread."""
+    """Process the instances of requests in one thread; those that arrive meanwhile share the next batches."""
 
-    def __init__(
-        self,
-        process_batch: Callable[[list[PreparedInstance]], list[CloudResult]],
-        count_expected: Callable[[], int],
-        max_batch: int,
-        window: float,
-    ) -> None:
+    def __init__(self, process_batch: Callable[[list[PreparedInstance]], list[CloudResult]], max_batch: int) -> None:
         """Start without requests.
 
         Args:
             process_batch: returns one result per instance, for at most `max_batch` instances.
-            count_expected: returns the number of current requests, including those that are not submitted yet.
             max_batch: maximum number of instances in a batch.
-            window: seconds for which an incomplete batch waits for expected requests.
         """
-        self._process_batch, self._count_expected = process_batch, count_expected
-        self._max_batch, self._window = max_batch, window
-        # A SimpleQueue of CPython 3.11 may wait for ever where its timeout passes before it begins to wait.
-        self._waiting: queue.Queue[Job] = queue.Queue()
+        self._process_batch, self._max_batch = process_batch, max_batch
+        self._waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
         self._device = ThreadPoolExecutor(1, thread_name_prefix="device")
 
     def submit(self, instances: Sequence[PreparedInstance]) -> Future[list[CloudResult]]:
@@ -105,19 +91,12 @@ class Batcher:
     def _process(self) -> None:
         """Process what waits, unless an earlier call has done so with its own batch."""
         jobs: list[Job] = []
-        free, window_end = self._max_batch, 0.0
-        while free > 0:
-            timeout = window_end - time.monotonic() if len(jobs) < self._count_expected() else 0.0
-            try:
-                job = self._waiting.get(timeout=max(0.0, timeout))
-            except queue.Empty:
-                break
-            if not jobs:
-                window_end = time.monotonic() + self._window
-            jobs.append(job)
-            free -= len(job[0])
-        jobs = [job for job in jobs if job[1].set_running_or_notify_cancel()]
-        instances = [instance for of_job, _ in jobs for instance in of_job]
+        instances: list[PreparedInstance] = []
+        while len(instances) < self._max_batch and not self._waiting.empty():
+            job = self._waiting.get()
+            if job[1].set_running_or_notify_cancel():
+                jobs.append(job)
+                instances += job[0]
         results: list[CloudResult] = []
         try:
             for first in range(0, len(instances), self._max_batch):
@@ -213,7 +192,7 @@ class InferenceEngine:
     def batch_shapes(self) -> list[tuple[int, int]]:
         """Every batch shape that `infer` can use, as (clouds, points)."""
         batches = [b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)]
-        return [(b, n) for n in POINT_BUCKETS if n >= MIN_POINTS_BUCKET for b in batches]
+        return [(b, n) for n in POINT_BUCKETS if n >= MIN_BATCH_POINTS for b in batches]
 
     def compile(self, n_clouds: int, n_points: int) -> None:
         """Compile the programs for one of `batch_shapes`."""
@@ -226,8 +205,8 @@ class InferenceEngine:
 
     def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
         """Describe and classify at most `max_batch` clouds."""
-        largest = max(len(instance.points) for instance in instances)
-        return self._infer(instances, _padded_batch(len(instances)), max(point_bucket(largest), MIN_POINTS_BUCKET))
+        n_points = batch_points(len(instance.points) for instance in instances)
+        return self._infer(instances, _padded_batch(len(instances)), n_points)
 
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
         clouds = pack_instances(instances, n_clouds, n_points)
@@ -257,28 +236,7 @@ class InferenceEngine:
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""
-        return [(padded_points(n_points), by_classifiers) for by_classifiers in explained_kinds(self.model)]
-
-    def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
-        """Return the calibrated confidence of the most probable class of each cloud.
-
-        It is the confidence itself if the run has a calibration, else the confidence after temperature scaling of both
-        classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
-        gallery, and with forgotten classes.
-        """
-        temperatures, model = self.run.record.get("temperatures", {}), self.model
-        if not results or model.answers_by() != "classifiers" or self.objects.gallery.hidden:
-            return [None] * len(results)
-        probabilities: dict[str, NDArray[np.float32]] = {
-            name: np.stack([r.inference.probabilities[name] for r in results]) for name in model.classifiers.default
-        }
-        if model.calibration is not None:
-            return [float(p) for p in model.fused(probabilities).max(axis=1)]
-        if not set(THOR2) <= set(temperatures):
-            return [None] * len(results)
-        index = fused_probabilities({name: probabilities[name] for name in THOR2}).argmax(axis=1)
-        calibrated = fused_probabilities({n: with_temperature(probabilities[n], temperatures[n]) for n in THOR2})
-        return [float(p) for p in calibrated[np.arange(len(results)), index]]
+        return [(batch_points([n_points]), by_classifiers) for by_classifiers in explained_kinds(self.model)]
 
 
 def _load(settings: Settings) -> Recognizer:

@@ -9,9 +9,8 @@ from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
-from thor2_jax.service.problem import RequestError, parse_fields
+from thor2_jax.service.problem import RequestError, field_errors, parse_fields
 from thor2_jax.service.schemas import FORM
 from thor2_jax.service.settings import MAX_BODY
 
@@ -95,11 +94,9 @@ def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]
 
 
 def _parse_name(content: bytes) -> str:
-    try:
+    with field_errors("name"):
         # A valid name has at most 4000 bytes; decoding and quoting all of a long one would take time.
         return check_name(content[:4004].decode(errors="surrogateescape"))
-    except InputError as error:
-        raise RequestError(422, "name", f"{error}.") from None
 
 
 def _parse_flag(fields: dict[str, bytes], name: str) -> bool:

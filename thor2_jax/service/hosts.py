@@ -1,18 +1,63 @@
-"""Names under which a local server may be addressed.
+"""What the service and the live view have in common as local servers: addresses, names of the host, headers of pages.
 
 A web page can give its own name the address of a local server (DNS rebinding), and is then of the same origin. Its
 requests still have that name in the header Host.
 """
 
+import contextlib
 import ipaddress
 import re
-from collections.abc import Iterable
+import socket
+from collections.abc import Iterable, Iterator
 
 from thor2_jax.errors import InputError
 
-__all__ = ["check_host_names", "is_allowed_host"]
+__all__ = ["check_host_names", "is_allowed_host", "listening", "page_headers"]
+
+BACKLOG = 2048
+"""Largest number of connections that wait to be accepted."""
 
 _NAME = re.compile(r"\[[0-9a-f:.]+\]|[a-z0-9_.-]+", re.ASCII | re.IGNORECASE)
+
+
+@contextlib.contextmanager
+def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
+    """Listen on an address; yield the socket and the URL of the server.
+
+    Args:
+        host: address to listen on.
+        port: port to listen on; 0 chooses a free one.
+
+    Raises:
+        InputError: the address cannot be used.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        listener = socket.create_server((host, port), family=family, backlog=BACKLOG)
+    except OSError as error:
+        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
+        raise InputError(message) from None
+    with listener:
+        url_host = f"[{host}]" if ":" in host else host
+        yield listener, f"http://{url_host}:{listener.getsockname()[1]}"
+
+
+def page_headers(images: str, cache: str) -> dict[str, str]:
+    """Return the headers of all answers of a server with a page.
+
+    The page loads from and connects to its own server only, has no inline code and cannot be framed.
+
+    Args:
+        images: sources of images, as in a Content-Security-Policy.
+        cache: value of Cache-Control.
+    """
+    return {
+        "Content-Security-Policy": f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {images}; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": cache,
+    }
 
 
 def check_host_names(names: Iterable[str]) -> None:

@@ -7,10 +7,9 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -24,7 +23,7 @@ from thor2_jax.gallery.gallery import CompactClouds
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.service.answers import explained_frame, why_answer
+from thor2_jax.service.answers import why_answer
 from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
@@ -35,13 +34,15 @@ from thor2_jax.service.preparation import (
     prepare_view,
     timed,
 )
-from thor2_jax.service.problem import RequestError, deadline_exceeded
-from thor2_jax.service.schemas import ExplainedFrame, WhyAnswer
+from thor2_jax.service.problem import RequestError, deadline_exceeded, field_errors
+from thor2_jax.service.schemas import WhyAnswer
 from thor2_jax.service.settings import Settings
 
-__all__ = ["AdmittedRequest", "Service", "gallery_errors"]
+__all__ = ["AdmittedRequest", "Service"]
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 WHY_RETRY_SECONDS = 3
 """Value of Retry-After until explanations are compiled."""
@@ -54,32 +55,6 @@ COMPILER_THREAD = "compile-explanations"
 
 LOCK_SHARE = 0.8
 """Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
-
-
-@contextlib.contextmanager
-def gallery_errors(directory: Path | None, refused: int, field: str) -> Iterator[None]:
-    """Turn the errors of a gallery into error responses; they do not say where it lies.
-
-    Args:
-        directory: directory of the gallery.
-        refused: status for a change that the gallery refuses.
-        field: field of the request that is then concerned.
-
-    Raises:
-        RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it cannot be
-            written, `refused` for other errors. The gallery is as before.
-    """
-    try:
-        yield
-    except (GalleryError, OSError) as error:
-        log.error("%s", error)
-        if isinstance(error, OSError):
-            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
-            raise RequestError(507, None, message) from None
-        message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
-        raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
-    except InputError as error:
-        raise RequestError(refused, field, f"{error}.") from None
 
 
 class AdmittedRequest:
@@ -124,7 +99,7 @@ class Service:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
         settings = self.settings
         self._pool = PreparationPool(settings.processes, settings.segmenter)
-        self._batcher = Batcher(self._process_batch, lambda: self._in_progress, settings.max_batch, settings.window)
+        self._batcher = Batcher(self._process_batch, settings.max_batch)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
@@ -205,15 +180,18 @@ class Service:
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
-    async def admit(self, seconds: float | None = None) -> AsyncIterator[AdmittedRequest]:
-        """Admit a request for the duration of the context.
+    async def admit(
+        self, read_body: Callable[[], Awaitable[T]], seconds: float | None = None
+    ) -> AsyncIterator[tuple[AdmittedRequest, T]]:
+        """Admit a request for the duration of the context; yield it with its body.
 
         Args:
+            read_body: waits for the body of the request; it is called only if the request is admitted.
             seconds: time until its deadline; by default that of the settings.
 
         Raises:
-            RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
-                has not arrived and 504 otherwise.
+            RequestError: 503 if the service is not ready, 429 if the queue is full, or as `read_body`; at the deadline,
+                408 if the body has not arrived and 504 otherwise.
         """
         self.check_ready()
         if self._in_progress >= self.settings.queue:
@@ -225,7 +203,9 @@ class Service:
         self.metrics.in_progress.inc()
         try:
             async with asyncio.timeout(seconds):
-                yield request
+                with timed(request.seconds, "upload"):
+                    body = await read_body()
+                yield request, body
         except TimeoutError:
             if "upload" in request.seconds:
                 raise deadline_exceeded() from None
@@ -255,13 +235,6 @@ class Service:
         recognitions = self.engine.recognize(corrected, results)
         return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
-    async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
-        """Recognize a frame and return the evidence as well. Raises RequestError."""
-        prepared, results, recognitions = await self.recognize(files, request, with_label_map=True)
-        confidences, config = self.engine.calibrated_confidences(results), self.engine.run.config
-        arguments = prepared, recognitions, results, confidences, config, request.milliseconds()
-        return await asyncio.to_thread(explained_frame, *arguments)
-
     async def why(self, files: dict[str, bytes], label: int, request: AdmittedRequest) -> WhyAnswer:
         """Explain the answer for one instance of a frame, one request after the other.
 
@@ -283,10 +256,8 @@ class Service:
             return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
         with timed(request.seconds, "explain"):
-            try:
+            with field_errors("instance"):
                 answer = await asyncio.wrap_future(self._explainer.submit(explained))
-            except InputError as error:
-                raise RequestError(422, "instance", f"{error}.") from None
         return answer.model_copy(update={"timings": request.milliseconds()})
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
@@ -303,10 +274,10 @@ class Service:
         `extend` and `replace` of `ObjectGallery.add`.
 
         Raises:
-            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
+            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `change` and
                 `prepare_view`. Nothing is enrolled.
         """
-        with gallery_errors(self.engine.objects.directory, 409, "name"):
+        with self._gallery_errors(409, "name"):
             self.engine.objects.refresh()
             self.engine.objects.check(name, **flags)
         prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
@@ -325,20 +296,50 @@ class Service:
     ) -> ObjectGallery:
         """Change the gallery on disk in another thread, then read it again in this one, as other processes do.
 
+        Args:
+            change: changes the gallery, of which it gets a copy.
+            refused: status if the gallery refuses the change.
+            field: field of the request that is then concerned.
+            request: the request.
+
         Returns:
             The gallery after the change.
 
         Raises:
-            RequestError: as `gallery_errors`, of whose arguments `refused` and `field` are two.
+            RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it
+                cannot be written, `refused` for other errors. The gallery is as before.
         """
         with timed(request.seconds, "gallery"):
             async with self._gallery_lock:
                 copied = copy.copy(self.engine.objects)
                 copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
-                with gallery_errors(copied.directory, refused, field):
+                with self._gallery_errors(refused, field):
                     await asyncio.to_thread(change, copied)
         self.engine.refresh()
         return copied
+
+    @contextlib.contextmanager
+    def _gallery_errors(self, refused: int, field: str) -> Iterator[None]:
+        """Turn the errors of the gallery into those of `change`, which do not say where the gallery lies."""
+        try:
+            yield
+        except OSError as error:
+            log.error("%s", error)
+            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
+            raise RequestError(507, None, message) from None
+        except GalleryError as error:
+            log.error("%s", error)
+            directory = self.engine.objects.directory
+            message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
+            raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
+        except InputError as error:
+            raise RequestError(refused, field, f"{error}.") from None
+
+    def known_objects(self) -> ObjectGallery:
+        """Return the objects that may be answered, as they are on disk. Raises RequestError as `change`."""
+        with self._gallery_errors(500, "gallery"):
+            self.engine.objects.refresh()
+        return self.engine.objects
 
     async def _prepare(
         self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any

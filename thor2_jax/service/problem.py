@@ -1,13 +1,23 @@
 """Errors of the API: an HTTP status and a JSON body that names the field concerned."""
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, Field
 
+from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 
-__all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_responses", "parse_fields"]
+__all__ = [
+    "FieldError",
+    "Problem",
+    "RequestError",
+    "deadline_exceeded",
+    "error_responses",
+    "field_errors",
+    "parse_fields",
+]
 
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
@@ -50,16 +60,19 @@ class RequestError(Exception):
 
     retry_after = 1
 
-    def __init__(self, status: int, field: str | None, message: str, *further: tuple[str | None, str]) -> None:
+    def __init__(self, status: int, field: str | None, message: str, *further: FieldError) -> None:
         super().__init__(status, field, message, *further)
         self.status, self.field, self.message = status, field, escape_characters(message)
-        self.further = further
+        self.further = list(further)
 
-    @property
-    def problem(self) -> Problem:
-        """The body of the response."""
-        further = [FieldError(field=field, message=message) for field, message in self.further]
-        return Problem(field=self.field, message=self.message, further=further)
+
+@contextlib.contextmanager
+def field_errors(field: str) -> Iterator[None]:
+    """Turn an InputError into a RequestError (422) about a field."""
+    try:
+        yield
+    except InputError as error:
+        raise RequestError(422, field, f"{error}.") from None
 
 
 def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
@@ -76,7 +89,7 @@ def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
             errors.append(error)
     if errors:
         first, *others = errors
-        further = [(error.field, error.message) for error in others]
+        further = [FieldError(field=error.field, message=error.message) for error in others]
         raise RequestError(first.status, first.field, first.message, *further)
     return values
 

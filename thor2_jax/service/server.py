@@ -12,7 +12,6 @@ import logging
 import multiprocessing
 import os
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -24,25 +23,15 @@ from uvicorn.config import LOGGING_CONFIG
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
 
-from thor2_jax.errors import InputError
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.hosts import listening, page_headers
 from thor2_jax.service.settings import Settings
 from thor2_jax.signals import ended_by_signals, signals_blocked
 
 __all__ = ["TimedConnection", "serve"]
 
 log = logging.getLogger(__name__)
-
-HEADERS = {
-    # The page loads from and connects to its own server only, has no inline code and cannot be framed.
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # Browsers revalidate each file of the page and transfer it only if it changed.
-}
-"""Headers of all answers."""
 
 HEAD_SECONDS = 5.0
 """Time limit for a complete request head, counted from the connection, the previous answer and its own first byte."""
@@ -78,20 +67,13 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         ws="none",
         access_log=False,
         server_header=False,
-        headers=list(HEADERS.items()),
+        # Browsers revalidate each file of the page and transfer it only if it changed.
+        headers=list(page_headers("'self'", "no-cache").items()),
         log_config=log_config,
         timeout_graceful_shutdown=int(settings.deadline) + 5,
         timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
     )
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        server = socket.create_server((host, port), family=family, backlog=config.backlog)
-    except OSError as error:
-        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
-        raise InputError(message) from None
-    with server as listener:
-        url_host = f"[{host}]" if ":" in host else host
-        url = f"http://{url_host}:{listener.getsockname()[1]}"
+    with listening(host, port) as (listener, url):
         if workers == 1:
             with ended_by_signals():
                 config.load()

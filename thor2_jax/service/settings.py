@@ -42,7 +42,6 @@ class Settings:
         queue: maximum number of requests in progress; further requests receive status 429.
         deadline: seconds from the arrival of a request to its answer; a later answer becomes status 504.
         max_batch: maximum batch size, one of `capacity.BATCH_BUCKETS`.
-        window: seconds for which a batch waits for the instances of requests in progress.
         processes: number of processes that decode images and compute clouds.
         unknown_below: confidence below which an object is unknown, as in `Recognizer`; None is the run's own.
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
@@ -63,7 +62,6 @@ class Settings:
     queue: int = 32
     deadline: float = 5.0
     max_batch: int = 32
-    window: float = 0.01
     processes: int = 2
     unknown_below: float | None = None
     cache: Path | None = None

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -22,9 +21,11 @@ from thor2_jax.testing.comparing import (
     embedding_rounding,
     image_lipschitz,
     image_rounding,
-    map_points,
+    joined,
+    taken,
     with_points,
 )
+from thor2_jax.testing.laws import Describe
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 
 __all__ = [
@@ -39,8 +40,6 @@ __all__ = [
     "moved_within_strips",
     "reference_descriptor",
 ]
-
-Describe = Callable[[PointClouds], Descriptors]
 
 
 class Reference(NamedTuple):
@@ -175,8 +174,8 @@ def assert_embedding_additive(describe: Describe, first: PointClouds, second: Po
         first: clouds that are at most half full.
         second: as many clouds of the same capacity, at most half full.
     """
-    half = first.mask.shape[1] // 2
-    union = map_points(lambda a, b: jnp.concatenate([a[:, :half], b[:, :half]], axis=1), first, second)
+    half = np.arange(first.mask.shape[1] // 2)
+    union = joined(taken(first, half), taken(second, half))
     a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, union))
     assert_within("embeddings", a + b, both, 2 * embedding_rounding(both.shape[-2]) * both)
 

@@ -95,9 +95,9 @@ class LiveView:
         else:
             milliseconds = 1000 * (time.perf_counter() - start)
             detections = sorted(detections_of(frame, recognitions), key=_order)
-            paints = [_paint(one.recognition, number) for number, one in enumerate(detections)]
-            values["objects"] = [_object(one, paint) for one, paint in zip(detections, paints, strict=True)]
-            self._last = {**values, "milliseconds": milliseconds, "image": _picture(frame, detections, paints)}
+            annotations = [_annotation(one.recognition, number) for number, one in enumerate(detections)]
+            values["objects"] = [_object(one, note.paint) for one, note in zip(detections, annotations, strict=True)]
+            self._last = {**values, "milliseconds": milliseconds, "image": _picture(frame, annotations)}
             self.n_frames += 1
         self._times.append(time.perf_counter())
         steps = len(self._times) - 1
@@ -113,10 +113,12 @@ def _order(detection: Detection) -> tuple[bool, int]:
     return answer.name is None, answer.label if track is None else track
 
 
-def _paint(answer: Recognition, number: int) -> Paint:
-    """Return the colour of an instance, the same in all frames of a track."""
+def _annotation(answer: Recognition, number: int) -> Annotation:
+    """Return the name and the colour of an instance, which is the same in all frames of a track."""
+    if answer.name is None:
+        return Annotation(answer.label, UNRECOGNIZED, "unknown")
     track = getattr(answer, "track", None)
-    return UNRECOGNIZED if answer.name is None else COLORS[(number if track is None else track - 1) % len(COLORS)]
+    return Annotation(answer.label, COLORS[(number if track is None else track - 1) % len(COLORS)], answer.name)
 
 
 def _object(detection: Detection, paint: Paint) -> dict[str, Any]:
@@ -128,11 +130,8 @@ def _object(detection: Detection, paint: Paint) -> dict[str, Any]:
     }
 
 
-def _picture(frame: RGBDFrame, detections: Sequence[Detection], paints: Sequence[Paint]) -> str:
-    annotations = [
-        Annotation(one.recognition.label, paint, one.recognition.name or "unknown")
-        for one, paint in zip(detections, paints, strict=True)
-    ]
+def _picture(frame: RGBDFrame, annotations: Sequence[Annotation]) -> str:
+    """Return the frame with its annotations, JPEG in base64."""
     stream = io.BytesIO()
     draw_instances(frame.color, frame.label_image, annotations).save(stream, "JPEG", quality=_JPEG_QUALITY)
     return base64.b64encode(stream.getvalue()).decode("ascii")

@@ -12,8 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
-from thor2_jax.service.hosts import check_host_names, is_allowed_host
+from thor2_jax.service.hosts import check_host_names, is_allowed_host, listening, page_headers
 
 __all__ = ["Broadcast", "serve_live"]
 
@@ -29,13 +28,7 @@ _FILES = {
 }
 """Path -> file and content type."""
 
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
+_HEADERS = page_headers("'self' data:", "no-store")
 
 KEEP_ALIVE = 2.0
 """Seconds without a message after which a comment is sent, so that a closed connection is noticed."""
@@ -68,11 +61,11 @@ class Broadcast:
 
 
 class _Server(ThreadingHTTPServer):
-    def __init__(self, address: tuple[str, int], broadcast: Broadcast, allow_host: Sequence[str]) -> None:
-        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        self.broadcast, self.is_stopping = broadcast, threading.Event()
-        self.allow_host = (*allow_host, address[0])
-        super().__init__(address, _Handler)
+    def __init__(self, listener: socket.socket, broadcast: Broadcast, allow_host: Sequence[str]) -> None:
+        super().__init__(listener.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listener
+        self.broadcast, self.allow_host, self.is_stopping = broadcast, allow_host, threading.Event()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore what goes wrong with a single connection: the browser has closed it."""
@@ -138,20 +131,12 @@ def serve_live(
         InputError: the address cannot be used, or a name is none.
     """
     check_host_names(allow_host)
-    try:
-        server = _Server((host, port), broadcast, allow_host)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"port is {port} and host {host}, which cannot be used ({reason}); choose another one"
-        ) from None
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
-    thread.start()
-    shown = f"[{host}]" if ":" in host else host
-    try:
-        yield f"http://{shown}:{server.server_address[1]}"
-    finally:
-        server.is_stopping.set()
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with listening(host, port) as (listener, url), _Server(listener, broadcast, (*allow_host, host)) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+        thread.start()
+        try:
+            yield url
+        finally:
+            server.is_stopping.set()
+            server.shutdown()
+            thread.join()

@@ -6,6 +6,7 @@ only the first run of a command compiles; JAX_COMPILATION_CACHE_DIR takes preced
 """
 
 import contextlib
+import functools
 import gc
 import itertools
 import os
@@ -15,10 +16,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from types import FrameType
-from typing import Annotated, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 from rich import progress
@@ -153,20 +153,22 @@ def thor2(
     show_help(context)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Handle Ctrl-C as Python does, but not in JAX's callback of the garbage collection, where exceptions get lost."""
-    while frame is not None and frame.f_code.co_name != "_xla_gc_callback":
-        frame = frame.f_back  # of this function, too, which a second signal may interrupt
-    if frame is None:
-        raise KeyboardInterrupt
-    threading.Timer(0.01, os.kill, [os.getpid(), number]).start()
+def _repeat_interrupt(report: Callable[[Any], Any], lost: Any) -> None:
+    """Send Ctrl-C again if its exception was lost; `report` other lost exceptions.
+
+    What finalizers and callbacks of the garbage collection raise, JAX's among them, is ignored, and Python only calls
+    `sys.unraisablehook`.
+    """
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        threading.Timer(0.01, os.kill, [os.getpid(), signal.SIGINT]).start()
+    else:
+        report(lost)
 
 
 def main() -> None:
     """Run the command line (entry point of the console script)."""
-    handler = signal.getsignal(signal.SIGINT)
-    if handler is signal.default_int_handler:  # Background jobs ignore it.
-        signal.signal(signal.SIGINT, _interrupt)
+    report = sys.unraisablehook
+    sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:
         _check_not_empty(sys.argv[1:])
         enable_compilation_cache()
@@ -192,7 +194,7 @@ def main() -> None:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")
     finally:
-        signal.signal(signal.SIGINT, handler)
+        sys.unraisablehook = report
     raise SystemExit(status)
 
 

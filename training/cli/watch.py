@@ -46,7 +46,7 @@ def watch(
     A bag plays at the speed at which it was recorded; frames for which there is no time are left out. All frames of a
     folder are shown.
     """
-    # The handler of `main` raises KeyboardInterrupt where JAX does not ignore it.
+    # `main` repeats a KeyboardInterrupt that is lost in a finalizer or in a callback of JAX.
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
         from thor2_jax.frames.frames import RecordedFrame
         from thor2_jax.recordings.bags import Bag

@@ -13,10 +13,11 @@ from scipy.special import logit
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.descriptor.slicing import region_sets
-from thor2_jax.explanation import attributions, class_scores
+from thor2_jax.explanation import attributions
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
@@ -68,7 +69,7 @@ def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig 
 
 @pytest.fixture(autouse=True)
 def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
 
 
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])

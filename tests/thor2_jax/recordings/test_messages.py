@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import encode_image
+from helpers import assert_refused, encode_image
 from recording_files import compressed, compressed_depth, image
 
-from thor2_jax.errors import InputError
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind
 
 RNG = np.random.default_rng(0)
@@ -49,8 +48,7 @@ def test_raw_images_of_too_many_pixels(encoding: str, read: Callable[[Any], Any]
     message.data = np.zeros(message.step * message.height, np.uint8)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="8192 x 8193 pixels; expected at most"):
-            read(message)
+        assert_refused("8192 x 8193 pixels; expected at most", read, message)
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
@@ -103,5 +101,4 @@ def resized(**fields: int) -> Any:
     ],
 )
 def test_other_images_are_refused(read: Any, message: Any) -> None:
-    with pytest.raises(InputError, match="expected"):
-        read(message)
+    assert_refused("expected", read, message)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import assert_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.realsense import RealSenseCamera
@@ -15,8 +16,7 @@ WIDTH, HEIGHT = 64, 48
 
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=r"\.\[realsense\]"), RealSenseCamera():
-        pass
+    assert_refused(r"\.\[realsense\]", RealSenseCamera().__enter__)
 
 
 @pytest.fixture
@@ -99,5 +99,4 @@ def test_frames_of_the_software_device(camera: SoftwareCamera) -> None:
 def test_no_camera_is_connected(rs: Any) -> None:
     if len(rs.context().query_devices()):
         pytest.skip("a RealSense camera is connected")
-    with pytest.raises(InputError, match="no camera can be started"), RealSenseCamera():
-        pass
+    assert_refused("no camera can be started", RealSenseCamera().__enter__)

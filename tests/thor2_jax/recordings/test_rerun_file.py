@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import assert_refused
 from recording_files import table_frame
 
-from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition, detections_of
 from thor2_jax.recordings.rerun_file import RerunFile
 from thor2_jax.segmentation.segmenters import segmented
@@ -64,13 +64,10 @@ def test_files_of_frames_without_instances_and_of_no_frames(reader: Any, tmp_pat
 def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     users = tmp_path / "a.rrd"
     users.write_bytes(b"RRF2 another program")
-    with pytest.raises(InputError, match=r"rerun is .*a\.rrd"):
-        RerunFile(users)
+    assert_refused(r"rerun is .*a\.rrd", RerunFile, users)
     assert users.read_bytes() == b"RRF2 another program"
-    with pytest.raises(InputError, match=r"\.rrd"):
-        RerunFile(tmp_path / "a.mcap")
+    assert_refused(r"\.rrd", RerunFile, tmp_path / "a.mcap")
     with pytest.raises(OSError, match="No such file"):
         RerunFile(tmp_path / "none" / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"\.\[rerun\]"):
-        RerunFile(tmp_path / "b.rrd")
+    assert_refused(r"\.\[rerun\]", RerunFile, tmp_path / "b.rrd")

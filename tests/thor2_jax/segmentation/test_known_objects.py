@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from segmentation_scenes import Box, best_overlaps, render
 
-from tests.segmentation_scenes import Box, best_overlaps, render
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from thor2_jax.segmentation.known_objects import Answer, segment_known
 

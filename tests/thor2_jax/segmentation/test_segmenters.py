@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import assert_refused
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation import segmenters
 from thor2_jax.segmentation.segmenters import ENTRY_POINTS, load_segmenter, segment, segmenter_names
@@ -54,17 +54,14 @@ def test_a_segmenter_of_another_package(offer: Callable[[str, str], None]) -> No
         np.testing.assert_array_equal(segment(FRAME, segmenter), expected)
         np.testing.assert_array_equal(thor2.segmented(FRAME, segmenter).label_image, expected)
     assert FRAME.labels is not None and FRAME.labels.all()
-    with pytest.raises(InputError, match=r"^segmenter is 'sam'; expected one of table, halves, .*" + ENTRY_POINTS):
-        segment(FRAME, "sam")
-    with pytest.raises(InputError, match="^segmenter is 'model', which only recognize and explain take"):
-        load_segmenter("model")
+    assert_refused(r"^segmenter is 'sam'; expected one of table, halves, .*" + ENTRY_POINTS, segment, FRAME, "sam")
+    assert_refused("^segmenter is 'model', which only recognize and explain take", load_segmenter, "model")
 
 
 @pytest.mark.parametrize("value", ["no_such_package_anywhere:f", "wrapper:no_such_function", "wrapper:FRAME"])
 def test_an_entry_point_that_is_no_function(offer: Callable[[str, str], None], value: str) -> None:
     offer("broken", value)
-    with pytest.raises(InputError, match=rf"^segmenter is 'broken'; {value} "):
-        load_segmenter("broken")
+    assert_refused(rf"^segmenter is 'broken'; {value} ", load_segmenter, "broken")
 
 
 def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,8 +69,7 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
         if name.startswith("thor2_jax.segmentation.") and "segmenters" not in name:
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(InputError, match=r"^segmenter is 'table', which needs OpenCV .*\[segment\]"):
-        load_segmenter("table")
+    assert_refused(r"^segmenter is 'table', which needs OpenCV .*\[segment\]", load_segmenter, "table")
 
 
 @pytest.mark.parametrize(
@@ -87,13 +83,13 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )
 def test_labels_that_are_not_labels(result: Any, message: str) -> None:
-    with pytest.raises(InputError, match=rf"^segmenter <lambda> returned .*{message.removeprefix('returned ')}"):
-        segment(FRAME, lambda frame: result)
+    assert_refused(
+        rf"^segmenter <lambda> returned .*{message.removeprefix('returned ')}", segment, FRAME, lambda frame: result
+    )
 
 
 def test_a_segmenter_that_raises() -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
         raise RuntimeError("no weights\nin this folder")
 
-    with pytest.raises(InputError, match=r"^segmenter failing failed .*RuntimeError: no weights in this folder.*;"):
-        segment(FRAME, failing)
+    assert_refused(r"^segmenter failing failed .*RuntimeError: no weights in this folder.*;", segment, FRAME, failing)

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import json
 import re
+import socket
 import ssl
 import subprocess
 import sys
@@ -111,7 +112,7 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
 
 SERVE = """
 from thor2_jax.service import engine
-engine.POINT_BUCKETS = (engine.MIN_POINTS_BUCKET,)  # the tests send no larger clouds
+engine.POINT_BUCKETS = (engine.MIN_BATCH_POINTS,)  # the tests send no larger clouds
 from training.cli import main
 main()
 """
@@ -168,23 +169,27 @@ def teaching_app(teaching_run: Path, gallery: Path) -> FastAPI:
     return create_app(Settings(teaching_run, gallery=gallery, teach=True, **options))
 
 
-@pytest.fixture(scope="session")
-def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
-    """Serve it in a thread of this process, so that tests can replace functions; yield the URL."""
-    server = uvicorn.Server(uvicorn.Config(teaching_app, port=0, log_config=None, ws="none"))
-    thread = threading.Thread(target=server.run)
+@contextlib.contextmanager
+def served(app: Any, listening: socket.socket, **options: Any) -> Iterator[None]:
+    """Serve an application in a thread of this process."""
+    server = uvicorn.Server(uvicorn.Config(app, log_config=None, **options))
+    thread = threading.Thread(target=server.run, args=([listening],))
     thread.start()
     try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(engine, "POINT_BUCKETS", (engine.MIN_POINTS_BUCKET,))  # the tests send small clouds
-            while not server.started:
-                assert thread.is_alive()
-                time.sleep(0.01)
-            teaching_app.state.service.wait_until_ready()
-        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+        yield
     finally:
         server.should_exit = True
         thread.join()
+
+
+@pytest.fixture(scope="session")
+def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
+    """Serve it in this process, so that tests can replace functions; yield the URL."""
+    with socket.create_server(("127.0.0.1", 0)) as listening, served(teaching_app, listening, ws="none"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(engine, "POINT_BUCKETS", (engine.MIN_BATCH_POINTS,))  # the tests send small clouds
+            wait_until(lambda: teaching_app.state.service.state != "starting")
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
 
 
 def assert_conforms(document: Any, path: str, method: str, examples: int) -> None:

@@ -8,13 +8,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import assert_same_answers, encode_image, random_clouds
+from helpers import assert_refused, assert_same_answers, encode_image, random_clouds
 from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
-from thor2_jax.errors import InputError
 
 from .conftest import CLASSES
 
@@ -144,11 +143,20 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
         with pytest.raises(ConnectionError, match="gives no answer"):
             Client(wrong).model()
-    with pytest.raises(InputError, match="clouds"):
-        Client(url).describe([])
+    assert_refused("clouds", Client(url).describe, [])
     for labels in (np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)):
-        with pytest.raises(InputError, match=r"labels has .* from 0 to 65535"):
-            Client(url).recognize(color=b"", depth=b"", labels=labels, intrinsics=b"")
+        assert_refused(
+            r"labels has .* from 0 to 65535", Client(url).recognize, color=b"", depth=b"", labels=labels, intrinsics=b""
+        )
+
+
+@pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
+def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | None, monkeypatch: Any) -> None:
+    answer = httpx.Response(503, headers={"Retry-After": retry_after}, text="<html>")
+    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: answer)
+    with pytest.raises(ServiceError) as error:
+        Client("http://robot.local").model()
+    assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
 
 
 def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:

@@ -27,7 +27,7 @@ from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds
 from thor2_jax.service.problem import RequestError
-from thor2_jax.service.schemas import ExplainedFrame
+from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_BODY, Settings
 
 
@@ -49,7 +49,7 @@ class Device:
 
 def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     device = Device()
-    batcher = Batcher(device, lambda: 0, max_batch=4, window=0.0)
+    batcher = Batcher(device, max_batch=4)
     first = batcher.submit([1])
     assert device.called.wait(HANG)  # The device is now processing it.
     others = [batcher.submit(numbers) for numbers in ([2, 3], [4], [5, 6, 7, 8, 9, 10])]
@@ -59,22 +59,9 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
 
 
-def test_batch_waits_briefly_for_expected_jobs() -> None:
-    device = Device(10)
-    batcher = Batcher(device, lambda: 2, max_batch=4, window=HANG)
-    jobs = [batcher.submit([number]) for number in (1, 2)]
-    assert [job.result(HANG) for job in jobs] == [[2], [4]] and device.batches == [[1, 2]]
-    batcher.close()
-    batcher = Batcher(device, lambda: 2, max_batch=4, window=0.3)
-    start = time.monotonic()
-    assert batcher.submit([3]).result(HANG) == [6]
-    assert time.monotonic() - start > 0.25
-    batcher.close()
-
-
 def test_cancelled_and_failing_jobs_are_isolated() -> None:
     device = Device()
-    batcher = Batcher(device, lambda: 0, max_batch=1, window=0.0)
+    batcher = Batcher(device, max_batch=1)
     first = batcher.submit([1])
     assert device.called.wait(HANG)
     cancelled, failing, last = (batcher.submit([number]) for number in (3, 13, 5))
@@ -142,7 +129,7 @@ def frame_request(files: dict[str, bytes], *then: Callable[[httpx.Response], Non
     return send
 
 
-NOTHING = PreparedRequest([], {}), [], []
+NOTHING = PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
 
 
 @pytest.fixture
@@ -246,8 +233,8 @@ def test_pages_of_other_sites_do_not_adapt_the_service(
 ) -> None:
     app = create_app(Settings(teaching_run, adapt=adapt))
     monkeypatch.setattr(app.state.service, "state", "ready")
-    for name, answer in (("recognize", NOTHING), ("explain", ExplainedFrame.model_construct())):
-        monkeypatch.setattr(app.state.service, name, AsyncMock(return_value=answer))
+    monkeypatch.setattr(app.state.service, "recognize", AsyncMock(return_value=NOTHING))
+    for name in ("recognize", "explain"):
         for headers in ({"Sec-Fetch-Site": "cross-site"}, {"Origin": "http://other.example"}, {}):
             (response,) = calls(app, lambda c, n=name, h=headers: c.post(f"/v1/{n}", files=files, headers=h))
             assert response.status_code == (status if headers else 200)

@@ -11,13 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
-import uvicorn
 from processes import HANG
 from starlette.staticfiles import StaticFiles
 
 from thor2_jax.service import server as serving
 
-from .conftest import SAMPLE_INDEX
+from .conftest import SAMPLE_INDEX, served
 
 WORK = 0.5
 HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
@@ -38,21 +37,14 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
 @contextlib.contextmanager
 def serve(app: Any, *sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
     """Serve an application in a thread; yield its address, and connections that had sent something before it began."""
-    config = uvicorn.Config(app, loop="asyncio", http=serving.TimedConnection, lifespan="off", log_config=None)
     with contextlib.ExitStack() as stack:
         listening = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         address, connections = listening.getsockname(), []
         for content in sent:
             connections.append(stack.enter_context(socket.create_connection(address)))
             connections[-1].sendall(content)
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=server.run, args=([listening],))
-        thread.start()
-        try:
-            yield address, connections
-        finally:
-            server.should_exit = True
-            thread.join()
+        stack.enter_context(served(app, listening, loop="asyncio", http=serving.TimedConnection, lifespan="off"))
+        yield address, connections
 
 
 @pytest.fixture

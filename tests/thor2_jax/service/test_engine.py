@@ -11,16 +11,15 @@ import pytest
 from helpers import SMALL_CONFIG, assert_same_answers, slow, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
-from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
-from thor2_jax.service import engine as service_engine
-from thor2_jax.service.answers import adaptation_answer
+from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.settings import Settings
 
@@ -30,9 +29,8 @@ BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
-    monkeypatch.setattr(service_engine, "MIN_POINTS_BUCKET", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     monkeypatch.setattr(estimate, "CAPACITY", 512)
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
 def write_run(folder: Path, trained: tuple[str, ...], record: dict[str, object]) -> Path:
@@ -59,8 +57,9 @@ def test_the_engine_answers_as_the_recognizer(
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.model.names == (*trained, "tall", "wide")
     instances, results = inferred(engine, frame)
-    assert_same_answers(engine.recognize(instances, results), recognizer.recognize(frame), 1e-4)
-    assert engine.calibrated_confidences(results) == [None] * 3
+    recognitions = engine.recognize(instances, results)
+    assert_same_answers(recognitions, recognizer.recognize(frame), 1e-4)
+    assert [calibrated_confidence(engine.model, recognitions[0], one.inference) for one in results] == [None] * 3
     unusable = [instance for instance in instances if instance.reason is not None]
     assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
 
@@ -74,24 +73,25 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
     instances, results = inferred(engine, frame)
     recognizer = thor2.Recognizer.load(tmp_path / "run")
-    answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
-    assert_same_answers(answers, expected, 1e-4)
-    calibrated = engine.calibrated_confidences(results)
-    of_usable = [one.confidence for one in expected if one.confidence is not None]
-    assert len(of_usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}
-    assert calibrated == ([None] * len(results) if calibration is None else pytest.approx(of_usable, abs=1e-4))
+    answers = engine.recognize(instances, results)
+    assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
+    usable = [one for one in answers if one.confidence is not None]
+    assert len(usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}
+    for answer, result in zip(usable, results, strict=True):
+        expected = None if calibration is None else answer.confidence
+        assert calibrated_confidence(engine.model, answer, result.inference) == expected
     assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
 
 
 def test_confidences_use_the_temperatures_of_both_classifiers(run_dir: Path) -> None:
     rng = np.random.default_rng(0)
-    engine = InferenceEngine(Settings(run_dir))
-    alpha = np.full(len(engine.run.classes), 0.1)
+    model = thor2.Recognizer.load(run_dir).model
+    alpha = np.full(len(model.names), 0.1)
     probabilities = {name: rng.dirichlet(alpha).astype(np.float32) for name in ("tops", "tops2", "embedding")}
-    result = CloudResult(*[np.zeros(0, np.float32)] * 4, Inference(0, probabilities))
-    assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
-    engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
-    (confidence,) = engine.calibrated_confidences([result])
+    recognition, inference = thor2.Recognition(1, confidence=0.5), Inference(0, probabilities)
+    assert calibrated_confidence(model, recognition, inference) is None
+    model.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
+    confidence = calibrated_confidence(model, recognition, inference)
     logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
     expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
     best = (probabilities["tops"] * probabilities["tops2"]).argmax()

@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import encode_image
+from helpers import encode_image, untrained_run
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
@@ -22,10 +22,10 @@ from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax import capacity
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.errors import InputError
-from thor2_jax.explanation import class_scores
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
@@ -105,7 +105,8 @@ def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray) -> Any:
     instances = [PreparedInstance(k, aligned, colors, np.zeros(len(z), bool)) for k in range(count)]
     recognitions = [thor2.Recognition(label=k, name="a") for k in range(count)]
     prepared = PreparedRequest(instances, {}, LabelMap(width=1, height=1, labels=[0], lengths=[1]))
-    return explained_frame(prepared, recognitions, [result] * count, [None] * count, config, {})
+    run = untrained_run(("a",), (), config)
+    return explained_frame(Model.of_run(run), prepared, [result] * count, recognitions, {})
 
 
 def test_details_are_limited_to_the_first_instances() -> None:
@@ -164,7 +165,7 @@ def test_why_returns_pictures(
     teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Almost all programs of an explanation are compiled before the first one."""
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     service = teaching_app.state.service
     service._compile_explanations(*service.engine.explanation_programs()).result(600)
     before = service.metrics.compilations._value.get()

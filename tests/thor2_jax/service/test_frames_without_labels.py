@@ -6,21 +6,17 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from helpers import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
 from thor2_jax.segmentation.table import segment_table
 from thor2_jax.service import preparation
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import Settings
 
 Files = dict[str, bytes]
-
-
-def failing(frame: thor2.RGBDFrame) -> np.ndarray:
-    raise RuntimeError("no weights\nin this folder")
 
 
 def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
@@ -52,7 +48,6 @@ def test_a_frame_without_labels_is_segmented(
 @pytest.mark.parametrize(
     ("segmenter", "status", "words"),
     [
-        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
         (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
         (many, 422, "labels has 76799 instances"),
         (None, 422, "labels is missing"),
@@ -69,7 +64,6 @@ def test_without_labels_of_a_segmenter_the_request_fails(
 
 def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Settings(tmp_path).segmenter == "table"
-    with pytest.raises(InputError, match="segmenter is 'sam'; expected one of table"):
-        Settings(tmp_path, segmenter="sam")
+    assert_refused("segmenter is 'sam'; expected one of table", Settings, tmp_path, segmenter="sam")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert Settings(tmp_path).segmenter is None

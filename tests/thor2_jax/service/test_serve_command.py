@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import uvicorn
-from helpers import Command, finish_programs, start_program
+from helpers import Command, assert_refused, finish_programs, start_program
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.errors import InputError
@@ -76,8 +76,7 @@ def test_ctrl_c_while_the_model_is_loaded(run_dir: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(server, "InferenceEngine", load)
     monkeypatch.setattr(server, "create_app", load)
     for workers in (1, 2):
-        with pytest.raises(InputError, match="ends"):
-            server.serve(Settings(run_dir), port=0, workers=workers)
+        assert_refused("ends", server.serve, Settings(run_dir), port=0, workers=workers)
     assert actions == [signal.SIG_IGN if handler is signal.SIG_IGN else signal.SIG_DFL for handler in before] * 2
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 

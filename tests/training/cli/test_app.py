@@ -12,14 +12,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax  # noqa: F401  (its callback of the garbage collection)
 import pytest
-from helpers import Command, assert_refused, untrained_run, write_frame
+from helpers import Command, assert_refused, run_thor2, untrained_run, write_frame
 from processes import HANG
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
-from training.cli.app import _interrupt, enable_compilation_cache, finish, show_progress
+from training.cli.app import enable_compilation_cache, finish, show_progress
 from training.cli.options import FrameOptions
 from training.storage.jobs import numbered
 
@@ -143,26 +142,37 @@ import training.cli
     assert (done.returncode, done.stderr) == (130, "")
 
 
-def test_ctrl_c_in_a_callback_of_jax() -> None:
-    """JAX ignores exceptions there, so Ctrl-C takes effect after it."""
-    reached = []
+class Finalized:
+    """An object whose finalizer is interrupted."""
 
-    def _xla_gc_callback() -> None:
-        something_called()
-        reached.append(True)
-
-    def something_called() -> None:
+    def __del__(self) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    assert "_xla_gc_callback" in {callback.__name__ for callback in gc.callbacks}
-    previous = signal.signal(signal.SIGINT, _interrupt)
+
+def collect_garbage() -> None:
+    """Collect garbage, with a callback that is interrupted, as JAX's may be."""
+
+    def callback(*_: object) -> None:
+        gc.callbacks.remove(callback)
+        signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(callback)
+    gc.collect()
+
+
+@pytest.mark.parametrize("interrupted", [Finalized, collect_garbage])
+def test_ctrl_c_where_exceptions_are_ignored(interrupted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(**_: object) -> None:
+        interrupted()
+        time.sleep(HANG)
+
+    monkeypatch.setattr(sys.modules["training.cli.app"], "app", run)
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            _xla_gc_callback()
-            time.sleep(HANG)
+            run_thor2("demo")
     finally:
         signal.signal(signal.SIGINT, previous)
-    assert reached
 
 
 # Progress on a standard error that is not a terminal.

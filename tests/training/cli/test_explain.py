@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from helpers import Command, ParsedPage, full_disk, run_thor2, write_frame
 
+from thor2_jax import capacity
 from thor2_jax.errors import InputError
-from thor2_jax.explanation import class_scores
 from thor2_jax.recognizer import Recognizer
 from training.cli import options
 from training.frame_recognition import RecognizerArguments
@@ -18,7 +18,7 @@ from training.reports import explanation_page
 
 @pytest.fixture(autouse=True)
 def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
 
 
 @pytest.fixture
