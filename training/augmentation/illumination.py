@@ -111,18 +111,21 @@ class Registration:
         shifted: probability of a shift.
         shift: largest shift along rows and columns, in pixels of a real frame.
         blur: standard deviation of the blur of the colour image, in pixels of a real frame.
+        chroma: standard deviation of the further blur of colour differences, in pixels of a real frame; cameras send
+            them at half the resolution or less, and smooth them against noise.
     """
 
     shifted: float = 0.5
     shift: float = 10.0
     blur: Range = (0.0, 3.0)
+    chroma: Range = (0.0, 6.0)
 
 
 def misregistered(view: RenderedView, registration: Registration, rng: np.random.Generator) -> RenderedView:
     """Return the view with a blurred, shifted colour image; the background has one random colour."""
     seen = view.depth > 0
     scale = FRAME_PIXEL / pixel_width(view)
-    blur = rng.uniform(*registration.blur) * scale
+    blur, chroma = (rng.uniform(*drawn) * scale for drawn in (registration.blur, registration.chroma))
     shift = np.zeros(2, int)
     if rng.random() < registration.shifted:
         shift = np.rint(rng.uniform(-registration.shift, registration.shift, 2) * scale).astype(int)
@@ -132,6 +135,13 @@ def misregistered(view: RenderedView, registration: Registration, rng: np.random
         # Divided by the blurred mask, so that the object's border keeps its colour.
         weight = np.maximum(gaussian_filter(seen.astype(np.float32), blur), 1e-3)[..., None]
         color = gaussian_filter(color.astype(np.float32), (blur, blur, 0)) / weight
+        color = color.clip(0, 255).astype(np.uint8)
+    if chroma > 0.1:
+        # As the colour differences of video: the luma stays.
+        values = color.astype(np.float32)
+        luma = (values @ LUMA)[..., None]
+        weight = np.maximum(gaussian_filter(seen.astype(np.float32), chroma), 1e-3)[..., None]
+        color = luma + gaussian_filter((values - luma) * seen[..., None], (chroma, chroma, 0)) / weight
         color = color.clip(0, 255).astype(np.uint8)
     margin = int(abs(shift).max())
     (row, column), (height, width) = margin + shift, seen.shape

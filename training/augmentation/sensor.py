@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width, without
 from training.rendering.view_sphere import RenderedView
@@ -29,6 +30,10 @@ class Sensor:
         missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
         flying: share of the other edge pixels whose depth lies between the surface's and the background's.
         background: distance of the background behind the object, metres.
+        smooth: standard deviation of the smoothing of depth, in pixels of a real frame; stereo cameras and the filters
+            of drivers smooth depth, so that noise is correlated and edges are round.
+        patches: share of the pixels that lack depth in connected patches, which dark or smooth surfaces have.
+        patch: width of these patches, in pixels of a real frame.
     """
 
     distance: Range = (0.6, 1.2)
@@ -38,6 +43,9 @@ class Sensor:
     missing: float = 0.3
     flying: float = 0.3
     background: Range = (0.1, 1.0)
+    smooth: Range = (0.0, 2.0)
+    patches: Range = (0.0, 0.2)
+    patch: Range = (2.0, 8.0)
 
 
 def axial_deviation(z: Any) -> Any:
@@ -66,11 +74,30 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     chance = rng.random((2, len(on_edge)), np.float32)
     lost[on_edge[chance[0] < sensor.missing]] = True
     mixed = on_edge[chance[1] < sensor.flying]
-    sampled[mixed] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
-    sampled += np.float32(1000 * deviation) * rng.standard_normal(n, np.float32)
-    measured = view.depth.copy()
-    measured.reshape(-1)[pixels] = np.rint(sampled).clip(1, 65535).astype(np.uint16)
+    sampled[sampled > 0] += np.float32(1000 * deviation) * rng.standard_normal(np.count_nonzero(sampled), np.float32)
+    scale, shape = FRAME_PIXEL / width, view.depth.shape
+    measured = np.zeros(shape, np.float32)
+    measured.reshape(-1)[pixels] = sampled
+    measured = _smoothed(measured, scale * rng.uniform(*sensor.smooth))
+    measured.reshape(-1)[pixels[mixed]] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
+    lost |= _patches(shape, rng.uniform(*sensor.patches), scale * rng.uniform(*sensor.patch), rng).take(pixels)
+    measured = np.rint(measured).clip(0, 65535).astype(np.uint16)
     return without(dataclasses.replace(view, depth=measured), pixels[lost])
+
+
+def _smoothed(depth: NDArray[np.float32], width: float) -> NDArray[np.float32]:
+    """Return depth [h, w] smoothed by a Gaussian over pixels with depth; pixels without depth stay 0."""
+    if width < 0.1:
+        return depth
+    seen = depth > 0
+    weight = np.maximum(gaussian_filter(seen.astype(np.float32), width), np.float32(1e-3))
+    return np.where(seen, gaussian_filter(depth, width) / weight, 0)
+
+
+def _patches(shape: tuple[int, ...], share: float, width: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return pixels [h, w] in random patches of `width` pixels that cover about `share` of the image."""
+    noise = gaussian_filter(rng.standard_normal(shape, np.float32), width)
+    return noise < np.quantile(noise, share)
 
 
 def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:
