@@ -5,16 +5,16 @@ the camera's response. Applied in this order to sRGB values in [0, 1]: c ** gamm
 saturation (distance from the grey of the same luma); a veil of stray light; noise.
 
 Some RGB-D cameras blur colour and shift it by up to ten pixels against depth. Points near the outline then have colours
-of the background.
+of the background. Colour differences are blurred more than luma, as in compressed video.
 """
 
 import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import uniform_filter
 
-from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width
+from training.augmentation.pixels import FRAME_PIXEL, Range, blurred, pixel_width
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Illumination", "Registration", "misregistered", "relit"]
@@ -111,28 +111,33 @@ class Registration:
         shifted: probability of a shift.
         shift: largest shift along rows and columns, in pixels of a real frame.
         blur: standard deviation of the blur of the colour image, in pixels of a real frame.
+        chroma: standard deviation of the further blur of the differences between colours and their luma, in pixels of a
+            real frame: video has them in half of its resolution, and drivers smooth them against noise.
     """
 
     shifted: float = 0.5
     shift: float = 10.0
     blur: Range = (0.0, 3.0)
+    chroma: Range = (0.0, 6.0)
 
 
 def misregistered(view: RenderedView, registration: Registration, rng: np.random.Generator) -> RenderedView:
     """Return the view with a blurred, shifted colour image; the background has one random colour."""
     seen = view.depth > 0
     scale = FRAME_PIXEL / pixel_width(view)
-    blur = rng.uniform(*registration.blur) * scale
+    blur, chroma = (rng.uniform(*drawn) * scale for drawn in (registration.blur, registration.chroma))
     shift = np.zeros(2, int)
     if rng.random() < registration.shifted:
         shift = np.rint(rng.uniform(-registration.shift, registration.shift, 2) * scale).astype(int)
     background = rng.integers(0, 256, 3).astype(np.uint8)
     color = view.color
     if blur > 0.1:
-        # Divided by the blurred mask, so that the object's border keeps its colour.
-        weight = np.maximum(gaussian_filter(seen.astype(np.float32), blur), 1e-3)[..., None]
-        color = gaussian_filter(color.astype(np.float32), (blur, blur, 0)) / weight
-        color = color.clip(0, 255).astype(np.uint8)
+        color = blurred(color.astype(np.float32), seen, blur).clip(0, 255).astype(np.uint8)
+    if chroma > 0.1:
+        values = color.astype(np.float32)
+        luma = (values @ LUMA)[..., None]
+        differences = np.where(seen[..., None], values - luma, 0)
+        color = (luma + blurred(differences, seen, chroma)).clip(0, 255).astype(np.uint8)
     margin = int(abs(shift).max())
     (row, column), (height, width) = margin + shift, seen.shape
     padded = np.full((height + 2 * margin, width + 2 * margin, 3), background)

@@ -1,4 +1,4 @@
-"""Augmentation of the depth sensor: axial and lateral noise, missing and flying pixels, depth rounded to 1 mm.
+"""Augmentation of the depth sensor: noise, smoothing, missing and flying pixels, depth rounded to 1 mm.
 
 The axial standard deviation is at most 1.2 mm + 1.9 mm (z / m - 0.4)^2, the lateral one 0.8 pixels (Nguyen, Izadi and
 Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012).
@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width, without
+from training.augmentation.pixels import FRAME_PIXEL, Range, blurred, pixel_width, without
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
@@ -29,6 +30,10 @@ class Sensor:
         missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
         flying: share of the other edge pixels whose depth lies between the surface's and the background's.
         background: distance of the background behind the object, metres.
+        smooth: standard deviation of the smoothing of depth, in pixels of a real frame. Stereo matching and the filters
+            of drivers smooth depth, so that noise is correlated and edges are round.
+        patches: share of the image in connected patches without depth, as on dark or shiny surfaces.
+        patch: width of these patches, in pixels of a real frame.
     """
 
     distance: Range = (0.6, 1.2)
@@ -38,6 +43,9 @@ class Sensor:
     missing: float = 0.3
     flying: float = 0.3
     background: Range = (0.1, 1.0)
+    smooth: Range = (0.0, 2.0)
+    patches: Range = (0.0, 0.2)
+    patch: Range = (2.0, 8.0)
 
 
 def axial_deviation(z: Any) -> Any:
@@ -55,22 +63,36 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     lateral = sensor.lateral * FRAME_PIXEL / width
     # The margin has no depth, so that the border of the view is an edge and lateral samples can fall there.
     margin = 1 + math.ceil(4 * lateral)
-    depth = np.pad(view.depth, margin).astype(np.float32)
-    edge = depth_edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
+    padded = np.pad(view.depth, margin).astype(np.float32)
+    edge = depth_edges(padded, 1000 * width * math.tan(math.radians(sensor.grazing)))
     shift = np.rint(np.float32(lateral) * rng.standard_normal((2, n), np.float32)).clip(-margin, margin)
     row, column = np.divmod(pixels, view.depth.shape[1])
-    at = (row + margin) * depth.shape[1] + column + margin
-    at += (shift[0] * depth.shape[1] + shift[1]).astype(np.intp)
-    sampled, on_edge = depth.take(at), np.flatnonzero(edge.take(at))
+    at = (row + margin) * padded.shape[1] + column + margin
+    at += (shift[0] * padded.shape[1] + shift[1]).astype(np.intp)
+    sampled, on_edge = padded.take(at), np.flatnonzero(edge.take(at))
     lost = sampled == 0
     chance = rng.random((2, len(on_edge)), np.float32)
     lost[on_edge[chance[0] < sensor.missing]] = True
     mixed = on_edge[chance[1] < sensor.flying]
-    sampled[mixed] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
-    sampled += np.float32(1000 * deviation) * rng.standard_normal(n, np.float32)
-    measured = view.depth.copy()
-    measured.reshape(-1)[pixels] = np.rint(sampled).clip(1, 65535).astype(np.uint16)
-    return without(dataclasses.replace(view, depth=measured), pixels[lost])
+    sampled[sampled > 0] += np.float32(1000 * deviation) * rng.standard_normal(np.count_nonzero(sampled), np.float32)
+    measured = np.zeros(view.depth.shape, np.float32)
+    measured.reshape(-1)[pixels] = sampled
+    scale = FRAME_PIXEL / width
+    smooth = scale * rng.uniform(*sensor.smooth)
+    if smooth > 0.1:
+        seen = measured > 0
+        measured = np.where(seen, blurred(measured, seen, smooth), 0)
+    measured.reshape(-1)[pixels[mixed]] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
+    share, patch = rng.uniform(*sensor.patches), scale * rng.uniform(*sensor.patch)
+    lost |= _patches(view.depth.shape, share, patch, rng).take(pixels)
+    depth = np.rint(measured).clip(0, 65535).astype(np.uint16)
+    return without(dataclasses.replace(view, depth=depth), pixels[lost])
+
+
+def _patches(shape: tuple[int, ...], share: float, width: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return pixels [h, w] in random patches of `width` pixels that cover about `share` of the image."""
+    noise = gaussian_filter(rng.standard_normal(shape, np.float32), width)
+    return noise < np.quantile(noise, share)
 
 
 def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:
