@@ -20,7 +20,7 @@ from training.evaluation.answers import (
     fusions,
     main_fusion,
 )
-from training.evaluation.published import compare_with_published, published_means
+from training.evaluation.published import compare_with_published
 from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
@@ -161,8 +161,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         ),
         "scratch": scratch_networks(runs),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, correct[rule], runs[0].own_objects) for names in tables]
-            for rule in by_rule
+            rule: [_accuracy(names, attributes, by_title) for names in tables] for rule, by_title in correct.items()
         },
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
@@ -197,19 +196,13 @@ def _of_all(predictions: Predictions, described: Flags) -> Integers:
 
 
 def _accuracy(
-    kind: str,
-    names: Sequence[str],
-    attributes: Sequence[Mapping[str, str]],
-    correct: Mapping[str, Sequence[Flags]],
-    own_objects: bool,
+    names: Sequence[str], attributes: Sequence[Mapping[str, str]], correct: Mapping[str, Sequence[Flags]]
 ) -> dict[str, Any]:
-    """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
+    """Return the accuracy of each fusion by the named attributes."""
     cells = []
     for values, rows in scores.group_by_attributes(attributes, names).items():
-        where = dict(zip(names, values, strict=True))
         accuracy = {title: summarize_runs([marks[rows].mean() for marks in each]) for title, each in correct.items()}
-        others = published_means(kind, where, own_objects)
-        cells.append({"where": where, "instances": len(rows), "accuracy": accuracy, "published": others})
+        cells.append({"where": dict(zip(names, values, strict=True)), "instances": len(rows), "accuracy": accuracy})
     return {"by": list(names), "cells": cells}
 
 
