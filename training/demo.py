@@ -174,19 +174,18 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
 def _instances(run: Run, answers: Sequence[FrameAnswers]) -> Iterator[dict[str, Any]]:
     """Yield the answers of every fusion for each instance."""
     for frame in answers:
-        described = [i for i in frame.instances if i.probabilities is not None]
-        fused = {name: by_run[0] for name, by_run in fuse_answers(described, [run]).items()}
-        rows = {instance.label: row for row, instance in enumerate(described)}
-        for instance in frame.instances:
-            row = rows.get(instance.label)
+        fused = {name: by_run[0] for name, by_run in fuse_answers(frame.instances, [run]).items()}
+        for row, instance in enumerate(frame.instances):
             yield {
                 "frame": frame.frame,
                 "label": instance.label,
                 "truth": instance.truth,
                 "attributes": frame.attributes,
-                "answers": {}
-                if row is None
-                else {name: (run.classes[p.class_index[row]], float(p.confidence[row])) for name, p in fused.items()},
+                "answers": {
+                    name: (run.classes[p.class_index[row]], float(p.confidence[row]))
+                    for name, p in fused.items()
+                    if p.described[row]
+                },
                 "occluded": instance.occluded,
                 "reason": instance.reason,
             }
