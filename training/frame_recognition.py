@@ -23,7 +23,7 @@ from thor2_jax.model import result_files
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
-from training.readers.frame_files import FrameSource
+from training.readers.frames import FrameSource
 
 __all__ = [
     "FrameAnswer",

@@ -21,8 +21,7 @@ from training.fitting.job import VIEWS, check_out, check_trained, finished_recor
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
-from training.readers.frame_files import find_frames
-from training.readers.frames import FrameFolder
+from training.readers.frames import FrameFolder, find_frames
 from training.storage.jobs import Display, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop

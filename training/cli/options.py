@@ -39,7 +39,7 @@ __all__ = [
 if TYPE_CHECKING:
     from thor2_jax.recordings.bags import Bag
     from thor2_jax.segmentation.segmenters import Segmenter
-    from training.readers.frame_files import FrameSource
+    from training.readers.frames import FrameSource
     from training.storage.workers import WorkerPool
 
 UnknownOption = Annotated[
@@ -155,7 +155,7 @@ class FrameOptions:
             OSError: a recording cannot be opened.
         """
         from thor2_jax.segmentation.segmenters import TABLE
-        from training.readers.frame_files import FrameFiles, find_frames, recorded_sources, segmented_source
+        from training.readers.frames import FrameFiles, find_frames, recorded_sources, segmented_source
 
         self.check()
         if self.labels is not None and segment is not None:

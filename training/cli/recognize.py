@@ -75,7 +75,7 @@ def recognize(
         track_frames,
     )
     from training.readers.bop import read_object_names
-    from training.readers.frame_files import read_poses, segmented_source
+    from training.readers.frames import segmented_source
 
     given.check()
     frames, recording = given.frames, given.bag
@@ -105,7 +105,11 @@ def recognize(
     else:
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
-    of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
+    of_frames = None
+    if poses is not None:
+        from thor2_jax.tracking.poses import read_poses  # imports SciPy
+
+        of_frames = read_poses(poses, [source.name for source in sources])
     if out is not None:
         resumable = {source.name.split("/")[0] for source in sources} if frames else result_files.RESULT_FILES
         check_output_directory(out, resumable=() if recording else resumable)

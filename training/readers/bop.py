@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_path
+from training.readers.labelled import LabelledFrames, dataset_folder, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -56,30 +56,33 @@ class BOP(LabelledFrames):
         self._names_file = names
         self._names = None if names is None else read_object_names(Path(names))
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also raises InputError for an image or object that a table lacks."""
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, the names of its scored instances and its scene.
+
+        Raises:
+            InputError: also for an image or an object that a table lacks.
+        """
         scene, image = self._images[number]
-        with with_context(self.identifiers[number]):
-            with self._entry(scene, "camera", image) as entry:
-                intrinsics = _intrinsics(entry)
-            with self._entry(scene, "gt", image) as entry:
-                objects = _values(entry, "obj_id", int)
-            visible: list[float] = [1.0] * len(objects)
-            if (scene / "scene_gt_info.json").exists():
-                with self._entry(scene, "gt_info", image) as entry:
-                    visible = _values(entry, "visib_fract", (int, float))
-                    if len(visible) != len(objects):
-                        raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
-            depth = read_depth(scene / "depth" / f"{image.stem}.png")
-            masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
-            sizes = [int(mask.sum()) for mask in masks]
-            labels = np.zeros(depth.shape, np.int32)
-            for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
-                labels[masks[k]] = k + 1
-            scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
-            truth = {k + 1: self._name(objects[k]) for k in scored}
-            frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
-        return LabelledFrame(self.identifiers[number], frame, truth, {"scene": scene.name})
+        with self._entry(scene, "camera", image) as entry:
+            intrinsics = _intrinsics(entry)
+        with self._entry(scene, "gt", image) as entry:
+            objects = _values(entry, "obj_id", int)
+        visible: list[float] = [1.0] * len(objects)
+        if (scene / "scene_gt_info.json").exists():
+            with self._entry(scene, "gt_info", image) as entry:
+                visible = _values(entry, "visib_fract", (int, float))
+                if len(visible) != len(objects):
+                    raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
+        depth = read_depth(scene / "depth" / f"{image.stem}.png")
+        masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
+        sizes = [int(mask.sum()) for mask in masks]
+        labels = np.zeros(depth.shape, np.int32)
+        for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
+            labels[masks[k]] = k + 1
+        scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
+        truth = {k + 1: self._name(objects[k]) for k in scored}
+        frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
+        return frame, truth, {"scene": scene.name}
 
     @contextlib.contextmanager
     def _entry(self, scene: Path, name: str, image: Path) -> Iterator[Any]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = [
@@ -86,15 +86,21 @@ class LabelledFrames(abc.ABC):
     def __len__(self) -> int:
         return len(self.identifiers)
 
-    @abc.abstractmethod
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame.
 
         Raises:
             IndexError: `number` is out of range.
-            InputError: a file is missing or damaged, or files do not belong together; names the file.
+            InputError: a file is missing or damaged, or files do not belong together; names the frame and the file.
             OSError: a file cannot be opened.
         """
+        identifier = self.identifiers[number]
+        with with_context(identifier):
+            return LabelledFrame(identifier, *self.read(number))
+
+    @abc.abstractmethod
+    def read(self, number: int) -> tuple[RGBDFrame, Mapping[int, str], Mapping[str, str]]:
+        """Read the images, the names and the attributes of a frame, see `LabelledFrame`; raises as indexing does."""
 
     def files(self, number: int) -> Sequence[Path]:
         """Return the files that a frame is read from; by default none are known."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
+from training.readers.labelled import LabelledFrames, dataset_folder, path_ends
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
@@ -81,31 +81,33 @@ class OCID(LabelledFrames):
             self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in self._images))
         self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in self._images]
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, its names, and the place, the camera and the type of its sequence.
+
+        Raises:
+            InputError: also for a cloud without a pinhole camera, and a label without a name.
+        """
         sequence, image = self._images[number]
         _, depth_file, label_file, cloud_file = self.files(number)
         place, camera, kind, _ = sequence.split("/")
         first_object = _FIRST_OBJECT[place]
-        with with_context(self.identifiers[number]):
-            names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
-            color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
-            with with_context(str(cloud_file)):
-                if points.shape[:2] != color.shape[:2]:
-                    raise InputError(
-                        f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
-                    )
-                intrinsics = fit_intrinsics(points)
-            frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
-            unnamed = [label for label in frame.instances if label not in names]
-            if unnamed and self._is_complete:
+        names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
+        color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
+        with with_context(str(cloud_file)):
+            if points.shape[:2] != color.shape[:2]:
                 raise InputError(
-                    f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels "
-                    f"from {first_object} on"
+                    f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
                 )
+            intrinsics = fit_intrinsics(points)
+        frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
+        unnamed = [label for label in frame.instances if label not in names]
+        if unnamed and self._is_complete:
+            raise InputError(
+                f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels "
+                f"from {first_object} on"
+            )
         truth = {label: names[label] for label in frame.instances if label in names}
-        attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
-        return LabelledFrame(self.identifiers[number], frame, truth, attributes)
+        return frame, truth, {"place": place, "camera": _CAMERAS[camera], "type": kind}
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""

@@ -5,10 +5,10 @@
 
 from pathlib import Path
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_labels
+from training.readers.labelled import LabelledFrames, dataset_folder, named_labels
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
@@ -57,15 +57,11 @@ class UWISOccluded(LabelledFrames):
             raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
         self.identifiers = [f"{video.name}/{_stem(color)}" for video, color in self._frames]
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame."""
-        video, _ = self._frames[number]
-        identifier = self.identifiers[number]
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, its names and the attributes of its video."""
         color, depth, labels, poses = self.files(number)
-        with with_context(identifier):
-            frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
-            truth = _truth(poses)
-        return LabelledFrame(identifier, frame, truth, video_attributes(int(video.name)))
+        frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
+        return frame, _truth(poses), video_attributes(int(self._frames[number][0].name))
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""

@@ -17,8 +17,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
 from training.evaluation.job import FRAMES_PER_CHUNK, answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import RecognizerArguments, recognize_frames
-from training.readers.frame_files import find_frames, segmented_source
-from training.readers.frames import FrameFolder
+from training.readers.frames import FrameFolder, find_frames, segmented_source
 from training.storage.workers import IN_PROCESS
 
 N_FRAMES = 2 * FRAMES_PER_CHUNK + 1
