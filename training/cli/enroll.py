@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -74,28 +74,26 @@ def enroll(
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-    skipped: list[str] = []
     with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
-        # These take seconds to import.
-        from training.enrollment import enroll_objects, labelled_views
+        # It takes seconds to import.
+        from training.enrollment import enroll_objects
 
-        def read(sigma_s: float) -> tuple[Iterable[str], Iterator[Sequence["PreparedInstance"]]]:
-            if frames is None:
-                return meshes, views_of_meshes
-            views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-            skipped.extend(f"skipped: {reason}" for reason in unusable)
-            views = views if name is None else {name: [view for each in views.values() for view in each]}
-            return views, iter(views.values())
-
-        source, changes = "frames" if mesh is None else "mesh", {"extend": extend, "replace": replace}
         with show_progress(quiet) as progress:
-            counts, known = enroll_objects(
-                model, read, source, name=name, gallery=gallery, progress=progress, **changes
+            counts, known, skipped = enroll_objects(
+                model,
+                frames or (meshes, views_of_meshes),
+                name=name,
+                label_name=label_name,
+                instance=instance,
+                extend=extend,
+                replace=replace,
+                gallery=gallery,
+                progress=progress,
             )
-    for line in skipped:
-        console.print(line)
+    for reason in skipped:
+        console.print(f"skipped: {reason}")
     for each, count in counts.items():
         console.print(f"{each}: {count} views")
     if known.weak_rejection:
