@@ -131,9 +131,7 @@ class RecognizerArguments:
 
     def answer(self, source: FrameSource) -> FrameAnswer:
         """Return the answer of `recognize_frames` for a frame, in a worker process as `segment`."""
-        answer = next(recognize_frames(_loaded(self).recognize, [source]))
-        # Without the cached properties of the frame, which would be sent too.
-        return dataclasses.replace(answer, frame=None if answer.frame is None else dataclasses.replace(answer.frame))
+        return next(recognize_frames(_loaded(self).recognize, [source]))
 
 
 _loaded = functools.lru_cache(1)(RecognizerArguments.load)

@@ -61,14 +61,9 @@ def enroll(
         raise InputError("name is missing; --label-name and --instance enroll one object")
     if extend and replace:
         raise InputError("extend and replace are both given; choose one")
-    for option, value in (("label_name", label_name), ("instance", instance)):
-        if mesh is not None and value is not None:
-            raise InputError(f"{option} is {value}; it belongs to frames")
-    if mesh is None and mesh_scale != 1:
-        raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
-    for field in dataclasses.fields(processes):
-        if mesh is None and (value := getattr(processes, field.name)) != field.default:
-            raise InputError(f"{field.name} is {value}; it belongs to --mesh")
+    options.check_belongs("frames", has_frames, label_name=label_name, instance=instance)
+    scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
+    options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 

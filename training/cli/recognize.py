@@ -79,17 +79,11 @@ def recognize(
 
     given.check()
     frames, recording = given.frames, given.bag
-    if recording is not None:
-        refused: dict[str, object] = {"names": names, "coco": coco, "bop": bop, "poses": poses}
-        for name, value in {**refused, "workers": processes.workers, "engine": processes.engine}.items():
-            if value not in (None, 1, "local"):
-                raise InputError(f"{name} is {value} and bag is {recording}; give one of them")
-    elif out_bag is not None:
-        raise InputError(f"out_bag is {out_bag}; it belongs to --bag")
-    if names is not None and coco is None and bop is None:
-        raise InputError(f"names is {names}; it belongs to --coco and --bop")
-    if poses is not None and not track:
-        raise InputError(f"poses is {poses}; it belongs to --track")
+    in_workers = options.given_values(processes)
+    options.check_alone("bag", recording, names=names, coco=coco, bop=bop, poses=poses, **in_workers)
+    options.check_belongs("--bag", recording, out_bag=out_bag)
+    options.check_belongs("--coco and --bop", coco or bop, names=names)
+    options.check_belongs("--track", track, poses=poses)
     pool = processes.pool()
     if pool is not None and (track or not frames):
         reason = "--track, which takes the frames in turn" if track else "one frame"

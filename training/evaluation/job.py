@@ -215,9 +215,8 @@ def _answer_chunk(
     load, frames, numbers = chunk
     runs, answered = _loaded(*load), []
     try:
-        for item, answers in answer_frames(runs, (frames[n] for n in numbers)):
-            frame = dataclasses.replace(item.frame)  # without its cached properties
-            answered.append((dataclasses.replace(item, frame=frame), answers))
+        for each in answer_frames(runs, (frames[number] for number in numbers)):
+            answered.append(each)
     except (InputError, OSError) as error:
         return answered, error
     return answered, None
