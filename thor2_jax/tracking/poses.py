@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import read_file
 from thor2_jax.frames.instance_clouds import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
@@ -66,12 +66,11 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
             pose is not a rigid motion. The message names the file.
         OSError: the file cannot be read.
     """
-    try:
-        stored = json.loads(read_file(path))
-    except (ValueError, RecursionError):
-        stored = None
-    if not isinstance(stored, (dict, list)):
-        raise InputError(f"poses: {path} is invalid; expected JSON: frame name -> [4, 4] matrix, or a list of matrices")
+    content = read_file(path)
+    with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
+        stored = json.loads(content)
+        if not isinstance(stored, (dict, list)):
+            raise TypeError(f"it holds a {type(stored).__name__}")
     if isinstance(stored, dict):
         missing = [name for name in names if name not in stored]
         if missing:

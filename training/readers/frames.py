@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RecordedFrame, RGBDFrame, read_frame
 from thor2_jax.recordings.bags import Bag
@@ -233,10 +233,9 @@ def _listed(labels: Iterable[int]) -> str:
 
 def read_names(path: Path) -> dict[int, str]:
     """Read `labels.json`: label -> name of the object; raises InputError and OSError."""
-    try:
-        entries = [(int(label), name) for label, name in json.loads(read_file(path))["labels"].items()]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f'{path} is invalid; expected {{"labels": {{"<number>": "<name>", ...}}}}') from None
+    content = read_file(path)
+    with decoding(f"{path} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
+        entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
     return named_labels(path, entries)
 
 
@@ -260,7 +259,7 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
 
     Args:
         open_bag: function that returns the recording.
-        every: take the first of so many frames.
+        every: 2 takes every second frame, and so on.
 
     Raises:
         InputError: the recording has no complete frame, or as `Bag`. One that is damaged later on has those before.

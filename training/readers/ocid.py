@@ -1,4 +1,4 @@
-"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: clutter that grows by an object a frame.
+"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: each frame has one more object.
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
 Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects. A

@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, dataset_folder, named_labels
@@ -75,9 +75,8 @@ def _stem(color: Path) -> str:
 
 
 def _truth(path: Path) -> dict[int, str]:
-    try:
-        objects = parse_yaml(read_file(path))
+    content = read_file(path)
+    with decoding(f"{path} does not hold the objects of a frame", "<name>: {label: <number>, ...}"):
+        objects = parse_yaml(content)
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
-    except (KeyError, TypeError, AttributeError, ValueError):
-        raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
     return named_labels(path, entries)

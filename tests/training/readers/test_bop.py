@@ -13,7 +13,7 @@ from dataset_files import TWO, K, band, color_and_depth, write_bop
 from helpers import Command, NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
-from training.readers import BOP
+from training.readers.bop import BOP
 
 
 def test_a_frame(tmp_path: Path) -> None:

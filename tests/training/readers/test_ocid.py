@@ -14,8 +14,7 @@ from PIL import Image
 
 from thor2_jax.frames.frames import backproject
 from training.evaluation.runs import Run as EvaluatedRun
-from training.readers import OCID
-from training.readers.ocid import fit_intrinsics, read_organized_points
+from training.readers.ocid import OCID, fit_intrinsics, read_organized_points
 
 ALL = {"seq36": ["mug", "bowl", "banana"]}
 
