@@ -47,9 +47,9 @@ class BOP(LabelledFrames):
         """
         path = dataset_folder(named_path(path))
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
-        self._images = [(scene, image) for scene in scenes for image in _images(scene / "rgb")]
-        self.identifiers = [f"{scene.name}/{image.stem}" for scene, image in self._images]
-        if not self._images:
+        self.sources = [image for scene in scenes for image in _images(scene / "rgb")]
+        self.identifiers = [f"{_scene(image).name}/{image.stem}" for image in self.sources]
+        if not self.sources:
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
@@ -62,14 +62,15 @@ class BOP(LabelledFrames):
         Raises:
             InputError: also for an image or an object that a table lacks.
         """
-        scene, image = self._images[number]
-        with self._entry(scene, "camera", image) as entry:
+        image = self.sources[number]
+        scene = _scene(image)
+        with _entry(image, "camera") as entry:
             intrinsics = _intrinsics(entry)
-        with self._entry(scene, "gt", image) as entry:
+        with _entry(image, "gt") as entry:
             objects = _values(entry, "obj_id", int)
         visible: list[float] = [1.0] * len(objects)
         if (scene / "scene_gt_info.json").exists():
-            with self._entry(scene, "gt_info", image) as entry:
+            with _entry(image, "gt_info") as entry:
                 visible = _values(entry, "visib_fract", (int, float))
                 if len(visible) != len(objects):
                     raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
@@ -84,23 +85,13 @@ class BOP(LabelledFrames):
         frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
         return frame, truth, {"scene": scene.name}
 
-    @contextlib.contextmanager
-    def _entry(self, scene: Path, name: str, image: Path) -> Iterator[Any]:
-        """Yield the entry of an image in a table of its scene; errors name the table."""
-        path, number = scene / f"scene_{name}.json", str(int(image.stem))
-        status = path.stat()
-        table = _read_table(path, status.st_mtime_ns, status.st_size)
-        with with_context(str(path)):
-            if number not in table:
-                raise InputError(f"it has no image {number}")
-            yield table[number]
-
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame: its images, its masks and the tables of its scene."""
-        folder, image = self._images[number]
-        tables = [folder / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
-        masks = sorted((folder / "mask_visib").glob(f"{image.stem}_*.png"))
-        return [image, folder / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
+        image = self.sources[number]
+        scene = _scene(image)
+        tables = [scene / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
+        masks = sorted((scene / "mask_visib").glob(f"{image.stem}_*.png"))
+        return [image, scene / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
 
     def _name(self, obj_id: int) -> str:
         if self._names is None:
@@ -108,6 +99,22 @@ class BOP(LabelledFrames):
         if obj_id not in self._names:
             raise InputError(f"{self._names_file} lacks the obj_id {obj_id}")
         return self._names[obj_id]
+
+
+def _scene(image: Path) -> Path:
+    return image.parent.parent
+
+
+@contextlib.contextmanager
+def _entry(image: Path, name: str) -> Iterator[Any]:
+    """Yield the entry of an image in a table of its scene; errors name the table."""
+    path, number = _scene(image) / f"scene_{name}.json", str(int(image.stem))
+    status = path.stat()
+    table = _read_table(path, status.st_mtime_ns, status.st_size)
+    with with_context(str(path)):
+        if number not in table:
+            raise InputError(f"it has no image {number}")
+        yield table[number]
 
 
 @functools.lru_cache(maxsize=3)  # frames are read scene by scene

@@ -133,7 +133,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         if any(path.glob("scene_camera.json")) or any(path.glob("*/scene_camera.json")):
             dataset = BOP(path)
             of_path = [
-                FrameSource(name, functools.partial(_read_bop, dataset, k))
+                FrameSource(name, functools.partial(_read_bop, dataset.only(k)))
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
@@ -196,14 +196,14 @@ class FrameFolder(LabelledFrames):
             raise InputError(
                 f"frames: {_first_names(sources)} has no labels.json; expected the names of the objects in the frames"
             )
-        self._sources = labelled or sources
-        self.identifiers = [source.name for source in self._sources]
+        self.sources = labelled or sources
+        self.identifiers = [source.name for source in self.sources]
         left_out = others if labelled else []
         self.note = f"{len(left_out)} frames without labels.json: {_first_names(left_out)}" if left_out else ""
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, its names if they are known, and no attributes."""
-        source = self._sources[number]
+        source = self.sources[number]
         files = source.files
         if files is None or not self.named:
             return source.read(), {}, {}
@@ -219,7 +219,7 @@ class FrameFolder(LabelledFrames):
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame; none are known of a recording."""
-        files = self._sources[number].files
+        files = self.sources[number].files
         return [*filter(None, vars(files).values()), files.names] if files else []
 
 
@@ -248,8 +248,8 @@ def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -
     return segmented(source.read(), segmenter)
 
 
-def _read_bop(dataset: BOP, number: int) -> RGBDFrame:
-    return dataset[number].frame
+def _read_bop(dataset: BOP) -> RGBDFrame:
+    return dataset[0].frame
 
 
 def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[FrameSource], list[str]]:

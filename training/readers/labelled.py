@@ -1,10 +1,11 @@
 """Labelled frames, and the interface of all dataset readers."""
 
 import abc
+import copy
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
@@ -79,9 +80,11 @@ class LabelledFrames(abc.ABC):
 
     Attributes:
         identifiers: identifiers of all frames, known without reading them.
+        sources: what each frame is read from, for instance its colour image.
     """
 
     identifiers: Sequence[str]
+    sources: Sequence[Any]
 
     def __len__(self) -> int:
         return len(self.identifiers)
@@ -105,6 +108,12 @@ class LabelledFrames(abc.ABC):
     def files(self, number: int) -> Sequence[Path]:
         """Return the files that a frame is read from; by default none are known."""
         return ()
+
+    def only(self, number: int) -> Self:
+        """Return a dataset of one of the frames. Processes get it, since all paths of a large dataset take seconds."""
+        one = copy.copy(self)
+        one.identifiers, one.sources = [self.identifiers[number]], [self.sources[number]]
+        return one
 
     def __iter__(self) -> Iterator[LabelledFrame]:
         """Read the frames one at a time; raises as indexing does."""

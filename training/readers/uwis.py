@@ -52,22 +52,26 @@ class UWISOccluded(LabelledFrames):
         """
         path = dataset_folder(path)
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
-        self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
-        if not self._frames:
+        self.sources = [color for video in videos for color in sorted((video / "images").glob("*_rgb.png"))]
+        if not self.sources:
             raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
-        self.identifiers = [f"{video.name}/{_stem(color)}" for video, color in self._frames]
+        self.identifiers = [f"{_video(color)}/{_stem(color)}" for color in self.sources]
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, its names and the attributes of its video."""
         color, depth, labels, poses = self.files(number)
         frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
-        return frame, _truth(poses), video_attributes(int(self._frames[number][0].name))
+        return frame, _truth(poses), video_attributes(int(_video(color)))
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
-        color = self._frames[number][1]
+        color = self.sources[number]
         names = "rgb.png", "depth.png", "labels.png", "poses.yaml"
         return [color.with_name(f"{_stem(color)}_{name}") for name in names]
+
+
+def _video(color: Path) -> str:
+    return color.parent.parent.name
 
 
 def _stem(color: Path) -> str:
