@@ -20,10 +20,12 @@ __all__ = [
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
+    "HostOption",
     "MAX_WORKERS",
     "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
+    "NamesOption",
     "QuietOption",
     "SegmentOption",
     "UnknownOption",
@@ -71,6 +73,10 @@ GalleryOption = Annotated[
 MeshScaleOption = Annotated[
     float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]
+NamesOption = Annotated[
+    Path | None, typer.Option("--names", help="JSON or YAML table: object name -> mesh. Default: all meshes.")
+]
+HostOption = Annotated[str, typer.Option("--host", help="Address to listen on; 0.0.0.0 for other machines.")]
 AllowHostOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -99,11 +99,11 @@ def recognize(
     else:
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
-    of_frames = None
+    frame_poses = None
     if poses is not None:
         from thor2_jax.tracking.poses import read_poses  # imports SciPy
 
-        of_frames = read_poses(poses, [source.name for source in sources])
+        frame_poses = read_poses(poses, [source.name for source in sources])
     if out is not None:
         resumable = {source.name.split("/")[0] for source in sources} if frames else result_files.RESULT_FILES
         check_output_directory(out, resumable=() if recording else resumable)
@@ -129,7 +129,7 @@ def recognize(
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
             answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
         elif track:
-            answers = track_frames(recognizer, sources, of_frames)
+            answers = track_frames(recognizer, sources, frame_poses)
         elif pool is not None:
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:

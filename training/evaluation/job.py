@@ -95,7 +95,7 @@ def evaluate_dataset(
             remove_leftovers(directory)
         pictures = FramePictures(out, runs, len(frames))
         for answers in file.frames:
-            pictures.restore(answers)
+            pictures.record(answers)
         first, start = len(file.frames), time.perf_counter()
         progress("evaluate", first, len(frames), "")
         with contextlib.closing(answering(range(first, len(frames)))) as answered:
