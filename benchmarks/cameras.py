@@ -176,20 +176,19 @@ def _measure(
     if not known:
         raise InputError(f"frames: no instance is of a class of the runs, which know {', '.join(classes[:5])}, ...")
     instances = [instance for instance, _, _ in known]
-    fused, others = fuse_answers(instances, runs, rule), fuse_answers(unknown, runs, rule)
+    described_unknown = [instance for instance in unknown if instance.probabilities is not None]
+    fused, others = fuse_answers(instances, runs, rule), fuse_answers(described_unknown, runs, rule)
     chosen = title or main_fusion(fused, runs[0].answer_by)
     if len(fused.get(chosen, ())) < len(runs):
         raise InputError(f"fusion is {chosen}; expected one that all runs have, of {', '.join(fused)}")
-    described = np.array([instance.probabilities is not None for instance in instances])
     truth = np.array([classes.index(instance.truth) for instance in instances])
     group = np.array([name for _, name, _ in known])
     placement = np.unique([pair for _, _, pair in known], axis=0, return_inverse=True)[1].ravel()
     results = []
     for run, predictions in fused[chosen].items():
-        answer = np.full(len(known), -1)
-        answer[described] = predictions.class_index
+        answer, described = predictions.class_index, predictions.described
         correct = answer == truth
-        confidence = np.minimum(predictions.confidence, 1)
+        confidence = np.minimum(predictions.confidence[described], 1)
         of_unknown = np.minimum(others[chosen][run].confidence, 1)
         every = np.concatenate([confidence, of_unknown])
         results.append(

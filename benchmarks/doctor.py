@@ -22,7 +22,7 @@ from thor2_jax.files import write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
 from training.diagnosis.setup import diagnose
-from training.readers.frame_files import FrameFiles, find_frames
+from training.readers.frames import FrameFiles, find_frames
 
 BASES = (
     "frames/ycbv_posecnn_demo/000001",

@@ -17,7 +17,7 @@ from thor2_jax.explanation.class_scores import ClassScores, classifier_scores
 from thor2_jax.files import write_text
 from thor2_jax.frames.prepared_instance import prepare_instance
 from thor2_jax.recognizer import Recognizer
-from training.readers.frame_files import find_frames
+from training.readers.frames import find_frames
 
 __all__ = ["faithfulness_of", "summary"]
 

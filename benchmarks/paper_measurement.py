@@ -115,14 +115,11 @@ def correct_answers(
     known = np.array([instance.truth in classes for instance in labelled], bool)
     placement = np.concatenate([np.zeros(0, np.intp), *find_placements(frames)])[known]
     instances = [instance for instance, is_known in zip(labelled, known, strict=True) if is_known]
-    described = np.array([instance.probabilities is not None for instance in instances], bool)
     truth = np.array([classes.index(instance.truth) for instance in instances], np.intp)
-    correct = {}
-    for title, by_run in fuse_answers(instances, runs, rule).items():
-        marks = np.zeros((len(by_run), len(instances)), bool)
-        for row, predictions in enumerate(by_run.values()):
-            marks[row, described] = predictions.class_index == truth[described]
-        correct[title] = marks
+    correct = {
+        title: np.stack([predictions.class_index == truth for predictions in by_run.values()])
+        for title, by_run in fuse_answers(instances, runs, rule).items()
+    }
     return correct, placement
 
 

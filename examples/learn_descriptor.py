@@ -45,7 +45,9 @@ from training.fitting.loop import FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes
-from training.readers import FrameFolder, LabelledFrame, UWISOccluded
+from training.readers.frames import FrameFolder
+from training.readers.labelled import LabelledFrame
+from training.readers.uwis import UWISOccluded
 from training.rendering.scenes import compose_scene
 from training.views.mesh_views import render_views
 from training.views.normalized_views import MemoryViews

@@ -15,7 +15,7 @@ from thor2_jax.files import atomic_directory, check_output_directory, read_file
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
-from training.readers.frame_files import FrameSource
+from training.readers.frames import FrameSource
 
 __all__ = ["adapt_run"]
 

@@ -10,7 +10,7 @@ import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -173,19 +173,18 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
 def _instances(run: Run, answers: Sequence[FrameAnswers]) -> Iterator[dict[str, Any]]:
     """Yield the answers of every fusion for each instance."""
     for frame in answers:
-        described = [i for i in frame.instances if i.probabilities is not None]
-        fused = {name: by_run[0] for name, by_run in fuse_answers(described, [run]).items()}
-        rows = {instance.label: row for row, instance in enumerate(described)}
-        for instance in frame.instances:
-            row = rows.get(instance.label)
+        fused = {name: by_run[0] for name, by_run in fuse_answers(frame.instances, [run]).items()}
+        for row, instance in enumerate(frame.instances):
             yield {
                 "frame": frame.frame,
                 "label": instance.label,
                 "truth": instance.truth,
                 "attributes": frame.attributes,
-                "answers": {}
-                if row is None
-                else {name: (run.classes[p.class_index[row]], float(p.confidence[row])) for name, p in fused.items()},
+                "answers": {
+                    name: (run.classes[p.class_index[row]], float(p.confidence[row]))
+                    for name, p in fused.items()
+                    if p.described[row]
+                },
                 "occluded": instance.occluded,
                 "reason": instance.reason,
             }
@@ -198,8 +197,8 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
         for subset, values in summary.accuracy.items()
     ]
 
-    def picture(name: str, caption: str, half: bool = False) -> Picture:
-        return Picture(f"pictures/{name}.png", caption, half)
+    def picture(name: str, caption: str, width: Literal["full", "half"] = "full") -> Picture:
+        return Picture(f"pictures/{name}.png", caption, width)
 
     lead = (
         f"Trained on {n_views:,} synthetic views of {n_objects} objects, evaluated on {N_SCENES} cluttered scenes "
@@ -219,10 +218,10 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
     differences = "Some objects differ from another one in colour only, some in shape only."
     caption = "Outline, recognized object, confidence and the more confident classifier."
     view = picture("descriptor", "One view of the blue mug.")
-    scenes = [picture(f"scene-{number}", caption, half=True) for number in range(N_SHOWN)]
+    scenes = [picture(f"scene-{number}", caption, "half") for number in range(N_SHOWN)]
     fit = [
-        picture("confusion", "Confusion matrix of THOR2 in the scenes.", half=True),
-        picture("training", "Loss and accuracy on the training views.", half=True),
+        picture("confusion", "Confusion matrix of THOR2 in the scenes.", "half"),
+        picture("training", "Loss and accuracy on the training views.", "half"),
     ]
     sections = [
         Section("Accuracy", accuracy, (header, rows), [picture("accuracy", "Accuracy by occlusion.")]),

@@ -1,61 +1,68 @@
 """Enrolling objects in the gallery of a run directory.
 
 from training.views.mesh_views import mesh_views
-enroll_objects(Path("run"), lambda sigma_s: (["mug"], iter([mesh_views(Path("mug.glb"))])), "mesh")
+enroll_objects(Path("run"), (["mug"], iter([mesh_views(Path("mug.glb"))])))
+enroll_objects(Path("run"), FrameFolder("labelled-frames"))
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import enrolled_views
+from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
+from training.readers.frames import FrameFolder
 from training.storage.jobs import Progress
+from training.views.labelled_views import read_instances
 
 __all__ = ["enroll_objects"]
 
 
 def enroll_objects(
     model: Path,
-    read: Callable[[float], tuple[Iterable[str], Iterator[Sequence[PreparedInstance]]]],
-    source: str,
+    source: FrameFolder | tuple[Iterable[str], Iterator[Sequence[PreparedInstance]]],
     *,
     name: str | None = None,
+    label_name: str | None = None,
+    instance: int | None = None,
     extend: bool = False,
     replace: bool = False,
     gallery: Path | None = None,
     progress: Progress = lambda stage, done, total, note: None,
-) -> tuple[dict[str, int], ObjectGallery]:
+) -> tuple[dict[str, int], ObjectGallery, Sequence[str]]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
     Args:
         model: the run directory.
-        read: function of sigma_s that returns the objects, and an iterator of their views, in the same order.
-        source: "mesh" or "frames".
-        name: the name that `read` will return, if there is one: it is checked before anything is read.
+        source: labelled frames, or the objects of meshes and an iterator of their views, in the same order.
+        name: the only object that is enrolled; its name is checked before anything is read. None enrolls all.
+        label_name: name of this object in the frames; by default `name`.
+        instance: number of this object in the frames, see `read_instances`.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
         gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery, and the gallery.
+        Object -> number of its views in the gallery, the gallery, and why instances of the frames were not used.
 
     Raises:
-        InputError: the run directory cannot be read, a view cannot be used, or a name exists and neither `extend` nor
-            `replace` is given. Nothing is enrolled.
+        InputError: the run directory cannot be read, a view cannot be used, the frames have no usable view (as
+            `read_instances`), or a name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
         OSError: a file cannot be written; the gallery is as before, and no run directory is created.
     """
     model = model.resolve()
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
-    added = {}
+    added: dict[str, GalleryObject] = {}
+    skipped: Sequence[str] = []
     with atomic_directory(model) if is_new else contextlib.nullcontext(model) as run:
         if is_new:
             embedding = ObjectGallery(()).embedding
@@ -64,14 +71,21 @@ def enroll_objects(
         objects = recognizer.objects
         if name is not None:
             objects.check(name, extend=extend, replace=replace)
-        given, views = read(recognizer.run.config.sigma_s)
-        names = [objects.check(each, extend=extend, replace=replace) for each in given]
+        views: Iterator[Sequence[PreparedInstance]]
+        if isinstance(source, FrameFolder):
+            instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
+            labelled, skipped = instances.views, instances.skipped
+            if name is not None:
+                labelled = {name: [view for each in labelled.values() for view in each]}
+            views, kind = ([recognizer.model.corrected(view) for view in each] for each in labelled.values()), "frames"
+            names = list(labelled)
+        else:
+            (given, views), kind = source, "mesh"
+            names = list(given)
+        names = [objects.check(each, extend=extend, replace=replace) for each in names]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)
-            of_object = next(views)
-            if source == "frames":
-                of_object = [recognizer.model.corrected(view) for view in of_object]
-            added[each] = enrolled_views(objects.embedding, of_object, source)
+            added[each] = enrolled_views(objects.embedding, next(views), kind)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
-    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects
+    return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects, skipped

@@ -23,7 +23,7 @@ from thor2_jax.model import result_files
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
-from training.readers.frame_files import FrameSource
+from training.readers.frames import FrameSource
 
 __all__ = [
     "FrameAnswer",
@@ -131,9 +131,7 @@ class RecognizerArguments:
 
     def answer(self, source: FrameSource) -> FrameAnswer:
         """Return the answer of `recognize_frames` for a frame, in a worker process as `segment`."""
-        answer = next(recognize_frames(_loaded(self).recognize, [source]))
-        # Without the cached properties of the frame, which would be sent too.
-        return dataclasses.replace(answer, frame=None if answer.frame is None else dataclasses.replace(answer.frame))
+        return next(recognize_frames(_loaded(self).recognize, [source]))
 
 
 _loaded = functools.lru_cache(1)(RecognizerArguments.load)

@@ -16,8 +16,7 @@ from training.baselines.job import check_weights, crop_size, pretrained_files, t
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
-from training.readers.frame_files import find_frames
-from training.readers.frames import FrameFolder
+from training.readers.frames import FrameFolder, find_frames
 from training.storage.jobs import Progress, check_same_job, numbered, of_stage, prefixed
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run

@@ -13,7 +13,7 @@ from benchmarks import adaptation, cameras, explanation, levers, paper, segmenta
 from benchmarks.doctor import DAMAGES, run
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 from thor2_jax.explanation.attributions import Faithfulness
-from training.readers.frame_files import frame_files
+from training.readers.frames import frame_files
 from training.readers.labelled import LabelledFrame
 
 

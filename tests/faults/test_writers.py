@@ -18,6 +18,7 @@ from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
+from training.baselines.files import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.loop import EpochMetrics, append_metrics, read_metrics
 from training.views.dataset import MANIFEST, Manifest
@@ -31,6 +32,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "similarity.png": lambda path: draw_similarity(NETWORK, path),
     "text.json": lambda path: write_text(path, "new" * 1000),
     "overlay.png": lambda path: draw_overlay(PHOTO, PHOTO[..., 0] + 1, [thor2.Recognition(1, "mug", 1.0)], path),
+    "forest.safetensors": lambda path: write_baseline(path, StoredBaseline({"w": np.zeros(9)}, None), ("a",), 1.0),
     MANIFEST: lambda path: Manifest({"shards": 0, "objects": []}).write(path.parent),
 }
 

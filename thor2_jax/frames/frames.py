@@ -90,6 +90,10 @@ class RGBDFrame:
         for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):
             object.__setattr__(self, name, value)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields, without what is computed of them, for another process."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
         """Depth in metres [H, W] float32; 0 where there is none."""

@@ -4,17 +4,20 @@ Clouds of one object from several known poses are merged in space before they ar
 """
 
 import dataclasses
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
+from thor2_jax.files import read_file
 from thor2_jax.frames.instance_clouds import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 
-__all__ = ["PosedInstance", "check_pose", "merge_views", "transform"]
+__all__ = ["PosedInstance", "check_pose", "merge_views", "read_poses", "transform"]
 
 PosedInstance = tuple[PreparedInstance, NDArray[np.float64]]
 """An instance and the pose [4, 4] of its camera, from camera to world coordinates."""
@@ -49,6 +52,35 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
             "expected a rotation and a translation in metres, from camera to world, last row 0 0 0 1"
         )
     return matrix
+
+
+def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
+    """Return the pose [4, 4] of each frame, from camera to world coordinates in metres.
+
+    Args:
+        path: JSON file with an object, frame name -> matrix, or with a list of matrices in the order of the frames.
+        names: names of the frames.
+
+    Raises:
+        InputError: the file is invalid, a frame has no pose, there is another number of poses than of frames, or a
+            pose is not a rigid motion. The message names the file.
+        OSError: the file cannot be read.
+    """
+    content = read_file(path)
+    with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
+        stored = json.loads(content)
+        if not isinstance(stored, (dict, list)):
+            raise TypeError(f"it holds a {type(stored).__name__}")
+    if isinstance(stored, dict):
+        missing = [name for name in names if name not in stored]
+        if missing:
+            raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")
+        stored = [stored[name] for name in names]
+    if len(stored) != len(names):
+        raise InputError(f"poses: {path} has {len(stored)} poses for {len(names)} frames; expected one for each frame")
+    return [
+        check_pose(pose, f"poses: {path}: the pose of frame {name}") for name, pose in zip(names, stored, strict=True)
+    ]
 
 
 def transform(pose: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float32]:

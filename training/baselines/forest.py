@@ -55,7 +55,7 @@ int16; `threshold` [n] float64; `shares` [n, C] float32, class probabilities; an
 each tree."""
 
 
-def load_forest(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+def load_forest(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Return a forest of the arrays `NODES`; raises KeyError if one is missing."""
     nodes = {name: arrays[name] for name in NODES}
     return lambda inputs: predict(nodes, forest_features(inputs.normal, run.network, run.config))

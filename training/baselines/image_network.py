@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 import optax  # type: ignore[import-untyped]
+from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
@@ -21,8 +23,14 @@ INFERENCE_BATCH = 8
 """Crops that a network reads at a time, about the instances of a frame: one compiled program for all."""
 
 
-def crop_function(function: Callable[..., Any]) -> Callable[[ViewCrops], NDArray[np.float32]]:
-    """Return a function of V crops, at least 1, from one of `INFERENCE_BATCH` colours and normals."""
+def crop_function(
+    model: nnx.Module,
+    inputs: Callable[..., tuple[Any, ...]] = network_inputs,
+    output: Callable[[Any], Any] = jax.nn.softmax,
+) -> Callable[[ViewCrops], NDArray[np.float32]]:
+    """Return a function of V crops, at least 1: `output` [V, ...] of a network that is applied to `inputs` of them."""
+    model.eval()
+    function = compiled(model, inputs, output)
     return lambda crops: in_batches(function, INFERENCE_BATCH, crops.color, crops.normals)
 
 
@@ -33,9 +41,7 @@ def load_image_network(name: str, arrays: Mapping[str, NDArray[Any]], run: Train
         ValueError: an array is missing or has another shape.
     """
     architecture, n_classes = ARCHITECTURES[name], len(run.classes)
-    model = model_from_arrays(lambda: architecture.build(n_classes, 0), arrays)
-    model.eval()
-    predict = crop_function(compiled(model, network_inputs))
+    predict = crop_function(model_from_arrays(lambda: architecture.build(n_classes, 0), arrays))
     return lambda inputs: inputs.predicted(architecture.size, n_classes, predict)
 
 
@@ -105,7 +111,6 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
     model.train()
     fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, OPTIMIZER, partial(_learning_rate, rate))
     fitted = fit_network(task, fit, model, label, np.flatnonzero(~held_out), n_views)
-    fitted.eval()
-    predict = crop_function(compiled(fitted, network_inputs))
+    predict = crop_function(fitted)
     temperature = task.temperature(label, held_out, lambda: predict(rows_of(samples, held_out)))
     return StoredBaseline(model_arrays(fitted), temperature, weights)

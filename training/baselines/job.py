@@ -1,5 +1,6 @@
 """Training and loading the baselines of finished runs, RUN/baselines/NAME.safetensors."""
 
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,16 +33,16 @@ from training.views.normalized_views import ViewSource
 
 __all__ = ["TrainedBaseline", "check_weights", "crop_size", "load_baselines", "pretrained_files", "train_baselines"]
 
-Load = Callable[[str, Mapping[str, Any], TrainedRun], Predictor]
+Load = Callable[[Mapping[str, Any], TrainedRun], Predictor]
 
 _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
     "thor": (fit_thor, load_thor),
     "forest": (fit_forest, load_forest),
     "pointnet": (fit_pointnet, load_pointnet),
-    **dict.fromkeys(NETWORKS, (fit_image_network, load_image_network)),
+    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in NETWORKS},
     TEMPLATES: (fit_templates, load_templates),
 }
-"""Name -> functions that fit a baseline and that build it from its name, arrays and run; the second raises KeyError or
+"""Name -> functions that fit a baseline and that build it from its arrays and run; the second raises KeyError or
 ValueError for unfit arrays."""
 
 
@@ -123,7 +124,7 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
             continue
         stored = read_baseline(file, run.classes)
         try:
-            predict = _METHODS[name][1](name, stored.arrays, run)
+            predict = _METHODS[name][1](stored.arrays, run)
         except (KeyError, ValueError) as error:
             raise InputError(
                 f"model: {file} does not match its run ({error}); delete it and train the baseline again"

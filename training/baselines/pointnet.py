@@ -68,7 +68,7 @@ def random_indices(count: int, points: int, rng: np.random.Generator) -> NDArray
     return np.resize(rng.permutation(count), points)
 
 
-def load_pointnet(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Return a PointNet of its weights; which points are sampled depends only on the number of points.
 
     Raises:

@@ -4,7 +4,7 @@ A crop has the class of the template whose features have the largest cosine simi
 of the masked crop.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.model.run_directory import TrainedRun
-from training.baselines.baseline import FitTask, Predictor, compiled
+from training.baselines.baseline import FitTask, Predictor
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline
 from training.baselines.image_network import crop_function, read_samples
 from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
@@ -59,7 +59,7 @@ def _unit(features: jax.Array) -> jax.Array:
     return features / jnp.linalg.norm(features, axis=1, keepdims=True)
 
 
-def load_templates(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+def load_templates(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Return the comparison with templates: equal probabilities for padding rows.
 
     Raises:
@@ -67,19 +67,13 @@ def load_templates(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) 
     """
     name, n_classes = BACKBONES[int(arrays["number"][0])], len(run.classes)
     weights = {k.removeprefix("backbone/"): a for k, a in arrays.items() if k.startswith("backbone/")}
-    embed = embedder(model_from_arrays(partial(create_backbone, name), weights))
+    embed = crop_function(model_from_arrays(partial(create_backbone, name), weights), _color, _unit)
     features, label = arrays["features"], arrays["label"]
 
     def predict(crops: ViewCrops) -> NDArray[np.float32]:
         return compare(embed(crops), features, label, n_classes)
 
     return lambda inputs: inputs.predicted(backbone_size(name), n_classes, predict)
-
-
-def embedder(model: ViT) -> Callable[[ViewCrops], NDArray[np.float32]]:
-    """Return the function of crops of a backbone's size, at least 1, that returns their unit features [V, D]."""
-    model.eval()
-    return crop_function(compiled(model, _color, _unit))
 
 
 def compare(
@@ -129,7 +123,7 @@ def fit_templates(task: FitTask) -> StoredBaseline:
     number, model, weights = _backbone(task)
     crops, label, view = read_samples(task, backbone_size(BACKBONES[number]))
     held_out = task.held_out(label, view)
-    features = embedder(model)(crops)
+    features = crop_function(model, _color, _unit)(crops)
     task.progress("collect templates", 1, 1, f"{len(features)} crops")
     stored = features[~held_out].astype(np.float16), label[~held_out].astype(np.int16)
     n_classes = len(task.source.classes)

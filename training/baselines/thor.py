@@ -102,7 +102,7 @@ def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
     return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
 
 
-def load_thor(_: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Return the library of its weights, `<type>-<slices>/<path>`.
 
     Raises:

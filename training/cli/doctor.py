@@ -39,8 +39,7 @@ def doctor(
     from training.frame_recognition import RecognizerArguments
     from training.objects.meshes import find_meshes
 
-    if meshes is None and mesh_scale != 1:
-        raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
+    options.check_belongs("--meshes", meshes, mesh_scale=None if mesh_scale == 1 else f"{mesh_scale:g}")
     sources = given.sources(masks=False)
     paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
     recognizer = None if model is None else RecognizerArguments(model).load()

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -61,43 +61,34 @@ def enroll(
         raise InputError("name is missing; --label-name and --instance enroll one object")
     if extend and replace:
         raise InputError("extend and replace are both given; choose one")
-    for option, value in (("label_name", label_name), ("instance", instance)):
-        if mesh is not None and value is not None:
-            raise InputError(f"{option} is {value}; it belongs to frames")
-    if mesh is None and mesh_scale != 1:
-        raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
-    for field in dataclasses.fields(processes):
-        if mesh is None and (value := getattr(processes, field.name)) != field.default:
-            raise InputError(f"{field.name} is {value}; it belongs to --mesh")
+    options.check_belongs("frames", has_frames, label_name=label_name, instance=instance)
+    scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
+    options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-    skipped: list[str] = []
     with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
-        # These take seconds to import.
+        # It takes seconds to import.
         from training.enrollment import enroll_objects
-        from training.views.labelled_views import read_instances
 
-        def read(sigma_s: float) -> tuple[Iterable[str], Iterator[Sequence["PreparedInstance"]]]:
-            if frames is None:
-                return meshes, views_of_meshes
-            instances = read_instances(frames, sigma_s, label_name or name, instance)
-            skipped.extend(f"skipped: {reason}" for reason in instances.skipped)
-            if name is None:
-                return instances.views, iter(instances.views.values())
-            return [name], iter([[view for views in instances.views.values() for view in views]])
-
-        source, changes = "frames" if mesh is None else "mesh", {"extend": extend, "replace": replace}
         with show_progress(quiet) as progress:
-            counts, known = enroll_objects(
-                model, read, source, name=name, gallery=gallery, progress=progress, **changes
+            counts, known, skipped = enroll_objects(
+                model,
+                frames or (meshes, views_of_meshes),
+                name=name,
+                label_name=label_name,
+                instance=instance,
+                extend=extend,
+                replace=replace,
+                gallery=gallery,
+                progress=progress,
             )
-    for line in skipped:
-        console.print(line)
+    for reason in skipped:
+        console.print(f"skipped: {reason}")
     for each, count in counts.items():
         console.print(f"{each}: {count} views")
     if known.weak_rejection:

@@ -60,12 +60,11 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     from thor2_jax.model.run_record import RUN_FILE
     from training.readers.frames import FrameFolder
 
-    paths = given.frames or [path for path in (given.color, given.bag) if path]
+    paths = given.frames or ()
     runs = [path for path in paths if (path / RUN_FILE).is_file() or any(path.glob(f"fold-*/{RUN_FILE}"))]
-    paths = [path for path in paths if path not in runs]
-    given = dataclasses.replace(given, frames=given.frames and paths)
+    given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
     folder = FrameFolder(given.sources())
-    dataset = ", ".join(str(path.resolve()) for path in paths)
+    dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, (given.color, given.bag)))
     if folder.note:
         console.print(f"skipped: {escape_characters(folder.note)}")
     _evaluate("frames", folder, dataset, job, runs, given=given.arguments)

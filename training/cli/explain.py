@@ -41,7 +41,7 @@ def explain(
     sources = given.sources(segment, lambda frame: load().segment(frame))
     check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
     recognizer = load()
-    explained = 0
+    explained, last = 0, 0
     for source in sources:
         frame = source.read()
         labels = frame.instances if instance is None else instance
@@ -56,7 +56,7 @@ def explain(
                 print(escape_characters(f"skipped: {source.name}: {error}"), file=sys.stderr)
                 continue
             write_explanation(explanation, frame, source.name, directory)
-            explained += 1
+            explained, last = explained + 1, label
             console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
@@ -64,5 +64,5 @@ def explain(
         finish(f"{explained} pages in {out}", "see the objects that the model knows", "objects", "--model", model)
         return
     segmented = ["--segment", segment] if segment else []
-    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", label, "--model", model, "--extend"]
+    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", last, "--model", model, "--extend"]
     finish(f"{explained} pages in {out}", "if a name is wrong, add this view of the object", *again)

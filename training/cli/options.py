@@ -20,17 +20,22 @@ __all__ = [
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
+    "HostOption",
     "MAX_WORKERS",
     "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
+    "NamesOption",
     "QuietOption",
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
     "WorkersOption",
+    "check_alone",
+    "check_belongs",
     "find_segmenter",
     "given_options",
+    "given_values",
     "grouped_options",
     "recording_option",
     "split_names",
@@ -39,7 +44,7 @@ __all__ = [
 if TYPE_CHECKING:
     from thor2_jax.recordings.bags import Bag
     from thor2_jax.segmentation.segmenters import Segmenter
-    from training.readers.frame_files import FrameSource
+    from training.readers.frames import FrameSource
     from training.storage.workers import WorkerPool
 
 UnknownOption = Annotated[
@@ -68,6 +73,10 @@ GalleryOption = Annotated[
 MeshScaleOption = Annotated[
     float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]
+NamesOption = Annotated[
+    Path | None, typer.Option("--names", help="JSON or YAML table: object name -> mesh. Default: all meshes.")
+]
+HostOption = Annotated[str, typer.Option("--host", help="Address to listen on; 0.0.0.0 for other machines.")]
 AllowHostOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -84,16 +93,35 @@ recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
 """An option of recordings, which the help lists in a panel of its own."""
 
 
+def given_values(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass that do not have their defaults: the options that are given."""
+    values = ((field, getattr(record, field.name)) for field in dataclasses.fields(record))
+    return {field.name: value for field, value in values if value != field.default}
+
+
 def given_options(record: Any, without: str = "") -> list[str]:
-    """Return the options that give another command the fields of a record that do not have their defaults.
+    """Return the options that give another command the values of a record.
 
     Args:
         record: a dataclass, such as `FrameOptions` or `RecognizerArguments`.
         without: name of a field that is no option.
     """
-    values = [(field, getattr(record, field.name)) for field in dataclasses.fields(record) if field.name != without]
-    given = [(f"--{field.name.replace('_', '-')}", value) for field, value in values if value != field.default]
+    given = [(f"--{name.replace('_', '-')}", value) for name, value in given_values(record).items() if name != without]
     return [str(part) for pair in given for part in pair]
+
+
+def check_belongs(owner: str, is_given: object, **values: object) -> None:
+    """Raise InputError if `owner` is not given, but an option that belongs to it has a value, which is not None."""
+    for name, value in values.items():
+        if value is not None and not is_given:
+            raise InputError(f"{name} is {value}; it belongs to {owner}")
+
+
+def check_alone(option: str, given: object, **values: object) -> None:
+    """Raise InputError if an option is given, and another one that it excludes has a value, too."""
+    for name, value in values.items():
+        if value and given:
+            raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,15 +157,11 @@ class FrameOptions:
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""
-        if self.bag is not None:
-            for name in ("frames", "color", "depth", "labels"):
-                if getattr(self, name):
-                    raise InputError(f"{name} is {getattr(self, name)} and bag is {self.bag}; give one of them")
-            return
-        for name in ("color_topic", "depth_topic", "camera_topic", "max_gap", "every"):
-            if getattr(self, name) != getattr(FrameOptions, name):
-                raise InputError(f"{name} is {getattr(self, name)}; it belongs to --bag")
-        if bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
+        check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
+        of_bag = ("color_topic", "depth_topic", "camera_topic", "max_gap", "every")
+        given = given_values(self)
+        check_belongs("--bag", self.bag, **{name: given[name] for name in of_bag if name in given})
+        if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
 
     def sources(
@@ -155,11 +179,10 @@ class FrameOptions:
             OSError: a recording cannot be opened.
         """
         from thor2_jax.segmentation.segmenters import TABLE
-        from training.readers.frame_files import FrameFiles, find_frames, recorded_sources, segmented_source
+        from training.readers.frames import FrameFiles, find_frames, recorded_sources, segmented_source
 
         self.check()
-        if self.labels is not None and segment is not None:
-            raise InputError(f"labels is {self.labels} and segment is {segment}; give one of them")
+        check_alone("segment", segment, labels=self.labels)
         if self.bag is not None:
             segment = segment or (TABLE if masks else None)
             sources, notes = recorded_sources(self.open_bag, self.every)

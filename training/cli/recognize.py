@@ -75,21 +75,15 @@ def recognize(
         track_frames,
     )
     from training.readers.bop import read_object_names
-    from training.readers.frame_files import read_poses, segmented_source
+    from training.readers.frames import segmented_source
 
     given.check()
     frames, recording = given.frames, given.bag
-    if recording is not None:
-        refused: dict[str, object] = {"names": names, "coco": coco, "bop": bop, "poses": poses}
-        for name, value in {**refused, "workers": processes.workers, "engine": processes.engine}.items():
-            if value not in (None, 1, "local"):
-                raise InputError(f"{name} is {value} and bag is {recording}; give one of them")
-    elif out_bag is not None:
-        raise InputError(f"out_bag is {out_bag}; it belongs to --bag")
-    if names is not None and coco is None and bop is None:
-        raise InputError(f"names is {names}; it belongs to --coco and --bop")
-    if poses is not None and not track:
-        raise InputError(f"poses is {poses}; it belongs to --track")
+    in_workers = options.given_values(processes)
+    options.check_alone("bag", recording, names=names, coco=coco, bop=bop, poses=poses, **in_workers)
+    options.check_belongs("--bag", recording, out_bag=out_bag)
+    options.check_belongs("--coco and --bop", coco or bop, names=names)
+    options.check_belongs("--track", track, poses=poses)
     pool = processes.pool()
     if pool is not None and (track or not frames):
         reason = "--track, which takes the frames in turn" if track else "one frame"
@@ -105,7 +99,11 @@ def recognize(
     else:
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
-    of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
+    frame_poses = None
+    if poses is not None:
+        from thor2_jax.tracking.poses import read_poses  # imports SciPy
+
+        frame_poses = read_poses(poses, [source.name for source in sources])
     if out is not None:
         resumable = {source.name.split("/")[0] for source in sources} if frames else result_files.RESULT_FILES
         check_output_directory(out, resumable=() if recording else resumable)
@@ -131,7 +129,7 @@ def recognize(
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
             answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
         elif track:
-            answers = track_frames(recognizer, sources, of_frames)
+            answers = track_frames(recognizer, sources, frame_poses)
         elif pool is not None:
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:

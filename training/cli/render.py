@@ -31,9 +31,7 @@ def render(
     processes: options.RenderWorkers,
     meshes: Annotated[Path, typer.Option(help="Directory of meshes (GLB, OBJ, PLY), one per file or subdirectory.")],
     out: Annotated[Path, typer.Option(help="Directory for the views: new, or begun by this command.")],
-    names: Annotated[
-        Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
-    ] = None,
+    names: options.NamesOption = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
     kinds: AugmentationOptions,

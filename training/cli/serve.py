@@ -15,7 +15,7 @@ from training.cli.app import app
 @app.command()
 def serve(
     model: options.ModelOption,
-    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    host: options.HostOption = "127.0.0.1",
     allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one, named in the log.")] = 8080,
     workers: Annotated[

@@ -39,9 +39,7 @@ def train(
         list[Path] | None,
         typer.Option(metavar="DIR...", help="Folders of labelled frames, whose instances are views, too."),
     ] = None,
-    names: Annotated[
-        Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
-    ] = None,
+    names: options.NamesOption = None,
     paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Train in half of the time, with fewer distractors and networks.")

@@ -37,7 +37,7 @@ def watch(
     camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
     unknown_below: options.UnknownOption = None,
     answer_by: options.AnswerByOption = None,
-    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    host: options.HostOption = "127.0.0.1",
     allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8090,
 ) -> None:

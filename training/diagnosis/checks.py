@@ -178,11 +178,11 @@ def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float 
     if MIN_SIDE <= min(sides.values()) and max(sides.values()) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
         return sides
     fitting = [each for each in SCALES if USUAL_SIDE[0] <= median * each <= USUAL_SIDE[1]]
-    unit, mend = "its unit is unknown", "--mesh-scale sets the factor"
+    unit, remedy = "its unit is unknown", "--mesh-scale sets the factor"
     if fitting:
-        unit, mend = f"it is likely in {SCALES[fitting[0]]}", f"--mesh-scale {fitting[0] * scale:g} mends it"
+        unit, remedy = f"it is likely in {SCALES[fitting[0]]}", f"give --mesh-scale {fitting[0] * scale:g}"
     measured = f"meshes is {median:.4g} (median)" if len(sides) > 1 else f"mesh is {median:.4g}"
     usual = f"{USUAL_SIDE[0]:g} to {USUAL_SIDE[1]:g}"
     message = f"The longest side of the {measured}; in metres, objects on a table have {usual}: {unit}."
-    diagnosis.add("mesh-unit", message, f"Meshes are read in metres; {mend}.")
+    diagnosis.add("mesh-unit", message, f"Meshes are read in metres; {remedy}.")
     return {}

@@ -1,7 +1,7 @@
 """Checks of colour: light and cast in the image alone, the order of the channels with a trained recognizer.
 
-One frame does not show whether red and blue are exchanged: apples may be blue. A recognizer knows its objects, so it is
-surer of their names in the right order.
+One frame does not show whether red and blue are exchanged: apples may be blue. A recognizer knows its objects, so its
+confidence is higher with the channels in the right order.
 """
 
 import dataclasses
@@ -27,10 +27,10 @@ MAX_CAST = 2.2
 """Largest ratio of the contrasts of two channels (generalized mean of order 4), which are equal in white light."""
 
 MIN_LOGIT_GAIN = 0.2
-"""How much surer, in mean log-odds, a recognizer must be with exchanged channels."""
+"""Least gain of a recognizer's mean log-odds with exchanged channels."""
 
 MIN_CONFIDENCE_GAIN = 0.2
-"""How much surer, in mean confidence, a recognizer must be with other light."""
+"""Least gain of a recognizer's mean confidence with other light."""
 
 MAX_LOGIT = 7.0
 
@@ -82,7 +82,7 @@ def _contrast(channel: NDArray[np.uint8]) -> float:
 
 
 def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer) -> None:
-    """Check the order of the channels and the light of a frame by how sure a recognizer is of its objects."""
+    """Check the order of the channels and the light of a frame by the confidence of a recognizer."""
 
     def confidences(color: NDArray[np.uint8]) -> NDArray[np.float64]:
         answers = recognizer.recognize(dataclasses.replace(frame, color=color))
@@ -100,15 +100,15 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
     if _logit(exchanged) - _logit(given) > MIN_LOGIT_GAIN and exchanged.mean() > lights[best].mean():
         diagnosis.add(
             "bgr",
-            f"With red and blue exchanged, the model is surer of the {len(given)} objects (mean confidence "
-            f"{exchanged.mean():.2f} in place of {given.mean():.2f}): the colour image is BGR, not RGB.",
+            f"With red and blue exchanged, the model is more confident of the {len(given)} objects (mean confidence "
+            f"{exchanged.mean():.2f} instead of {given.mean():.2f}): the colour image is BGR, not RGB.",
             "Store RGB; OpenCV's imread and cvtColor give BGR, imwrite expects it.",
         )
     elif lights[best].mean() - given.mean() > MIN_CONFIDENCE_GAIN:
         diagnosis.add(
             "color-light",
-            f"{FAR}: if they were {best}, the model would be surer of the objects (mean confidence "
-            f"{lights[best].mean():.2f} in place of {given.mean():.2f}).",
+            f"{FAR}: if they were {best}, the model would be more confident of the objects (mean confidence "
+            f"{lights[best].mean():.2f} instead of {given.mean():.2f}).",
             "Set the exposure and the white balance of the camera.",
         )
 

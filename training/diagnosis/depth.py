@@ -1,4 +1,4 @@
-"""Checks of depth: its unit, its range, how much of it there is, and the focal length by the sizes of known meshes."""
+"""Checks of depth: its unit, its range and its missing pixels, and the focal length by the sizes of known meshes."""
 
 import math
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ MIN_EXTENT, MAX_EXTENT = 0.02, 0.45
 """Range of the median longest side of the objects of a frame, metres, if no meshes are given."""
 
 EXTENT_MARGIN = 2.0
-"""How much smaller or larger than all meshes the median object may be."""
+"""Largest factor by which the median object is smaller or larger than all meshes."""
 
 MAX_RATIO = 1.35
 """Largest median ratio of an object's visible longest side to that of its mesh. Sound frames have 0.8 to 1.1, occluded

@@ -34,7 +34,7 @@ MIN_NEAR = 4.0
 """Least height without a shift, in the same unit, of a frame that may be registered."""
 
 MIN_GAIN = 1.25
-"""How much higher than without a shift or a transformation a peak must be."""
+"""Least ratio of a peak to the one without a shift or a transformation."""
 
 WIDTH = 640
 

@@ -19,8 +19,7 @@ from training.diagnosis.checks import Diagnosis, check_camera, check_labels, che
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth
 from training.diagnosis.registration import check_labels_alignment, check_registration
-from training.readers.frame_files import FrameFiles
-from training.readers.frames import read_names
+from training.readers.frames import FrameFiles, read_names
 
 __all__ = ["diagnose"]
 

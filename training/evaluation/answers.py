@@ -205,10 +205,15 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
 
 
 class Predictions(NamedTuple):
-    """Predicted classes [B] and their fused probabilities [B]."""
+    """Predicted classes [N] and their fused probabilities [N]; -1 and 0 for instances that were not described."""
 
     class_index: NDArray[np.intp]
     confidence: NDArray[np.floating[Any]]
+
+    @property
+    def described(self) -> NDArray[np.bool_]:
+        """[N], whether the instance was described."""
+        return self.class_index >= 0
 
 
 def fuse_by(

@@ -57,10 +57,6 @@ class FramePictures:
         """Return the path of the picture of an object with a wrong name."""
         return self._out / "confusions" / f"{self._names.index(truth)}-{self._names.index(name)}.jpg"
 
-    def restore(self, answers: FrameAnswers) -> None:
-        """Take into account a frame that was drawn before the evaluation was interrupted."""
-        self._record(answers)
-
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
 
@@ -68,13 +64,17 @@ class FramePictures:
             OSError: a file cannot be written.
         """
         color, labels = item.frame.color, item.frame.label_image
-        for instance, name in self._record(answers):
+        for instance, name in self.record(answers):
             draw_crop(color, labels == instance.label, self.confusion_path(instance.truth, name))
         if number in self.shown:
             draw_judged(color, labels, self._judge(answers), self.frame_path(number))
 
-    def _record(self, answers: FrameAnswers) -> list[tuple[InstancePrediction, str]]:
-        """Record the confidences; return instance and wrong name where it is the most confident equal one so far."""
+    def record(self, answers: FrameAnswers) -> list[tuple[InstancePrediction, str]]:
+        """Record the confidences of a frame, which may have been drawn before the evaluation was interrupted.
+
+        Returns:
+            Instances with their wrong names, each the most confident one so far that has this name wrongly.
+        """
         most_confident = []
         for _, instance, name, confidence in named_answers(answers.instances, self._runs):
             if instance.truth not in self._names:

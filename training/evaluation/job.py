@@ -45,9 +45,6 @@ NO_PIXELS = "no pixels in the label image"
 Load = tuple[tuple[Path, ...], tuple[str, ...] | None]
 """Arguments of `load_evaluated`."""
 
-FRAMES_PER_CHUNK = 4
-"""Frames that a worker answers at a time, and that are answered again if it dies."""
-
 
 def evaluate_dataset(
     runs: Sequence[Run],
@@ -98,7 +95,7 @@ def evaluate_dataset(
             remove_leftovers(directory)
         pictures = FramePictures(out, runs, len(frames))
         for answers in file.frames:
-            pictures.restore(answers)
+            pictures.record(answers)
         first, start = len(file.frames), time.perf_counter()
         progress("evaluate", first, len(frames), "")
         with contextlib.closing(answering(range(first, len(frames)))) as answered:
@@ -182,7 +179,7 @@ def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None =
 def answer_frames_in_pool(
     load: Load, frames: LabelledFrames, pool: WorkerPool, numbers: range
 ) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
-    """Yield the frames of these numbers with the answers of `answer_frames`, which workers compute in chunks.
+    """Yield the frames of these numbers with the answers of `answer_frames`, which workers compute.
 
     Frames before one that cannot be read are yielded before its error is raised.
 
@@ -196,31 +193,17 @@ def answer_frames_in_pool(
         InputError: as `answer_frames`.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
-    starts = range(0, len(numbers), FRAMES_PER_CHUNK)
-    chunks = [(load, frames, numbers[start : start + FRAMES_PER_CHUNK]) for start in starts]
-    with contextlib.closing(pool(_answer_chunk, chunks)) as results:
-        for answered, error in results:
-            yield from answered
-            if error is not None:
-                raise error
+    answer = functools.partial(_answer_first, load)
+    with contextlib.closing(pool(answer, (frames.only(number) for number in numbers))) as answered:
+        yield from answered
 
 
 _loaded = functools.lru_cache(1)(load_evaluated)
 """Loads the runs once in a worker process."""
 
 
-def _answer_chunk(
-    chunk: tuple[Load, LabelledFrames, range],
-) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
-    load, frames, numbers = chunk
-    runs, answered = _loaded(*load), []
-    try:
-        for item, answers in answer_frames(runs, (frames[n] for n in numbers)):
-            frame = dataclasses.replace(item.frame)  # without its cached properties
-            answered.append((dataclasses.replace(item, frame=frame), answers))
-    except (InputError, OSError) as error:
-        return answered, error
-    return answered, None
+def _answer_first(load: Load, frames: LabelledFrames) -> tuple[LabelledFrame, FrameAnswers]:
+    return next(answer_frames(_loaded(*load), frames))
 
 
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:

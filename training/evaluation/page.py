@@ -159,7 +159,7 @@ def _answer_section(report: Mapping[str, Any], pictures: FramePictures, out: Pat
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
         crop = pictures.confusion_path(pair["truth"], name)
         if crop.is_file():
-            shown.append(Picture(crop.relative_to(out).as_posix(), f"{truth}, recognized as {name}", small=True))
+            shown.append(Picture(crop.relative_to(out).as_posix(), f"{truth}, recognized as {name}", "small"))
     models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
     text = " ".join(answer_texts(report)[:2]) + models
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
@@ -311,7 +311,7 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
         text += f" With one that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(statistics)} of the unknown "
         text += "objects have a name."
         caption = f"Unknown objects that {main} names, by the share of its correct answers that a threshold keeps."
-        pictures = [Picture("known-unknown.png", caption, half=True)]
+        pictures = [Picture("known-unknown.png", caption, "half")]
     return [Section("Unknown objects", text, (header, table), pictures)]
 
 
@@ -343,7 +343,7 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     )
     draw_reliability(report["reliability"], report["main"], out / "reliability.png")
     caption = f"Accuracy of {report['main']} by confidence."
-    pictures = [Picture("reliability.png", caption, half=True)]
+    pictures = [Picture("reliability.png", caption, "half")]
     return _main_row(Section("Confidence", text, (["", *columns], rows), pictures), report["main"])
 
 
@@ -353,7 +353,7 @@ def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path
         "true object stands in brackets; none: the instance could not be described."
     )
     shown = [
-        Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", half=True)
+        Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", "half")
         for number, name in zip(pictures.shown, report["shown"], strict=True)
     ]
     return Section("Frames", text, pictures=shown)

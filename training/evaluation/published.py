@@ -16,7 +16,6 @@ from training.evaluation.scores import summarize_runs
 __all__ = [
     "compare_with_published",
     "published_attributes",
-    "published_means",
     "published_seconds",
     "published_tables",
 ]
@@ -43,11 +42,6 @@ def published_tables(kind: str) -> list[dict[str, Any]]:
     return [{**table, "source": content["sources"][table["source"]]} for table in tables]
 
 
-def _comparable_tables(kind: str, own_objects: bool) -> list[dict[str, Any]]:
-    """Return the tables whose classes are those of an evaluation on each sequence's own objects, or on all."""
-    return [table for table in published_tables(kind) if table["own_objects"] in (None, own_objects)]
-
-
 def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, str]:
     """Return the attributes of a frame with the values that the published tables name.
 
@@ -60,24 +54,6 @@ def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, 
         name = values["sequence"].rpartition("/")[2]
         values["sequence"] = f"S-{name.removeprefix('seq')}"
     return values
-
-
-def published_means(kind: str, where: Mapping[str, str], own_objects: bool) -> dict[str, float]:
-    """Return method -> published mean accuracy, from 0 to 1, of exactly these attribute values; often empty.
-
-    Args:
-        kind: kind of dataset.
-        where: attribute values, as the reader names them.
-        own_objects: whether the classes are the objects of the frame's own sequence.
-    """
-    values = published_attributes(kind, where)
-    return {
-        method: mean / 100
-        for table in _comparable_tables(kind, own_objects)
-        for cell in table["cells"]
-        if cell["where"] == values
-        for method, (mean, _) in cell["accuracy"].items()
-    }
 
 
 def published_seconds() -> dict[str, float]:
@@ -128,7 +104,9 @@ def compare_with_published(
     """
     values = [published_attributes(kind, each) for each in attributes]
     comparisons, real_views = [], any(run.has_real_views for run in runs)
-    for table in _comparable_tables(kind, runs[0].own_objects):
+    for table in published_tables(kind):
+        if table["own_objects"] not in (None, runs[0].own_objects):
+            continue
         cells, shown = [], np.zeros(len(values), bool)
         for cell in table["cells"]:
             rows = np.array([cell["where"].items() <= each.items() for each in values], bool)

@@ -20,7 +20,7 @@ from training.evaluation.answers import (
     fusions,
     main_fusion,
 )
-from training.evaluation.published import compare_with_published, published_means
+from training.evaluation.published import compare_with_published
 from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
@@ -30,6 +30,7 @@ __all__ = ["compute_results", "fuse_answers", "named_answers"]
 CURVE = tuple(k / 100 for k in range(101))
 """Shares of the correct answers at which the known/unknown curve is computed."""
 
+Floats = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
 
@@ -47,13 +48,14 @@ Fused = Mapping[str, Mapping[int, Predictions]]
 def fuse_answers(
     instances: Sequence[InstancePrediction], runs: Sequence[Run], rule: Rule = DEFAULT_RULE
 ) -> dict[str, dict[int, Predictions]]:
-    """Return fusion -> index of the run -> predictions for those of `instances` that were described.
+    """Return fusion -> index of the run -> predictions for the instances.
 
     The rule "calibrated" leaves out classifiers without a temperature.
     """
     predictors = all_predictors(runs)
-    described = [i.probabilities for i in instances if i.probabilities is not None]
-    table = np.stack(described) if described else np.zeros((0, len(predictors), 1), np.float32)  # [N, M, C]
+    described = np.array([i.probabilities is not None for i in instances], bool)
+    tables = [i.probabilities for i in instances if i.probabilities is not None]
+    table = np.stack(tables) if tables else np.zeros((0, len(predictors), 1), np.float32)  # [described, M, C]
     predictions: dict[str, dict[int, Predictions]] = {title: {} for title in fusions(name for _, name in predictors)}
     for index, run in enumerate(runs):
         probabilities = {
@@ -62,8 +64,10 @@ def fuse_answers(
             if owner == index and (rule != "calibrated" or name in run.temperatures)
         }
         for title, names in fusions(probabilities).items():
-            fused = {name: probabilities[name] for name in names}
-            predictions[title][index] = fuse_by(rule, fused, run.temperatures)
+            fused = fuse_by(rule, {name: probabilities[name] for name in names}, run.temperatures)
+            answer = Predictions(np.full(len(instances), -1), np.zeros(len(instances), fused.confidence.dtype))
+            answer.class_index[described], answer.confidence[described] = fused
+            predictions[title][index] = answer
     return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
@@ -74,13 +78,13 @@ def named_answers(
 
     The name is None if the confidence is below the run's threshold: the object is unknown.
     """
-    described = [i for i in instances if i.probabilities is not None]
-    predictions = fuse_answers(described, runs)
+    predictions = fuse_answers(instances, runs)
     for run, answers in predictions[main_fusion(predictions, runs[0].answer_by)].items():
         thresholds = runs[run].thresholds
-        for instance, index, confidence in zip(described, answers.class_index, answers.confidence, strict=True):
-            name = runs[run].classes[index] if confidence >= thresholds[index] else None
-            yield run, instance, name, float(confidence)
+        for instance, index, confidence in zip(instances, *answers, strict=True):
+            if index >= 0:
+                name = runs[run].classes[index] if confidence >= thresholds[index] else None
+                yield run, instance, name, float(confidence)
 
 
 def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
@@ -113,29 +117,26 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         if instance.truth in classes
     ]
     placement = np.concatenate(scores.find_placements(frames))[is_known]
-    described = np.array([i.probabilities is not None for i in instances])
     truth = np.array([classes.index(i.truth) for i in instances], np.intp)
     by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
-    unknown_by_rule = {rule: fuse_answers(unknown, runs, rule) for rule in (DEFAULT_RULE, "calibrated")}
+    described_unknown = [instance for instance in unknown if instance.probabilities is not None]
+    unknown_by_rule = {rule: fuse_answers(described_unknown, runs, rule) for rule in (DEFAULT_RULE, "calibrated")}
     tables = scores.attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
     by_run, unknown_by_run = by_rule[DEFAULT_RULE][main], unknown_by_rule[DEFAULT_RULE][main]
-    answers = {
-        rule: {title: [_of_all(p, described) for p in by_run.values()] for title, by_run in fused.items()}
+    correct = {
+        rule: {title: [p.class_index == truth for p in by_run.values()] for title, by_run in fused.items()}
         for rule, fused in by_rule.items()
     }
-    correct = {
-        rule: {title: [answer == truth for answer in each] for title, each in by_title.items()}
-        for rule, by_title in answers.items()
-    }
-    rejection = [_rejection(by_run[run], truth, described, unknown_by_run[run], runs[run].thresholds) for run in by_run]
+    rejection = [_rejection(by_run[run], truth, unknown_by_run[run], runs[run].thresholds) for run in by_run]
     # Rows are true classes; the last column has the instances that are not described, by their index -1.
     confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
-    for answer in answers[DEFAULT_RULE][main]:
-        np.add.at(confusion, (truth, answer), 1)
+    for predictions in by_run.values():
+        np.add.at(confusion, (truth, predictions.class_index), 1)
 
-    def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
-        return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
+    def of_runs(measure: Callable[[Predictions], float]) -> dict[str, Any]:
+        fused = by_rule[DEFAULT_RULE]
+        return {title: summarize_runs([measure(each) for each in fused[title].values()]) for title in fused}
 
     counts, worst = _answers([*instances, *unknown], runs)
     return {
@@ -161,24 +162,23 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         ),
         "scratch": scratch_networks(runs),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, correct[rule], runs[0].own_objects) for names in tables]
-            for rule in by_rule
+            rule: [_accuracy(names, attributes, by_title) for names in tables] for rule, by_title in correct.items()
         },
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
         },
-        "confidence": _confidence(by_rule[DEFAULT_RULE], truth[described], unknown_by_rule[DEFAULT_RULE]),
-        "calibrated_confidence": _confidence(by_rule["calibrated"], truth[described], unknown_by_rule["calibrated"]),
+        "confidence": _confidence(by_rule[DEFAULT_RULE], truth, unknown_by_rule[DEFAULT_RULE]),
+        "calibrated_confidence": _confidence(by_rule["calibrated"], truth, unknown_by_rule["calibrated"]),
         "placements": {
             "count": len(np.unique(placement)),
-            "accuracy": of_runs(scores.placement_accuracy, correct[DEFAULT_RULE]),
-            "steadiness": of_runs(scores.steadiness, answers[DEFAULT_RULE]),
+            "accuracy": of_runs(lambda each: scores.placement_accuracy(placement, each.class_index == truth)),
+            "steadiness": of_runs(lambda each: scores.steadiness(placement, each.class_index)),
         },
         "main": main,
         "rejection": summarize_rows(rejection),
-        "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth[described]),
-        "reliability": _reliability(list(by_run.values()), truth[described]),
+        "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth),
+        "reliability": _reliability(list(by_run.values()), truth),
         "confusion": confusion.tolist(),
         "answers": counts,
     }
@@ -189,27 +189,14 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(first) + (", ..." if len(first) == MAX_LISTED else "") if first else "no names"
 
 
-def _of_all(predictions: Predictions, described: Flags) -> Integers:
-    """Return the predicted class of every instance [N]; -1 of those that were not described."""
-    answers = np.full(len(described), -1, np.intp)
-    answers[described] = predictions.class_index
-    return answers
-
-
 def _accuracy(
-    kind: str,
-    names: Sequence[str],
-    attributes: Sequence[Mapping[str, str]],
-    correct: Mapping[str, Sequence[Flags]],
-    own_objects: bool,
+    names: Sequence[str], attributes: Sequence[Mapping[str, str]], correct: Mapping[str, Sequence[Flags]]
 ) -> dict[str, Any]:
-    """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
+    """Return the accuracy of each fusion by the named attributes."""
     cells = []
     for values, rows in scores.group_by_attributes(attributes, names).items():
-        where = dict(zip(names, values, strict=True))
         accuracy = {title: summarize_runs([marks[rows].mean() for marks in each]) for title, each in correct.items()}
-        others = published_means(kind, where, own_objects)
-        cells.append({"where": where, "instances": len(rows), "accuracy": accuracy, "published": others})
+        cells.append({"where": dict(zip(names, values, strict=True)), "instances": len(rows), "accuracy": accuracy})
     return {"by": list(names), "cells": cells}
 
 
@@ -221,8 +208,14 @@ def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]
     }
 
 
-def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
-    confidence, correct = np.minimum(known.confidence, 1), known.class_index == truth
+def _judged(known: Predictions, truth: Integers) -> tuple[Floats, Flags]:
+    """Return the confidences of the described instances, at most 1, and whether their answers are correct."""
+    described = known.described
+    return np.minimum(known.confidence[described], 1), (known.class_index == truth)[described]
+
+
+def _confidence_of_run(known: Predictions, truth: Integers, unknown: Predictions) -> dict[str, float]:
+    confidence, correct = _judged(known, truth)
     of_unknown = np.minimum(unknown.confidence, 1)
     threshold, accuracy = scores.accuracy_at_coverage(confidence, correct)
     every = np.concatenate([confidence, of_unknown])
@@ -238,16 +231,15 @@ def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Pre
 
 
 def _rejection(
-    known: Predictions, truth: Integers, described: Flags, unknown: Predictions, thresholds: NDArray[np.float64]
+    known: Predictions, truth: Integers, unknown: Predictions, thresholds: NDArray[np.float64]
 ) -> dict[str, float]:
     """Return shares of the known and the unknown objects without rejection and at the run's thresholds [C]."""
-    correct = _of_all(known, described) == truth
-    named = described.copy()
-    named[described] = known.confidence >= thresholds[known.class_index]
+    correct = known.class_index == truth
+    named = known.described & (known.confidence >= thresholds[known.class_index])
     return {
         "threshold": float(np.median(thresholds)) or np.nan,
         "accuracy": float(correct.mean()),
-        "incorrect": float((described & ~correct).mean()),
+        "incorrect": float((known.described & ~correct).mean()),
         "accuracy_at_threshold": float((correct & named).mean()),
         "incorrect_at_threshold": float((named & ~correct).mean()),
         "unknown_named_at_threshold": float((unknown.confidence >= thresholds[unknown.class_index]).mean())
@@ -273,9 +265,8 @@ def _known_unknown(
 
 def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[str, list[Any]]:
     """Return the bins of the reliability diagram, all runs together."""
-    confidence = np.concatenate([p.confidence for p in predictions])
-    correct = np.concatenate([p.class_index == truth for p in predictions])
-    bins = scores.reliability(np.minimum(confidence, 1), correct)
+    confidence, correct = zip(*(_judged(each, truth) for each in predictions), strict=True)
+    bins = scores.reliability(np.concatenate(confidence), np.concatenate(correct))
     return {
         name: [None if np.isnan(value) else value for value in values.tolist()]
         for name, values in bins._asdict().items()

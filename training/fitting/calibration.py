@@ -101,8 +101,8 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
 
 
 KEPT = 0.85
-"""Share of the correct held-out answers whose confidence reaches the threshold of a run. Held-out views have more faults
-than frames: 95 % of the correct answers to frames of nineteen real and simulated cameras reach it."""
+"""Share of the correct held-out answers whose confidence reaches the threshold of a run. Held-out views have more
+faults than frames, of whose correct answers 95 % reach it (real and simulated cameras)."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_path
+from training.readers.labelled import LabelledFrames, dataset_folder, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -47,57 +47,51 @@ class BOP(LabelledFrames):
         """
         path = dataset_folder(named_path(path))
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
-        self._images = [(scene, image) for scene in scenes for image in _images(scene / "rgb")]
-        self.identifiers = [f"{scene.name}/{image.stem}" for scene, image in self._images]
-        if not self._images:
+        self.sources = [image for scene in scenes for image in _images(scene / "rgb")]
+        self.identifiers = [f"{_scene(image).name}/{image.stem}" for image in self.sources]
+        if not self.sources:
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
         self._names_file = names
         self._names = None if names is None else read_object_names(Path(names))
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also raises InputError for an image or object that a table lacks."""
-        scene, image = self._images[number]
-        with with_context(self.identifiers[number]):
-            with self._entry(scene, "camera", image) as entry:
-                intrinsics = _intrinsics(entry)
-            with self._entry(scene, "gt", image) as entry:
-                objects = _values(entry, "obj_id", int)
-            visible: list[float] = [1.0] * len(objects)
-            if (scene / "scene_gt_info.json").exists():
-                with self._entry(scene, "gt_info", image) as entry:
-                    visible = _values(entry, "visib_fract", (int, float))
-                    if len(visible) != len(objects):
-                        raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
-            depth = read_depth(scene / "depth" / f"{image.stem}.png")
-            masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
-            sizes = [int(mask.sum()) for mask in masks]
-            labels = np.zeros(depth.shape, np.int32)
-            for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
-                labels[masks[k]] = k + 1
-            scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
-            truth = {k + 1: self._name(objects[k]) for k in scored}
-            frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
-        return LabelledFrame(self.identifiers[number], frame, truth, {"scene": scene.name})
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, the names of its scored instances and its scene.
 
-    @contextlib.contextmanager
-    def _entry(self, scene: Path, name: str, image: Path) -> Iterator[Any]:
-        """Yield the entry of an image in a table of its scene; errors name the table."""
-        path, number = scene / f"scene_{name}.json", str(int(image.stem))
-        status = path.stat()
-        table = _read_table(path, status.st_mtime_ns, status.st_size)
-        with with_context(str(path)):
-            if number not in table:
-                raise InputError(f"it has no image {number}")
-            yield table[number]
+        Raises:
+            InputError: also for an image or an object that a table lacks.
+        """
+        image = self.sources[number]
+        scene = _scene(image)
+        with _entry(image, "camera") as entry:
+            intrinsics = _intrinsics(entry)
+        with _entry(image, "gt") as entry:
+            objects = _values(entry, "obj_id", int)
+        visible: list[float] = [1.0] * len(objects)
+        if (scene / "scene_gt_info.json").exists():
+            with _entry(image, "gt_info") as entry:
+                visible = _values(entry, "visib_fract", (int, float))
+                if len(visible) != len(objects):
+                    raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
+        depth = read_depth(scene / "depth" / f"{image.stem}.png")
+        masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
+        sizes = [int(mask.sum()) for mask in masks]
+        labels = np.zeros(depth.shape, np.int32)
+        for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
+            labels[masks[k]] = k + 1
+        scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
+        truth = {k + 1: self._name(objects[k]) for k in scored}
+        frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
+        return frame, truth, {"scene": scene.name}
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame: its images, its masks and the tables of its scene."""
-        folder, image = self._images[number]
-        tables = [folder / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
-        masks = sorted((folder / "mask_visib").glob(f"{image.stem}_*.png"))
-        return [image, folder / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
+        image = self.sources[number]
+        scene = _scene(image)
+        tables = [scene / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
+        masks = sorted((scene / "mask_visib").glob(f"{image.stem}_*.png"))
+        return [image, scene / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
 
     def _name(self, obj_id: int) -> str:
         if self._names is None:
@@ -105,6 +99,22 @@ class BOP(LabelledFrames):
         if obj_id not in self._names:
             raise InputError(f"{self._names_file} lacks the obj_id {obj_id}")
         return self._names[obj_id]
+
+
+def _scene(image: Path) -> Path:
+    return image.parent.parent
+
+
+@contextlib.contextmanager
+def _entry(image: Path, name: str) -> Iterator[Any]:
+    """Yield the entry of an image in a table of its scene; errors name the table."""
+    path, number = _scene(image) / f"scene_{name}.json", str(int(image.stem))
+    status = path.stat()
+    table = _read_table(path, status.st_mtime_ns, status.st_size)
+    with with_context(str(path)):
+        if number not in table:
+            raise InputError(f"it has no image {number}")
+        yield table[number]
 
 
 @functools.lru_cache(maxsize=3)  # frames are read scene by scene

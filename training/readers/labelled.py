@@ -1,12 +1,13 @@
 """Labelled frames, and the interface of all dataset readers."""
 
 import abc
+import copy
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = [
@@ -79,26 +80,40 @@ class LabelledFrames(abc.ABC):
 
     Attributes:
         identifiers: identifiers of all frames, known without reading them.
+        sources: what each frame is read from, for instance its colour image.
     """
 
     identifiers: Sequence[str]
+    sources: Sequence[Any]
 
     def __len__(self) -> int:
         return len(self.identifiers)
 
-    @abc.abstractmethod
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame.
 
         Raises:
             IndexError: `number` is out of range.
-            InputError: a file is missing or damaged, or files do not belong together; names the file.
+            InputError: a file is missing or damaged, or files do not belong together; names the frame and the file.
             OSError: a file cannot be opened.
         """
+        identifier = self.identifiers[number]
+        with with_context(identifier):
+            return LabelledFrame(identifier, *self.read(number))
+
+    @abc.abstractmethod
+    def read(self, number: int) -> tuple[RGBDFrame, Mapping[int, str], Mapping[str, str]]:
+        """Read the images, the names and the attributes of a frame, see `LabelledFrame`; raises as indexing does."""
 
     def files(self, number: int) -> Sequence[Path]:
         """Return the files that a frame is read from; by default none are known."""
         return ()
+
+    def only(self, number: int) -> Self:
+        """Return a dataset of one of the frames. Processes get it, since all paths of a large dataset take seconds."""
+        one = copy.copy(self)
+        one.identifiers, one.sources = [self.identifiers[number]], [self.sources[number]]
+        return one
 
     def __iter__(self) -> Iterator[LabelledFrame]:
         """Read the frames one at a time; raises as indexing does."""

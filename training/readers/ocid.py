@@ -1,4 +1,4 @@
-"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: clutter that grows by an object a frame.
+"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: each frame has one more object.
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
 Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects. A
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
+from training.readers.labelled import LabelledFrames, dataset_folder, path_ends, sequence_of
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
@@ -58,58 +58,61 @@ class OCID(LabelledFrames):
             OSError: `names` cannot be opened.
         """
         path = dataset_folder(path)
-        self._root = path / "YCB10" if (path / "YCB10").is_dir() else path
-        self._images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
+        root = path / "YCB10" if (path / "YCB10").is_dir() else path
+        images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
-            for folder in sorted((self._root / place / camera).glob("*/*")):
-                sequence = folder.relative_to(self._root).as_posix()
-                self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
-        if not self._images:
+            for folder in sorted((root / place / camera).glob("*/*")):
+                sequence = folder.relative_to(root).as_posix()
+                images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
+        if not images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
         value = read_table(Path(names), (dict, list))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
             self._names, listed = _names_of_vlg(Path(names), value)
-            self._images = [
+            images = [
                 (sequence, image)
-                for sequence, image in self._images
+                for sequence, image in images
                 if any(image.stem in listed.get(end, ()) for end in path_ends(sequence))
             ]
-            if not self._images:
+            if not images:
                 raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
         else:
-            self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in self._images))
-        self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in self._images]
+            self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in images))
+        self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in images]
+        self.sources = [image for _, image in images]
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
-        sequence, image = self._images[number]
-        _, depth_file, label_file, cloud_file = self.files(number)
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, its names, and the place, the camera and the type of its sequence.
+
+        Raises:
+            InputError: also for a cloud without a pinhole camera, and a label without a name.
+        """
+        sequence = sequence_of(self.identifiers[number])
+        image, depth_file, label_file, cloud_file = self.files(number)
         place, camera, kind, _ = sequence.split("/")
         first_object = _FIRST_OBJECT[place]
-        with with_context(self.identifiers[number]):
-            names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
-            color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
-            with with_context(str(cloud_file)):
-                if points.shape[:2] != color.shape[:2]:
-                    raise InputError(
-                        f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
-                    )
-                intrinsics = fit_intrinsics(points)
-            frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
-            unnamed = [label for label in frame.instances if label not in names]
-            if unnamed and self._is_complete:
+        names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
+        color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
+        with with_context(str(cloud_file)):
+            if points.shape[:2] != color.shape[:2]:
                 raise InputError(
-                    f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels "
-                    f"from {first_object} on"
+                    f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
                 )
+            intrinsics = fit_intrinsics(points)
+        frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
+        unnamed = [label for label in frame.instances if label not in names]
+        if unnamed and self._is_complete:
+            raise InputError(
+                f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels "
+                f"from {first_object} on"
+            )
         truth = {label: names[label] for label in frame.instances if label in names}
-        attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
-        return LabelledFrame(self.identifiers[number], frame, truth, attributes)
+        return frame, truth, {"place": place, "camera": _CAMERAS[camera], "type": kind}
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
-        image = self._images[number][1]
+        image = self.sources[number]
         folder = image.parent.parent
         cloud = folder / "pcd" / f"{image.stem}.pcd"
         return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]

@@ -5,10 +5,10 @@
 
 from pathlib import Path
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_labels
+from training.readers.labelled import LabelledFrames, dataset_folder, named_labels
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
@@ -52,26 +52,26 @@ class UWISOccluded(LabelledFrames):
         """
         path = dataset_folder(path)
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
-        self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
-        if not self._frames:
+        self.sources = [color for video in videos for color in sorted((video / "images").glob("*_rgb.png"))]
+        if not self.sources:
             raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
-        self.identifiers = [f"{video.name}/{_stem(color)}" for video, color in self._frames]
+        self.identifiers = [f"{_video(color)}/{_stem(color)}" for color in self.sources]
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame."""
-        video, _ = self._frames[number]
-        identifier = self.identifiers[number]
+    def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
+        """Read a frame, its names and the attributes of its video."""
         color, depth, labels, poses = self.files(number)
-        with with_context(identifier):
-            frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
-            truth = _truth(poses)
-        return LabelledFrame(identifier, frame, truth, video_attributes(int(video.name)))
+        frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
+        return frame, _truth(poses), video_attributes(int(_video(color)))
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
-        color = self._frames[number][1]
+        color = self.sources[number]
         names = "rgb.png", "depth.png", "labels.png", "poses.yaml"
         return [color.with_name(f"{_stem(color)}_{name}") for name in names]
+
+
+def _video(color: Path) -> str:
+    return color.parent.parent.name
 
 
 def _stem(color: Path) -> str:
@@ -79,9 +79,8 @@ def _stem(color: Path) -> str:
 
 
 def _truth(path: Path) -> dict[int, str]:
-    try:
-        objects = parse_yaml(read_file(path))
+    content = read_file(path)
+    with decoding(f"{path} does not hold the objects of a frame", "<name>: {label: <number>, ...}"):
+        objects = parse_yaml(content)
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
-    except (KeyError, TypeError, AttributeError, ValueError):
-        raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
     return named_labels(path, entries)

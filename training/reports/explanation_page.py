@@ -72,8 +72,7 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
         sections: dict[str, list[Picture]] = {}
         for picture in pictures(explanation, frame):
             save_figure(picture.figure, unfinished / f"{picture.name}.png")
-            is_slice = picture.section == "slices"
-            shown = Picture(f"{picture.name}.png", picture.caption, half=not is_slice, third=is_slice)
+            shown = Picture(f"{picture.name}.png", picture.caption, "third" if picture.section == "slices" else "half")
             sections.setdefault(picture.section, []).append(shown)
         write_text(unfinished / VALUES, json.dumps(explanation.as_json()) + "\n")
         title, lead = f"Why {explanation.title}?", _lead(explanation, name)

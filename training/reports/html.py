@@ -5,6 +5,7 @@ import dataclasses
 import html
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from thor2_jax.files import write_text
 
@@ -21,16 +22,13 @@ class Picture:
     Attributes:
         path: path relative to the page.
         caption: caption and alternative text.
-        half: takes half the width of a wide screen.
-        third: takes a third of the width of a wide screen.
-        small: takes a fraction of the width, so that many pictures fit side by side.
+        width: part of the width of a wide screen: all of it, a half, a third, or small, so that many pictures fit side
+            by side.
     """
 
     path: str
     caption: str
-    half: bool = False
-    third: bool = False
-    small: bool = False
+    width: Literal["full", "half", "third", "small"] = "full"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +76,7 @@ def _figure(picture: Picture, embedded_from: Path | None) -> str:
     if embedded_from is not None:
         content = base64.b64encode((embedded_from / picture.path).read_bytes()).decode()
         path = f"data:image/{Path(picture.path).suffix[1:]};base64,{content}"
-    width = next((name for name in ("half", "third", "small") if getattr(picture, name)), None)
-    kind = f' class="{width}"' if width else ""
+    kind = "" if picture.width == "full" else f' class="{picture.width}"'
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 

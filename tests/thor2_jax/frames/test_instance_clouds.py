@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.frames.instance_clouds import MIN_POINTS, instance_clouds, voxel_downsample
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
-from training.readers import FrameFolder
+from training.readers.frames import FrameFolder
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(600.0, 610.0, 159.5, 119.5)

@@ -65,10 +65,10 @@ def test_single_leaf_trees_and_missing_arrays() -> None:
     nodes = tree_arrays(grown)
     run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
     inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32), None)
-    probabilities = load_forest("forest", nodes, run)(inputs)
+    probabilities = load_forest(nodes, run)(inputs)
     np.testing.assert_allclose(probabilities, grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
     with pytest.raises(KeyError, match="root"):
-        load_forest("forest", {name: nodes[name] for name in nodes if name != "root"}, run)
+        load_forest({name: nodes[name] for name in nodes if name != "root"}, run)
 
 
 ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
@@ -76,7 +76,7 @@ ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
 
 def pointnet(classes: int = 5) -> Predictor:
     run: Any = SimpleNamespace(classes=("",) * classes)
-    return load_pointnet("pointnet", ARRAYS, run)
+    return load_pointnet(ARRAYS, run)
 
 
 def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, assert_refused, random_clouds, small_disk, untrained_run
+from helpers import Command, assert_refused, random_clouds, untrained_run
 from safetensors.numpy import load, save
 
 import colornet
@@ -17,7 +17,7 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import forest, job
 from training.baselines.baseline import baseline_inputs
-from training.baselines.files import CLOUD_BASELINES, StoredBaseline, check_baselines, write_baseline
+from training.baselines.files import CLOUD_BASELINES, check_baselines
 from training.baselines.forest import load_forest
 from training.baselines.job import load_baselines, train_baselines
 from training.evaluation.runs import load_runs
@@ -124,10 +124,3 @@ def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
     for damaged in (content[:-9], content[:-1] + bytes([content[-1] ^ 1]), lacking, others):
         file.write_bytes(damaged)
         assert_refused("forest.safetensors", load_baselines, folder, load_run(folder))
-
-
-def test_a_full_disk_leaves_no_baseline(tmp_path: Path) -> None:
-    stored = StoredBaseline({"w": np.zeros(1000, np.float32)}, None)
-    with small_disk(1000), pytest.raises(OSError, match="too large"):
-        write_baseline(tmp_path / "baselines" / "forest.safetensors", stored, NAMES, 1.0)
-    assert list((tmp_path / "baselines").iterdir()) == []

@@ -76,7 +76,7 @@ def test_most_confident_selected_classifier_decides() -> None:
     models = library()
     selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
     arrays, run = library_arrays(models), SimpleNamespace(config=CONFIG, classes=("",) * 4)
-    probabilities = load_thor("thor", arrays, run)(clouds)
+    probabilities = load_thor(arrays, run)(clouds)
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (names, k) in enumerate(selected):
         tops = clouds.tops[row : row + 1, : 16 * k]
@@ -84,7 +84,7 @@ def test_most_confident_selected_classifier_decides() -> None:
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
     del arrays["side-2/head/bias"]
     with pytest.raises(ValueError, match="head/bias"):
-        load_thor("thor", arrays, run)
+        load_thor(arrays, run)
 
 
 def test_empty_clouds_give_finite_probabilities() -> None:

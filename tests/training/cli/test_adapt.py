@@ -14,7 +14,7 @@ from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.runs import load_runs
-from training.readers.frame_files import frame_files
+from training.readers.frames import frame_files
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from recording_files import table_frame, write_recording
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
+from training.cli import evaluate
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
@@ -73,6 +75,17 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     page = (tmp_path / "report" / "report.html").read_text()
     assert run_thor2("evaluate", "frames", *frame_options(frames / "a"), "--model", model) == 0
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
+
+
+def test_runs_and_the_files_of_a_frame_are_told_apart(
+    model: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr(evaluate, "_evaluate", lambda *arguments, **_: calls.append(arguments))
+    one = frame_options(frames / "000")
+    for given, dataset in (([frames], frames), (one, frames / "000" / "color.png")):
+        assert run_thor2("evaluate", "frames", "--model", model, model, *given) == 0
+        assert calls[-1][2] == str(dataset) and calls[-1][4] == [model]
 
 
 def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> None:

@@ -91,6 +91,19 @@ def test_advice_on_a_wrong_name() -> None:
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
 
 
+def test_the_next_command_has_an_instance_that_was_explained(
+    model: Path, frame: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def explain(_: Recognizer, __: Any, label: int) -> SimpleNamespace:
+        if label == 4:
+            raise InputError("too few points")
+        return SimpleNamespace(title="mug")
+
+    monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
+    monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
+    assert " --instance 1 " in printed("explain", "--model", model, frame, "--out", tmp_path / "out")
+
+
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
     command = ("explain", "--model", model, frame, "--out", out)

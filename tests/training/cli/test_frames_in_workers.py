@@ -5,6 +5,7 @@ import json
 import pickle
 import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,11 @@ from recording_files import table_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-from training.evaluation.job import FRAMES_PER_CHUNK, answer_frames, answer_frames_in_pool, load_evaluated
+from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import RecognizerArguments, recognize_frames
-from training.readers.frame_files import find_frames, segmented_source
-from training.readers.frames import FrameFolder
-from training.storage.workers import IN_PROCESS
+from training.readers.frames import FrameFolder, find_frames, segmented_source
 
-N_FRAMES = 2 * FRAMES_PER_CHUNK + 1
+N_FRAMES = 9
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,8 @@ def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path
     for one, other in zip(answers, expected, strict=True):
         assert one.frame is not None and other.frame is not None
         np.testing.assert_array_equal(one.frame.labels, other.frame.labels)
-        assert vars(one.frame).keys() == {field.name for field in dataclasses.fields(one.frame)}
+        sent = vars(pickle.loads(pickle.dumps(one.frame)))
+        assert vars(one.frame).keys() > sent.keys() == {field.name for field in dataclasses.fields(one.frame)}
 
 
 def test_answers_before_an_unreadable_frame_are_kept(
@@ -58,17 +58,23 @@ def test_answers_before_an_unreadable_frame_are_kept(
 ) -> None:
     frames, arguments = FrameFolder(folder), ((model,), None)
     expected = list(answer_frames(load_evaluated(*arguments), frames))
-    broken, read = FRAMES_PER_CHUNK + 2, FrameFolder.__getitem__
+    broken, read = 6, FrameFolder.read
 
     def damaged(self: FrameFolder, number: int) -> Any:
-        if number == broken:
+        if self.identifiers[number] == f"{broken:03d}":
             raise InputError("depth: damaged")
         return read(self, number)
 
-    monkeypatch.setattr(FrameFolder, "__getitem__", damaged)
+    monkeypatch.setattr(FrameFolder, "read", damaged)
     answers = []
+
+    def pool(answer: Callable[[FrameFolder], Any], parts: Iterable[FrameFolder]) -> Iterator[Any]:
+        for part in parts:
+            assert len(part.sources) == 1  # workers get no other frames
+            yield answer(part)
+
     with pytest.raises(InputError, match="damaged"):
-        for _, answer in answer_frames_in_pool(arguments, frames, IN_PROCESS, range(len(frames))):
+        for _, answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
             answers.append(answer)
     assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(broken)]
     for (_, one), other in zip(expected, answers, strict=False):

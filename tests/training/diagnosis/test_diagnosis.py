@@ -23,7 +23,7 @@ from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth, instance_extents
 from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.diagnosis.setup import diagnose
-from training.readers.frame_files import FrameFiles, frame_files
+from training.readers.frames import FrameFiles, frame_files
 
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,13 +46,13 @@ class ToyDataset(LabelledFrames):
 
     def __init__(self, n: int, prefix: str = "frame", directory: Path | None = None) -> None:
         self.identifiers, self.directory = [f"{prefix}{k}" for k in range(n)], directory
-        self.read: list[int] = []
+        self.numbers: list[int] = []
 
     def files(self, number: int) -> list[Path]:
         return [] if self.directory is None else [self.directory / f"{number}.png"]
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        self.read.append(number)
+    def read(self, number: int) -> tuple[thor2.RGBDFrame, dict[int, str], dict[str, str]]:
+        self.numbers.append(number)
         color = np.random.default_rng(number).integers(0, 255, (48, 64, 3), dtype=np.uint8)
         color[0, 0] = number
         labels = np.zeros((48, 64), np.uint8)
@@ -61,8 +62,7 @@ class ToyDataset(LabelledFrames):
         rows, columns = np.indices(labels.shape)  # curved, since a plane has several boxes of equal size
         depth = (800 + rows * rows // 40 + columns * columns // 60).astype(np.uint16)
         frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
-        truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
-        return LabelledFrame(self.identifiers[number], frame, truth, {"light": str(number % 2)})
+        return frame, {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}, {"light": str(number % 2)}
 
 
 class Frames(LabelledFrames):
@@ -71,8 +71,8 @@ class Frames(LabelledFrames):
     def __init__(self, frames: list[LabelledFrame]) -> None:
         self.identifiers, self.frames = [frame.identifier for frame in frames], frames
 
-    def __getitem__(self, number: int) -> LabelledFrame:
-        return self.frames[number]
+    def read(self, number: int) -> tuple[thor2.RGBDFrame, Mapping[int, str], Mapping[str, str]]:
+        return self.frames[number].frame, self.frames[number].truth, self.frames[number].attributes
 
 
 class ToyRecognizer(UntaughtRecognizer):
@@ -130,7 +130,7 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     dataset = ToyDataset(9)
     resumed = evaluate_toys(tmp_path / "stopped", dataset)
     assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
-    assert dataset.read == [5, 6, 7, 8]
+    assert dataset.numbers == [5, 6, 7, 8]
     assert without_times(resumed) == without_times(whole)
     pictures = {p.relative_to(report): p.read_bytes() for p in report.rglob("*.jpg")}
     other = tmp_path / "whole" / "report"

@@ -11,8 +11,11 @@ from dataset_files import K, write_bop, write_folder, write_ocid, write_uwis
 from helpers import assert_refused, input_error
 from PIL import Image
 
-from training.readers import BOP, OCID, FrameFolder, UWISOccluded
+from training.readers.bop import BOP
+from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrames
+from training.readers.ocid import OCID
+from training.readers.uwis import UWISOccluded
 
 FILES = {
     "bop": ("000049", "rgb/000001.png depth/000001.png mask_visib/000001_000000.png scene_camera.json scene_gt.json"),
@@ -58,7 +61,7 @@ READERS: dict[str, Callable[[Path], LabelledFrames]] = {
 def test_frames_before_a_damaged_file_are_read(kind: str, file: str, damage: str, tmp_path: Path) -> None:
     write_dataset(kind, tmp_path)
     path, whole = tmp_path / file, READERS[kind](tmp_path)
-    assert path in whole.files(1) and all(each.is_file() for each in whole.files(1))
+    assert path in whole.files(1) == whole.only(1).files(0) and all(each.is_file() for each in whole.files(1))
     content = path.read_bytes()
     path.unlink()
     if damage != "missing":

@@ -13,10 +13,9 @@ from recording_files import table_frame, write_recording
 
 from thor2_jax.frames.frames import Intrinsics, read_labels
 from thor2_jax.recordings.bags import Bag
-from training.readers import FrameFolder, UWISOccluded
-from training.readers.frame_files import find_frames, recorded_sources
+from training.readers.frames import FrameFolder, find_frames, recorded_sources
 from training.readers.labelled import LabelledFrame
-from training.readers.uwis import video_attributes
+from training.readers.uwis import UWISOccluded, video_attributes
 
 # The dataset's table, in three columns for the degrees of occlusion: none, low, high.
 VIDEOS = {
