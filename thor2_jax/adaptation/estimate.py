@@ -237,7 +237,7 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
         # `objective` adds the balanced colours.
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
-        mean = (oriented.weights[..., None] * scores).sum(axis=1)
+        mean = scores.mean(axis=1)
         return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
 
     return classify

@@ -196,7 +196,7 @@ def projected_features(descriptors: Descriptors, statistics: jax.Array, version:
 
 
 def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) -> jax.Array:
-    return models[0](*oriented.flat).reshape(*oriented.weights.shape, -1)
+    return models[0](*oriented.flat).reshape(*oriented.shape, -1)
 
 
 class _ClassViews(nnx.Module):
@@ -239,8 +239,8 @@ def _class_probabilities(
     probabilities = fused[:, :n_classes]
     if len(models) > n_networks:
         views = models[n_networks]
-        looks = learned[0].reshape(*oriented.weights.shape, -1)
-        similarity = (oriented.weights * views.similarity(looks, probabilities.argmax(axis=1))).sum(axis=1)
+        looks = learned[0].reshape(*oriented.shape, -1)
+        similarity = views.similarity(looks, probabilities.argmax(axis=1)).mean(axis=1)
         probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
         probabilities /= (probabilities.sum(axis=1) + fused[:, n_classes:].sum(axis=1))[:, None]
     return probabilities
@@ -364,7 +364,7 @@ class Embedding:
         """Function from K looks at clouds, described by this embedding's descriptor, to class probabilities [B, C].
 
         What they lack to 1 is that of the distractors. They are the geometric mean over the networks and over the
-        looks, by their weights. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
+        looks. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
         network and look. With `sizes.views`, the odds of all classes are multiplied by
         exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between the learned blocks of a
         look and of a reference view of the most probable class, averaged over the looks (Sun et al.,

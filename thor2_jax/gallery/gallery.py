@@ -270,23 +270,20 @@ class Gallery:
     def _search(self) -> ExactSearch | IndexSearch:
         return (IndexSearch if self.search == "usearch" else ExactSearch)(self.regression[0])
 
-    def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
+    def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
         A score is the value of the regression, times its share in the sum with the value of the best trained class.
 
         Args:
             embeddings: [B, D] of unit length, or [B, K, D] for K looks, whose scores are averaged.
-            weights: [B, K] weights of the looks, which sum to 1; equal by default.
         """
         queries = np.asarray(embeddings, np.float32)
         if not self.objects or not len(queries):
             return np.zeros((len(queries), len(self.objects)), np.float32)
         if queries.ndim == 3:
             each = self.scores(queries.reshape(-1, queries.shape[-1])).reshape(*queries.shape[:2], -1)
-            if weights is None:
-                return each.mean(axis=1)
-            return np.einsum("bkn,bk->bn", each, np.asarray(weights, np.float32))
+            return each.mean(axis=1)
         similarity, index = self._search.nearest(queries, NEAREST)
         embeddings, owner, ridge = self.regression
         views = embeddings[index].astype(np.float32)

@@ -90,7 +90,7 @@ class DescribedFrame:
     @property
     def packed(self) -> PointClouds:
         """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, len(self.oriented.weights))
+        return pack_instances(self.usable, self.oriented.shape[0])
 
 
 def check_answer_by(value: str | None) -> AnswerBy | None:

@@ -64,7 +64,7 @@ def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -
     """Return the descriptors of the samples of a batch, one look each."""
     descriptors = batch_descriptors(batch.length, batch.color, network, config)
     each, statistics = jax.tree.map(lambda a: a[:, None], (descriptors, jnp.asarray(batch.statistics)))
-    return LookDescriptors(each, statistics, jnp.ones((len(batch.label), 1)))
+    return LookDescriptors(each, statistics)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

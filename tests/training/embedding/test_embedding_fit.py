@@ -83,7 +83,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     for mirror in ("", "x"):
         aligned = thor2.turn(thor2.mirror(normal, mirror), SMALL_CONFIG)
         described = strips(aligned, NETWORK, embedding.config)
-        oriented = describe_aligned_looks(aligned, jnp.ones((len(rows), 1)), described, NETWORK, embedding.config)
+        oriented = describe_aligned_looks(aligned, described, NETWORK, embedding.config, 1)
         similarity.append((actual * embedding.embed_oriented(oriented, aligned)[:, 0]).sum(axis=1))
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 
