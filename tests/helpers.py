@@ -31,11 +31,12 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.model.classifier import FEATURES, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, input_size
+from thor2_jax.networks import MLP, EmbeddingSizes
 from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene

@@ -15,16 +15,18 @@ enrolled or forgotten.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.references import References
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name
+
+if TYPE_CHECKING:
+    from thor2_jax.gallery.embedding import References
 
 __all__ = ["CompactClouds", "Gallery", "GalleryObject", "score_odds"]
 
@@ -167,7 +169,7 @@ class Gallery:
     objects: Mapping[str, GalleryObject] = dataclasses.field(default_factory=dict)
     hidden: tuple[str, ...] = ()
     search: str = "exact"
-    references: References | None = None
+    references: "References | None" = None
     version: int = 0
     generation: int = 0
     stamp: tuple[int, int, int] | None = None

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.types import Cloud
 from training.embedding.fit import fit_embedding, reference_views
 from training.embedding.samples import (

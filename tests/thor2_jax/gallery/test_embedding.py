@@ -15,8 +15,8 @@ from helpers import SMALL_CONFIG, random_clouds
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
-from thor2_jax.gallery.references import BACKGROUND, References
+from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References, load_default
+from thor2_jax.networks import EmbeddingSizes
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
 
@@ -76,15 +76,12 @@ def test_class_probabilities_are_geometric_means(nearest: bool, clouds: thor2.Po
     np.testing.assert_allclose(actual, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("answer", [0, 1])
-def test_nearest_views_of_the_answered_class_raise_the_odds(answer: int, clouds: thor2.PointClouds) -> None:
+def test_nearest_views_of_the_answered_class_raise_the_odds(clouds: thor2.PointClouds) -> None:
     embedding = ensemble()
-    if answer:  # exchange the classes
-        for model in (embedding.model, *embedding.further):
-            model.proxies[...] = model.proxies[...][:, [1, 0, 2, 3, 4]]
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     before = np.asarray(embedding.class_probabilities(oriented), np.float64)
-    assert (before.argmax(axis=1) == answer).all()
+    answer = before.argmax(axis=1)
+    assert answer.tolist() == [1, 0, 0]
 
     views, label = np.random.default_rng(2).normal(size=(6, embedding.size)), np.array([0, 1, BACKGROUND, 1, 0, 0])
     references = References(views.astype(np.float16), label.astype(np.int32), ("a", "b"))
@@ -92,7 +89,7 @@ def test_nearest_views_of_the_answered_class_raise_the_odds(answer: int, clouds:
     learned, of_views = np.asarray(embedding.embed_oriented(oriented, clouds))[..., :8], views[:, :8]
     norms = np.linalg.norm(learned, axis=-1)[..., None] * np.linalg.norm(of_views, axis=1)
     cosines = np.einsum("bkl,nl->bkn", learned, of_views) / norms
-    nearest = cosines[..., label == answer].max(axis=-1).mean(axis=1)
+    nearest = np.array([of[:, label == k].max(axis=-1).mean() for of, k in zip(cosines, answer, strict=True)])
     assert (nearest < cosines.max(axis=-1).mean(axis=1)).any()
     odds = before / (1 - before.sum(axis=1, keepdims=True)) * np.exp(10 * (nearest - 0.8))[:, None]
     np.testing.assert_allclose(

@@ -10,8 +10,8 @@ from sklearn.gaussian_process.kernels import RBF
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.embedding import BACKGROUND, References
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, CompactClouds, Gallery, GalleryObject
-from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 
 

@@ -17,7 +17,7 @@ from helpers import class_probabilities, full_disk, untrained_embedding_run, unt
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
-from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
+from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.recognizer import Recognizer
 

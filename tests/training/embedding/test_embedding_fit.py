@@ -15,9 +15,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.classifier import model_arrays
+from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
+from thor2_jax.networks import EmbeddingSizes, model_arrays
 from training.augmentation import orientation
 from training.embedding import fit
 from training.embedding import samples as module
