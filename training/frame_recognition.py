@@ -18,7 +18,7 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
-from thor2_jax.frames.instance_clouds import unit_question
+from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model import result_files
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer

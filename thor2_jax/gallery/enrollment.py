@@ -19,8 +19,7 @@ from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import MIN_POINTS
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import CompactClouds, GalleryObject
 

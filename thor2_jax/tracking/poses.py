@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.instance_clouds import downsample_to_fit
+from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 
 __all__ = ["PosedInstance", "check_pose", "merge_views", "transform"]
