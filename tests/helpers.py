@@ -32,6 +32,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.classifier import FEATURES, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
@@ -127,7 +128,7 @@ class UntaughtRecognizer:
             name: lambda oriented, name=name: self.probabilities(oriented.content)[name]
             for name in self.run.classifiers
         }
-        return Model(self.run, RunClassifiers(classifiers), unknown_below=self.unknown_below)
+        return Model(self.run, RunClassifiers(classifiers), Gallery("", trained=self.run.classes), self.unknown_below)
 
     def describe(self, frame: thor2.RGBDFrame) -> Any:
         instances = [

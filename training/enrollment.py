@@ -115,9 +115,9 @@ def enroll_objects(
         recognizer = Recognizer.load(run, gallery=gallery)
         objects = recognizer.objects
         if name is not None:
-            objects.check(name, extend=extend, replace=replace)
+            objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
         given, views = read(recognizer.run.config.sigma_s)
-        names = [objects.check(each, extend=extend, replace=replace) for each in given]
+        names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in given]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)
             of_object = next(views)

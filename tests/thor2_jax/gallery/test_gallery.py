@@ -136,8 +136,10 @@ def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
 def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:
     with pytest.raises(InputError, match="'cup'"):
         gallery.without("cup")
-    hidden = gallery.without("cup", hide=True).without("cup", hide=True)
+    hidden = dataclasses.replace(gallery, trained=("cup",)).without("cup")
     assert hidden.hidden == ("cup",) and hidden.names == gallery.names
+    with pytest.raises(InputError, match="'cup'"):
+        hidden.without("cup")
 
 
 NO_NAMES = ["", " ", "a\nb", "x" * 201, 3, ".", "..", "a/../b", "unknown", " Unknown", "mug\u200b", "\u3164", "\ud800"]
