@@ -147,7 +147,7 @@ def track_frames(
     Args:
         recognizer: the recognizer.
         sources: the frames, in the order in which they were taken.
-        poses: pose of the camera for each frame, see `thor2_jax.tracking.poses`.
+        poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
 
     Raises:
         InputError: a frame cannot be read, has another size than the first one, or a pose is not a rigid motion. The

@@ -185,7 +185,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
             pose is not a rigid motion. The message names the file.
         OSError: the file cannot be read.
     """
-    from thor2_jax.tracking.poses import check_pose  # imports SciPy
+    from thor2_jax.tracking.viewpoints import check_pose  # imports SciPy
 
     try:
         stored = json.loads(read_file(path))
