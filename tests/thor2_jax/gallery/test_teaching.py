@@ -174,17 +174,6 @@ def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embeddi
         recognizer.forget(next(iter(first)))  # type: ignore[arg-type]
 
 
-def test_a_trained_class_needs_extend_or_replace(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
-    with pytest.raises(thor2.InputError, match="'a' is a trained class"):
-        recognizer.enroll("a", [frame(RED)])
-    assert recognizer.gallery.names == ()
-    recognizer.enroll("a", [frame(RED)], extend=True)
-    recognizer.enroll("b", [frame(BLUE)], replace=True)
-    assert (recognizer.gallery.names, recognizer.gallery.hidden) == (("a", "b"), ("b",))
-    assert recognizer.classes == ("a", "c", "b")
-
-
 def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embedding: Embedding) -> None:
     recognizer = taught(run, embedding)
     before = recognizer.gallery
