@@ -57,7 +57,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
 
     import colornet
     from thor2_jax import DescriptorConfig
-    from thor2_jax.model.classifier import HIDDEN, MLP
+    from thor2_jax.networks import HIDDEN, MLP
     from training.fitting.fit import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.fitting.samples import build_samples
     from training.objects.builtin_objects import builtin_objects

@@ -11,7 +11,7 @@ occluded there, the file has the accuracy by the number of views when
 fused      the answers for the views are fused (`thor2_jax.tracking.tracker`), the views in the order around the table
 merged     fused, and each view is also described as one cloud with those before it (`merge_views`)
 random     fused, the further views in random order
-next_view  fused, each further view chosen by `thor2_jax.tracking.next_view`
+next_view  fused, each further view chosen by `thor2_jax.tracking.viewpoints`
 
 and the number of views that each needs for an accuracy of .95. Objects are identified by their labels here.
 
@@ -36,9 +36,8 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.inference import Inference, answers, infer_clouds
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.next_view import ViewTable, next_view
-from thor2_jax.tracking.poses import merge_views, transform
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
+from thor2_jax.tracking.viewpoints import ViewTable, merge_views, next_view, transform
 from training.evaluation.scores import placement_accuracy, steadiness
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh

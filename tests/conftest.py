@@ -182,10 +182,10 @@ def small_classifiers() -> Iterator[None]:
     """
     import helpers
 
-    from thor2_jax.model import classifier
+    from thor2_jax import networks
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(classifier, "HIDDEN", (32, 16))
+        patch.setattr(networks, "HIDDEN", (32, 16))
         helpers._drawn.cache_clear()
         yield
     helpers._drawn.cache_clear()

@@ -31,11 +31,13 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import Gallery
+from thor2_jax.model.classifier import FEATURES, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, input_size
+from thor2_jax.networks import MLP, EmbeddingSizes
 from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
@@ -126,7 +128,7 @@ class UntaughtRecognizer:
             name: lambda oriented, name=name: self.probabilities(oriented.content)[name]
             for name in self.run.classifiers
         }
-        return Model(self.run, RunClassifiers(classifiers), unknown_below=self.unknown_below)
+        return Model(self.run, RunClassifiers(classifiers), Gallery("", trained=self.run.classes), self.unknown_below)
 
     def describe(self, frame: thor2.RGBDFrame) -> Any:
         instances = [

@@ -1,4 +1,4 @@
-"""Atomic writes, digests, the check of output directories, and values in JSON and YAML files."""
+"""Atomic writes, digests, the check of output directories, files of named arrays, and values in JSON and YAML files."""
 
 import contextlib
 import errno
@@ -8,9 +8,14 @@ import json
 import math
 import re
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import NDArray
 
 from colornet.files import (
     atomic_write,
@@ -35,13 +40,16 @@ __all__ = [
     "has_json",
     "json_digest",
     "open_file",
+    "pack_arrays",
     "parse_json",
     "parse_yaml",
     "read_file",
     "read_table",
     "remove_leftovers",
     "remove_written",
+    "safetensors_metadata",
     "temporary_directory",
+    "unpack_arrays",
     "write_text",
 ]
 
@@ -206,6 +214,27 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
 def json_digest(value: Any) -> str:
     """Return the SHA-256 of a JSON value, whatever the order of its keys."""
     return content_digest([json.dumps(value, sort_keys=True)])
+
+
+def pack_arrays(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str] | None = None) -> bytes:
+    """Return the content of a safetensors file with arrays and texts by name.
+
+    Equal arrays and texts give equal bytes if there is at most one text: the order of several is random.
+    """
+    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    return safetensors.numpy.save(contiguous, None if metadata is None else dict(metadata))
+
+
+def unpack_arrays(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return the arrays and the texts of `pack_arrays`.
+
+    Raises:
+        ValueError: the content is damaged.
+    """
+    try:
+        return safetensors.numpy.load(content), safetensors_metadata(content)
+    except safetensors.SafetensorError as error:
+        raise ValueError(str(error)) from None
 
 
 def safetensors_metadata(content: bytes) -> dict[str, str]:

@@ -27,10 +27,11 @@ from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, camera_instances, estimate_transform
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.errors import with_context
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import instance_views
+from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
@@ -89,7 +90,7 @@ class Recognizer:
         """
         if embedding is not None:
             run = dataclasses.replace(run, embedding=embedding)
-        self._model = self._current = Model.of_run(run, unknown_below, rule, answer_by)
+        self._model = Model.of_run(run, unknown_below, rule, answer_by)
         self.chunk = chunk
         self.objects = ObjectGallery(run.classes, run.embedding, search)
 
@@ -127,14 +128,14 @@ class Recognizer:
     @property
     def model(self) -> Model:
         """The current model: the run and the enrolled objects. Another one can be set; its gallery is not used."""
-        current, gallery = self._current, self.objects.gallery
-        if current.gallery is not gallery:
-            self._current = current = dataclasses.replace(self._model, gallery=gallery)
-        return current
+        gallery = self.objects.gallery
+        if self._model.gallery is not gallery:
+            self._model = dataclasses.replace(self._model, gallery=gallery)
+        return self._model
 
     @model.setter
     def model(self, model: Model) -> None:
-        self._model = self._current = model
+        self._model = model
 
     @property
     def run(self) -> TrainedRun:
@@ -184,7 +185,11 @@ class Recognizer:
                 and neither `extend` nor `replace` is given. Nothing is enrolled.
             OSError: the gallery cannot be written; it is as before.
         """
-        views = [self.model.corrected(view) for view in instance_views(frames, self.run.config.sigma_s)]
+        views = []
+        for number, item in enumerate(frames):
+            frame, label = item if isinstance(item, tuple) else (item, None)
+            with with_context(f"frames[{number}]"):
+                views.append(self.model.corrected(instance_view(frame, label, self.run.config.sigma_s)))
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
 
     def forget(self, name: str) -> None:

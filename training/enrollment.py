@@ -70,7 +70,7 @@ def enroll_objects(
         recognizer = Recognizer.load(run, gallery=gallery)
         objects = recognizer.objects
         if name is not None:
-            objects.check(name, extend=extend, replace=replace)
+            objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
         views: Iterator[Sequence[PreparedInstance]]
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
@@ -82,7 +82,7 @@ def enroll_objects(
         else:
             (given, views), kind = source, "mesh"
             names = list(given)
-        names = [objects.check(each, extend=extend, replace=replace) for each in names]
+        names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)
             added[each] = enrolled_views(objects.embedding, next(views), kind)

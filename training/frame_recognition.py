@@ -1,4 +1,4 @@
-"""Recognition of several frames or of a recording, one frame after the other, and the files with all answers.
+"""Recognition of several frames or of a recording, one frame after the other.
 
 for answer in recognize_frames(recognizer.recognize, find_frames([Path("frames")])):
     print(answer.name, answer.error or answer.recognitions)
@@ -6,9 +6,8 @@ for answer in recognize_frames(recognizer.recognize, find_frames([Path("frames")
 
 import dataclasses
 import functools
-import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,10 @@ from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import write_text
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
-from thor2_jax.frames.instance_clouds import unit_question
-from thor2_jax.model import result_files
+from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
+from thor2_jax.model.result_files import instances_as_json
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
@@ -28,7 +26,6 @@ from training.readers.frames import FrameSource
 __all__ = [
     "FrameAnswer",
     "RecognizerArguments",
-    "ResultTables",
     "read_source",
     "recognize_frames",
     "segmentation_failure",
@@ -70,7 +67,7 @@ class FrameAnswer:
             return {**line, "error": self.error}
         if self.recorded is not None:
             return {**line, "instances": detections_as_json(self.detections)}
-        return {**line, "instances": result_files.instances_as_json(self.recognitions)}
+        return {**line, "instances": instances_as_json(self.recognitions)}
 
 
 def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
@@ -148,7 +145,7 @@ def track_frames(
     Args:
         recognizer: the recognizer.
         sources: the frames, in the order in which they were taken.
-        poses: pose of the camera for each frame, see `thor2_jax.tracking.poses`.
+        poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
 
     Raises:
         InputError: a frame cannot be read, has another size than the first one, or a pose is not a rigid motion. The
@@ -168,51 +165,3 @@ def track_frames(
         final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
         # The frame is read again, since a long sequence of images does not fit into memory.
         yield FrameAnswer(source.name, source.read(), final, seconds)
-
-
-class ResultTables:
-    """The COCO and BOP results of all frames, filled frame by frame and written at the end.
-
-    Attributes:
-        n_without_number: named instances whose class has no number; they are in neither file.
-    """
-
-    def __init__(self, frames: Sequence[str], classes: Sequence[str], names: Mapping[int, str] | None = None) -> None:
-        """Number the frames and the classes.
-
-        Args:
-            frames: names of all frames, see `image_numbers`.
-            classes: names of all objects.
-            names: number -> name, see `category_numbers`.
-        """
-        self._categories = result_files.category_numbers(classes, names)
-        self._images = dict(zip(frames, result_files.image_numbers(frames), strict=True))
-        self._has_scenes = len({scene for scene, _ in self._images.values()}) > 1
-        self._places = {name: place for place, name in enumerate(frames, 1)}
-        self._coco: list[dict[str, Any]] = []
-        self._bop: list[str] = []
-        self.n_without_number = 0
-
-    def add(self, answer: FrameAnswer) -> None:
-        """Add the answers of a frame, which was recognized."""
-        assert answer.frame is not None
-        named = [r.name for r in answer.recognitions if r.name is not None]
-        self.n_without_number += sum(name not in self._categories for name in named)
-        recognized = answer.frame, answer.recognitions, self._categories
-        scene, image = self._images[answer.name]
-        # COCO has no scenes: images of several scenes are counted from 1.
-        number = self._places[answer.name] if self._has_scenes else image
-        self._coco += result_files.coco_results(answer.name, number, *recognized)
-        self._bop += result_files.bop_lines(scene, image, *recognized, answer.seconds)
-
-    def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
-        """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.
-
-        Raises:
-            OSError: a file cannot be written.
-        """
-        contents = {coco: json.dumps(self._coco), bop: "\n".join([result_files.BOP_HEADER, *self._bop])}
-        for path, content in contents.items():
-            if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_text(path, content + "\n")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.next_view import ViewTable
+from thor2_jax.tracking.viewpoints import ViewTable
 from training.objects.mesh import TexturedMesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose

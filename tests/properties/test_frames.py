@@ -4,7 +4,7 @@ from hypothesis import given
 
 from thor2_jax import testing as laws
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import instance_clouds
+from thor2_jax.frames.prepared_instance import instance_clouds
 
 
 @given(frame=laws.frames(), seed=laws.seeds())

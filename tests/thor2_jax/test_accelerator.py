@@ -16,7 +16,8 @@ import colornet
 import thor2_jax as thor2
 from benchmarks import run_gpu
 from benchmarks.timing import time_calls
-from thor2_jax.model.classifier import MLP, class_probabilities
+from thor2_jax.model.classifier import class_probabilities
+from thor2_jax.networks import MLP
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64

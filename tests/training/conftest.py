@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from thor2_jax import figures
-from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.references import BACKGROUND, References
-from thor2_jax.model.classifier import MLP
+from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
 from thor2_jax.model.run_directory import input_size
+from thor2_jax.networks import MLP
 from training import train_run
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics

@@ -12,8 +12,8 @@ from helpers import SMALL_CONFIG, Interrupted, assert_refused, brick_and_stick, 
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module

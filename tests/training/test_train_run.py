@@ -13,8 +13,8 @@ from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full
 from PIL import Image
 
 import thor2_jax as thor2
-from thor2_jax.model.classifier import model_arrays
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting import loop

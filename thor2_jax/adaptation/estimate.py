@@ -17,7 +17,6 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from colornet import ColorNetwork
 from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
 from thor2_jax.capacity import point_bucket
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
@@ -65,12 +62,8 @@ MIN_KNOWN = 1e-3
 """Smallest probability of being known that is distinguished from 0."""
 
 
-class Criterion(NamedTuple):
-    """The colour network, the descriptor and the classifier whose certainty an estimate increases."""
-
-    network: ColorNetwork
-    config: DescriptorConfig
-    classify: Classifier
+Criterion = Callable[[PointClouds], jax.Array]
+"""From clouds [B, N] in metres to the probabilities [B, C] of names, whose certainty an estimate increases."""
 
 
 def entropy(probabilities: jax.Array) -> jax.Array:
@@ -102,24 +95,18 @@ def objective(
         capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default each
             chunk has the point bucket of its largest cloud.
     """
-    network, config, classify = criterion
-    config = dataclasses.replace(config, homology="closed_form", relaxation=None)
-
-    def probabilities(clouds: PointClouds) -> jax.Array:
-        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
-
     fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
     ordered = sorted(fitting, key=lambda each: len(each.points))
     chunks = []
     for start in range(0, len(ordered), ROWS):
         part = ordered[start : start + ROWS]
         clouds = pack_instances(part, ROWS, capacity or point_bucket(len(part[-1].points)))
-        chunks.append((len(part), clouds, jnp.minimum(probabilities(clouds).sum(axis=1), 1)))
+        chunks.append((len(part), clouds, jnp.minimum(criterion(clouds).sum(axis=1), 1)))
 
     def total(parameters: NDArray[np.floating]) -> float:
         transform = jnp.asarray(parameters, jnp.float32)
         values = [
-            (count, _uncertainties(probabilities(_transformed(clouds, transform)), known_before))
+            (count, _uncertainties(criterion(_transformed(clouds, transform)), known_before))
             for count, clouds, known_before in chunks
         ]
         return float(sum(np.asarray(value)[:count].sum() for count, value in values))
@@ -191,25 +178,32 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
 
 
 def adaptation_criterion(model: Model) -> Criterion:
-    """Return the colour network, the descriptor and the classifier whose certainty an estimate increases.
+    """Return the function of clouds whose certainty an estimate increases.
 
-    It is the embedding, which also knows what is none of the classes; in runs without one, the classifiers, fused by
-    the model's rule; and the gallery if it answers alone.
+    It is the class probabilities of the embedding, which also knows what is none of the classes; in runs without one,
+    those of the classifiers, fused by the model's rule; and the scores of the gallery if it answers alone.
 
     Raises:
         InputError: the model knows no object.
     """
-    if model.answers_by() == "gallery":
-        if not model.gallery.objects:
-            raise InputError("model has neither classes nor enrolled objects; enroll some first")
-        embedding = model.embedding
-        return Criterion(embedding.network, embedding.config, gallery_classifier(model.gallery, embedding))
 
     def fused(oriented: LookDescriptors) -> jax.Array:
         computed: jax.Array = fused_probabilities(infer(model, oriented).probabilities, model.rule)
         return computed
 
-    return Criterion(model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused))
+    if model.answers_by() != "gallery":
+        network, config, classify = model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)
+    elif model.gallery.objects:
+        network, config = model.embedding.network, model.embedding.config
+        classify = gallery_classifier(model.gallery, model.embedding)
+    else:
+        raise InputError("model has neither classes nor enrolled objects; enroll some first")
+    config = dataclasses.replace(config, homology="closed_form", relaxation=None)
+
+    def criterion(clouds: PointClouds) -> jax.Array:
+        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
+
+    return criterion
 
 
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
@@ -234,10 +228,10 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     fixed = jnp.asarray(views, jnp.float32)
 
     def classify(oriented: LookDescriptors) -> jax.Array:
-        # `objective` adds the balanced colours.
+        # `adaptation_criterion` adds the balanced colours.
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
-        mean = (oriented.weights[..., None] * scores).sum(axis=1)
+        mean = scores.mean(axis=1)
         return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
 
     return classify

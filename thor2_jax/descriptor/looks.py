@@ -18,11 +18,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from colornet import ColorNetwork
-from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
 from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
-from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
 __all__ = ["WARMTH", "LookDescriptors", "aligned_looks", "describe_aligned_looks", "describe_looks"]
@@ -39,12 +38,15 @@ class LookDescriptors:
     Attributes:
         each: descriptors, fields [B, K, ...].
         statistics: [B, K, 12 + R] float32, from `cloud_statistics`; `with_balanced` appends `N_BALANCED` values.
-        weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
     """
 
     each: Descriptors
     statistics: jax.Array
-    weights: jax.Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of clouds and of looks, (B, K)."""
+        return self.each.overflow.shape
 
     @property
     def first(self) -> Descriptors:
@@ -59,10 +61,9 @@ class LookDescriptors:
     def fuse(self, logits: jax.Array) -> jax.Array:
         """Return class probabilities [B, n] from the logits [B * K, n] of `flat`.
 
-        They are the geometric mean over the looks, by their weights, normalized to sum to 1.
+        They are the geometric mean over the looks, normalized to sum to 1.
         """
-        each = jax.nn.log_softmax(logits).reshape(*self.weights.shape, -1)
-        return jax.nn.softmax((self.weights[..., None] * each).sum(axis=1))
+        return jax.nn.softmax(jax.nn.log_softmax(logits).reshape(*self.shape, -1).mean(axis=1))
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
@@ -77,12 +78,12 @@ class LookDescriptors:
             clouds: [B, N] the clouds, in metres or aligned.
         """
         histogram = map_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), clouds)
-        repeated = jnp.broadcast_to(histogram[:, None], (*self.weights.shape, N_BALANCED))
+        repeated = jnp.broadcast_to(histogram[:, None], (*self.shape, N_BALANCED))
         return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
 
 @partial(jax.jit, static_argnums=3)
-def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> tuple[PointClouds, jax.Array]:
+def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> PointClouds:
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
     warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
 
@@ -109,12 +110,11 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
         dataclasses.replace(masked[m], points=points[m, :, k, :n_points], camera=cameras[m, :, k], colors=color)
         for m, k, color in looks
     ]
-    each = jax.tree.map(lambda *a: jnp.stack(a, axis=1).reshape(-1, *a[0].shape[1:]), *rows)
-    return each, jnp.full((n_clouds, count), 1 / count)
+    return jax.tree.map(lambda *a: jnp.stack(a, axis=1).reshape(-1, *a[0].shape[1:]), *rows)
 
 
-def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:
-    """Return the aligned clouds of `count` looks at each cloud, that of `align` first, and their weights.
+def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> PointClouds:
+    """Return the aligned clouds of `count` looks at each cloud, that of `align` first.
 
     A half turn is left out where the occlusion boundary decides which end comes first.
 
@@ -124,42 +124,35 @@ def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
         count: K, one of `LOOK_COUNTS`. Static.
 
     Returns:
-        [B * K, N] aligned clouds in scaled units, those of a cloud consecutive, and weights [B, K], which sum to 1 for
-        each cloud.
-
-    Raises:
-        InputError: `count` is another number.
+        [B * K, N] aligned clouds in scaled units, those of a cloud consecutive.
     """
-    if count not in LOOK_COUNTS:
-        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
     if count == 1:
-        return align(clouds, config), jnp.ones((len(clouds.mask), 1))
+        return align(clouds, config)
     return _looks(clouds, np.float32(config.sigma_s), np.float32(config.alpha), count)
 
 
 def describe_aligned_looks(
-    aligned: PointClouds, weights: jax.Array, strips: Strips, network: ColorNetwork, config: DescriptorConfig
+    aligned: PointClouds, strips: Strips, network: ColorNetwork, config: DescriptorConfig, count: int
 ) -> LookDescriptors:
     """Return the descriptors of looks.
 
     Args:
         aligned: [B * K, N] clouds, from `aligned_looks`.
-        weights: [B, K] float32, likewise.
         strips: their strips.
         network: colour network.
         config: static.
+        count: K. Static.
     """
-    return _group_by_cloud(describe_strips(strips, network, config), aligned, weights, strips, config)
+    return _group_by_cloud(describe_strips(strips, network, config), aligned, strips, config, count)
 
 
-@partial(jax.jit, static_argnums=4)
+@partial(jax.jit, static_argnums=(3, 4))
 def _group_by_cloud(
-    descriptors: Descriptors, aligned: PointClouds, weights: jax.Array, strips: Strips, config: DescriptorConfig
+    descriptors: Descriptors, aligned: PointClouds, strips: Strips, config: DescriptorConfig, count: int
 ) -> LookDescriptors:
     """Group the descriptors [B * K, ...] of looks by cloud, and add the statistics of the clouds."""
     statistics = cloud_statistics(side_lengths(aligned, config.alpha), aligned, strips)
-    each, grouped = jax.tree.map(lambda a: a.reshape(*weights.shape, *a.shape[1:]), (descriptors, statistics))
-    return LookDescriptors(each, grouped, weights)
+    return LookDescriptors(*jax.tree.map(lambda a: a.reshape(-1, count, *a.shape[1:]), (descriptors, statistics)))
 
 
 def describe_looks(
@@ -171,15 +164,12 @@ def describe_looks(
         clouds: [B, N] clouds in metres.
         network: colour network.
         config: static.
-        count: number of looks K; by default `config.looks`. Static.
-
-    Raises:
-        InputError: `count` is not one of `LOOK_COUNTS`.
+        count: number of looks K, one of `LOOK_COUNTS`; by default `config.looks`. Static.
     """
     count = config.looks if count is None else count
 
     def describe_chunk(chunk: PointClouds) -> LookDescriptors:
-        aligned, weights = aligned_looks(chunk, config, count)
-        return describe_aligned_looks(aligned, weights, strips(aligned, network, config), network, config)
+        aligned = aligned_looks(chunk, config, count)
+        return describe_aligned_looks(aligned, strips(aligned, network, config), network, config, count)
 
     return map_large_chunks(describe_chunk, clouds, count)

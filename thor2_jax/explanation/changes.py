@@ -113,7 +113,7 @@ def _gradient_directions(
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
 
     def lead(parameters: jax.Array) -> jax.Array:
-        aligned, _ = aligned_looks(_changed(clouds, axes, parameters, kind), config, scores.count)
+        aligned = aligned_looks(_changed(clouds, axes, parameters, kind), config, scores.count)
         oriented = scores.describe(aligned, strips(aligned, scores.network, config), config)
         values = scores.of_descriptors(oriented)[0]
         return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()

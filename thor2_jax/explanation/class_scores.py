@@ -70,7 +70,7 @@ class ClassScores:
 
     def orient(self, instance: PreparedInstance) -> PointClouds:
         """Return the K looks at an instance, [K, N] aligned clouds, that of the paper first; each has its own mask."""
-        return aligned_looks(packed(instance), self.config, self.count)[0]
+        return aligned_looks(packed(instance), self.config, self.count)
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
@@ -101,8 +101,7 @@ class ClassScores:
     def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
         first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        weights = jnp.full((len(first.mask), self.count), 1 / self.count)
-        return describe_aligned_looks(aligned, weights, cut, self.network, config).with_balanced(first)
+        return describe_aligned_looks(aligned, cut, self.network, config, self.count).with_balanced(first)
 
     def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
         """Return the scores [B, n] of items, described `ROWS` at a time."""
@@ -172,7 +171,7 @@ def gallery_scores(model: Model) -> ClassScores:
         first: LookDescriptors = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
         cosines = jnp.split(embedding.embed_oriented(first) @ views.T, ends[:-1], axis=-1)
         nearest = jnp.stack([of_object.max(axis=-1) for of_object in cosines], axis=-1)
-        return (first.weights[..., None] * nearest).sum(axis=1) / first.weights.sum(axis=1, keepdims=True)
+        return nearest.mean(axis=1)
 
     count = max(model.run.config.looks, LOOKS)  # as `infer`
     config = _checked(embedding.config)

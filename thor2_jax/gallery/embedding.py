@@ -13,7 +13,6 @@ networks.
 
 import dataclasses
 import functools
-import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -23,180 +22,94 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import safetensors
-import safetensors.numpy
 from flax import nnx
+from numpy.typing import NDArray
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import decoding
-from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
-from thor2_jax.gallery.references import REFERENCES_FILE, References
-from thor2_jax.model.classifier import compiled, model_arrays, model_from_arrays
-from thor2_jax.types import Descriptors, PointClouds
+from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays
+from thor2_jax.networks import (
+    EmbeddingNetwork,
+    EmbeddingSizes,
+    compiled,
+    model_arrays,
+    model_from_arrays,
+    to_unit_length,
+)
+from thor2_jax.types import PointClouds
 
-__all__ = ["Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
+__all__ = ["BACKGROUND", "REFERENCES_FILE", "Embedding", "References", "load_default"]
 
 EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
-
-IMAGE_SHARE = 0.5
-BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
-"""Shares of the blocks in the similarity by `EmbeddingSizes.version`, before they are divided by their sum; the share
-of the persistence images in the projected block, where each kind of colours has 1. Chosen on held-out frames."""
 
 VIEW_WEIGHT, NEUTRAL_SIMILARITY = 10.0, 0.8
 """Log-odds of an object being one of the classes for each unit of its similarity to the nearest reference view, as a
 logistic regression on held-out views weighs it; the similarity at which they stay as they are."""
 
-_METADATA = "embedding"
-# safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
-
-
 _FURTHER = "further/{}/"
 """Prefix of the names of the arrays of a further network in the file, with its number."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EmbeddingSizes:
-    """Sizes of the network of an embedding, and what its outputs are made of.
+REFERENCES_FILE = "references.safetensors"
+"""References of the embedding in the same directory."""
+
+BACKGROUND = -1
+"""Label of views of the background."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class References:
+    """Reference views: embedded views of the classes of a run and of a background of objects that are none of them.
+
+    They take part in the regression of a gallery (`Gallery.scores`), so that an enrolled object is recognized by what
+    distinguishes it from them, and a gallery with a single object already knows what is unknown. With
+    `EmbeddingSizes.views`, those of the classes also take part in the classification (`Embedding.class_probabilities`).
 
     Attributes:
-        cell: outputs of the layer that is shared by all strip positions.
-        hidden: units of the hidden layers.
-        learned: length of the network's block of the embedding.
-        color: length of the block of projected colours and images.
-        balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
-        shape: whether it has the persistence images; False in embeddings of earlier versions.
-        nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
-            embeddings of earlier versions, where each counts with its own.
-        views: whether the reference views take part in the classification; False in embeddings of earlier versions.
+        embeddings: [n, D] float16, of unit length.
+        label: [n] int32, index into `classes`, or `BACKGROUND`.
+        classes: names of the classes.
     """
 
-    cell: int = 20
-    hidden: tuple[int, ...] = (384, 256)
-    learned: int = 128
-    color: int = 120
-    balanced: bool = True
-    shape: bool = True
-    nearest: bool = True
-    views: bool = True
+    embeddings: NDArray[np.float16]
+    label: NDArray[np.int32]
+    classes: tuple[str, ...] = ()
 
-    @property
-    def version(self) -> int:
-        """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
-        return self.balanced + (self.balanced and self.shape)
+    def save(self, path: Path, fingerprint: str) -> None:
+        """Write the references of the embedding with this fingerprint, atomically; raises OSError if that fails."""
+        about = {"embedding": fingerprint, "classes": list(self.classes)}
+        arrays: dict[str, NDArray[Any]] = {"embeddings": self.embeddings, "label": self.label}
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(pack_arrays(arrays, {"references": json.dumps(about, sort_keys=True)}))
 
+    @classmethod
+    def load(cls, path: Path, fingerprint: str, size: int) -> "References":
+        """Read the references of the embedding with this fingerprint and of this length D.
 
-def _unit(x: jax.Array) -> jax.Array:
-    """Scale the last axis to unit length; zeros stay zeros."""
-    return x * jax.lax.rsqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-12))
-
-
-class EmbeddingNetwork(nnx.Module):
-    """Network of an embedding: one linear layer on each strip position of each slice, then fully connected layers.
-
-    At a position, the layer reads the row of the persistence image born there and the colour embedding of the strip.
-    Empty positions contribute zero.
-    """
-
-    def __init__(
-        self, config: DescriptorConfig, n_regions: int, sizes: EmbeddingSizes, n_proxies: int, *, rngs: nnx.Rngs
-    ) -> None:
-        """Initialize the weights; the colour basis is zero and the blocks have equal weights.
-
-        Args:
-            config: descriptor.
-            n_regions: number of colour regions.
-            sizes: sizes of the layers.
-            n_proxies: number of proxies, which classify; 0 for none.
-            rngs: generators of the weights and the dropout.
+        Raises:
+            InputError: the file is missing or damaged, or of another embedding. The message names the file.
         """
-        self.positions = max(config.image_size, config.n_strips)
-        self.n_regions, self.version = n_regions, sizes.version
-        n_cells = config.n_slices * self.positions
-        widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
-        he = nnx.initializers.he_normal()
-        self.cell = nnx.Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
-        layers = [nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs) for a, b in itertools.pairwise(widths)]
-        self.layers = nnx.List(layers)
-        self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
-        self.dropout = nnx.Dropout(0.15)
-        self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
-        n_strips, cells = n_regions * config.n_strips, -(-config.image_size // 2)
-        n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # one more in each version
-        self.color_basis = nnx.BatchStat(jnp.zeros((sum(n_features[: sizes.version + 1]), sizes.color)))
-        self.block_weights = nnx.BatchStat(jnp.array(BLOCK_WEIGHTS[sizes.version]))
-        if n_proxies:
-            self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
-            self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps anew
-
-    def learned(
-        self, descriptors: Descriptors, statistics: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None
-    ) -> jax.Array:
-        """Return the learned block [B, learned], of unit length.
-
-        Args:
-            descriptors: of B clouds.
-            statistics: [B, 12 + R] or more, from `cloud_statistics`; those after the first 12 + R are not read.
-            train: normalize by the statistics of the batch, and drop units.
-            rngs: generators of the dropout.
-        """
-        colors = jnp.swapaxes(square_root(descriptors.embeddings), -1, -2)
-        cells = [100 * descriptors.images, 0.5 * colors]
-        padded = [jnp.pad(a, ((0, 0), (0, 0), (0, self.positions - a.shape[2]), (0, 0))) for a in cells]
-        bias = jnp.asarray(self.cell.bias)
-        x = nnx.relu(self.cell(jnp.concatenate(padded, axis=-1))) - nnx.relu(bias)
-        read = statistics[:, : N_SCALARS + self.n_regions]
-        scale = jnp.where(jnp.arange(read.shape[1]) < N_SCALARS, 1, 2)
-        x = jnp.concatenate([x.reshape(len(x), -1), read * scale], axis=1)
-        for layer, norm in zip(self.layers, self.norms, strict=True):
-            x = nnx.relu(norm(layer(x), use_running_average=not train))
-            x = self.dropout(x, deterministic=not train, rngs=rngs)
-        return _unit(self.head(x))
-
-    def class_logits(self, learned: jax.Array) -> jax.Array:
-        """Return one logit for each proxy [B, n_proxies] from learned blocks [B, learned]."""
-        return jnp.exp(self.log_scale[...]) * class_cosines(learned, self.proxies[...])
-
-    def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
-        """Return the embeddings [B, D], of unit length.
-
-        The arguments are those of `learned`; if the colours are balanced, `balanced_histogram` ends the statistics.
-        """
-        features = projected_features(descriptors, statistics, self.version)
-        blocks = [self.learned(descriptors, statistics), _unit(features @ self.color_basis[...])]
-        if self.version == 0:
-            blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
-        weights = jnp.sqrt(self.block_weights[...])
-        return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
-
-
-def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
-    """Return the cosines [B, n] of unit vectors [B, learned] with proxies [learned, n]."""
-    return learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
-
-
-def projected_features(descriptors: Descriptors, statistics: jax.Array, version: int) -> jax.Array:
-    """Return the features [B, F] that are projected to their principal components, by `EmbeddingSizes.version`.
-
-    They are the square roots of the colour embeddings, `balanced_histogram`, with which the statistics end, and
-    the square roots of the persistence images, in cells of 2 x 2 pixels. Each part has a constant length.
-    """
-    count = len(descriptors.embeddings)
-    parts = [_unit(square_root(descriptors.embeddings).reshape(count, -1))]
-    if version > 0:
-        parts.append(statistics[:, -N_BALANCED:])
-    if version > 1:
-        cells = nnx.avg_pool(jnp.moveaxis(descriptors.images, 1, -1), (2, 2), strides=(2, 2), padding="SAME")
-        parts.append(math.sqrt(IMAGE_SHARE) * _unit(square_root(cells).reshape(count, -1)))
-    return jnp.concatenate(parts, axis=1)
+        expected = "the views of the embedding beside it; copy both files, or train the run again"
+        with decoding(f"embedding: {path} cannot be used", expected):
+            arrays, metadata = unpack_arrays(read_file(path))
+            about, embeddings, label = json.loads(metadata["references"]), arrays["embeddings"], arrays["label"]
+            classes = tuple(map(str, about["classes"]))
+            is_fitting = embeddings.shape == (len(label), size) and embeddings.dtype == np.float16
+            if not is_fitting or label.dtype != np.int32:
+                raise ValueError(f"embeddings are {embeddings.dtype} {list(embeddings.shape)}")
+            if len(label) and not (BACKGROUND <= label.min() and label.max() < len(classes)):
+                raise ValueError("a label is out of range")
+            if about["embedding"] != fingerprint:
+                raise ValueError("it is of another embedding")
+        return cls(embeddings, label, classes)
 
 
 def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) -> jax.Array:
-    return models[0](*oriented.flat).reshape(*oriented.weights.shape, -1)
+    return models[0](*oriented.flat).reshape(*oriented.shape, -1)
 
 
 class _ClassViews(nnx.Module):
@@ -207,7 +120,7 @@ class _ClassViews(nnx.Module):
     """
 
     def __init__(self, references: References, n_classes: int, length: int) -> None:
-        learned = np.asarray(_unit(jnp.asarray(references.embeddings[:, :length], jnp.float32)))
+        learned = np.asarray(to_unit_length(jnp.asarray(references.embeddings[:, :length], jnp.float32)))
         of_class = [learned[references.label == label] for label in range(n_classes)]
         padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
         for label, views in enumerate(of_class):
@@ -239,8 +152,8 @@ def _class_probabilities(
     probabilities = fused[:, :n_classes]
     if len(models) > n_networks:
         views = models[n_networks]
-        looks = learned[0].reshape(*oriented.weights.shape, -1)
-        similarity = (oriented.weights * views.similarity(looks, probabilities.argmax(axis=1))).sum(axis=1)
+        looks = learned[0].reshape(*oriented.shape, -1)
+        similarity = views.similarity(looks, probabilities.argmax(axis=1)).mean(axis=1)
         probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
         probabilities /= (probabilities.sum(axis=1) + fused[:, n_classes:].sum(axis=1))[:, None]
     return probabilities
@@ -364,7 +277,7 @@ class Embedding:
         """Function from K looks at clouds, described by this embedding's descriptor, to class probabilities [B, C].
 
         What they lack to 1 is that of the distractors. They are the geometric mean over the networks and over the
-        looks, by their weights. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
+        looks. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
         network and look. With `sizes.views`, the odds of all classes are multiplied by
         exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between the learned blocks of a
         look and of a reference view of the most probable class, averaged over the looks (Sun et al.,
@@ -394,7 +307,7 @@ class Embedding:
         for number, model in enumerate(self.further):
             arrays |= {_FURTHER.format(number) + name: array for name, array in model_arrays(model).items()}
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
-        return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
+        return pack_arrays(arrays, {"embedding": json.dumps(about, sort_keys=True)})
 
     @functools.cached_property
     def fingerprint(self) -> str:
@@ -428,8 +341,9 @@ class Embedding:
         advice = "an embedding of this version; copy the whole run directory, or train the run again"
         with decoding(f"embedding: {path} cannot be used", advice):
             content = read_file(path)
-            about = json.loads(safetensors_metadata(content)[_METADATA])
-            arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
+            stored, metadata = unpack_arrays(content)
+            about = json.loads(metadata["embedding"])
+            arrays = {name: array.astype(np.float32) for name, array in stored.items()}
             count = int(about.get("further", 0))
             version = FORMAT_WITH_FURTHER if count else EMBEDDING_FORMAT
             current = (version, DESCRIPTOR_VERSION, network.fingerprint)

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from thor2_jax.adaptation.color_transform import LUMA
 from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import MIN_POINTS
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import CompactClouds, GalleryObject
 
@@ -33,7 +32,6 @@ __all__ = [
     "enrolled_object",
     "enrolled_views",
     "instance_view",
-    "instance_views",
     "views_to_embed",
 ]
 
@@ -79,16 +77,6 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     if view.reason is not None:
         raise InputError(f"instance {view.label} cannot be used: {view.reason}")
     return view
-
-
-def instance_views(frames: Sequence[RGBDFrame | tuple[RGBDFrame, int]], sigma_s: float) -> list[PreparedInstance]:
-    """Return the views of an object in frames; the arguments and errors are those of `Recognizer.enroll`."""
-    views = []
-    for number, item in enumerate(frames):
-        frame, label = item if isinstance(item, tuple) else (item, None)
-        with with_context(f"frames[{number}]"):
-            views.append(instance_view(frame, label, sigma_s))
-    return views
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:

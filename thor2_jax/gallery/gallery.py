@@ -15,18 +15,21 @@ enrolled or forgotten.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.references import References
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
+from thor2_jax.gallery.union import ClassUnion, score_odds
 from thor2_jax.printable import check_name, find_name
 
-__all__ = ["CompactClouds", "Gallery", "GalleryObject", "score_odds"]
+if TYPE_CHECKING:
+    from thor2_jax.gallery.embedding import References
+
+__all__ = ["CompactClouds", "Gallery", "GalleryObject"]
 
 NEAREST = 128
 """Views of the gallery in the regression of a query; all views give the same accuracy on held-out frames."""
@@ -44,10 +47,6 @@ KEPT: tuple[tuple[dict[int, float], dict[int, float]], ...] = (
 )
 """Number of views of an object -> score whose odds give the default threshold, by `EmbeddingSizes.version`, without and
 with reference views; up to ten views from held-out frames, 120 from meshes. 95 % of the correct answers reach it."""
-
-EVEN, STEEPNESS = 0.2, 3
-"""A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
-
 
 STEP = 5e-5
 """Resolution of the coordinates, metres."""
@@ -154,6 +153,7 @@ class Gallery:
     Attributes:
         embedding: fingerprint of the embedding that the views are embedded by.
         objects: name -> its views, in the order of enrolment.
+        trained: class names of the run, in the order of the classifiers' outputs.
         hidden: trained classes that were forgotten or replaced; no classifier answers by them.
         references: reference views of the embedding; None if it has none.
         version: version of the embedding, see `EmbeddingSizes`.
@@ -166,8 +166,9 @@ class Gallery:
     embedding: str
     objects: Mapping[str, GalleryObject] = dataclasses.field(default_factory=dict)
     hidden: tuple[str, ...] = ()
+    trained: tuple[str, ...] = ()
     search: str = "exact"
-    references: References | None = None
+    references: "References | None" = None
     version: int = 0
     generation: int = 0
     stamp: tuple[int, int, int] | None = None
@@ -181,39 +182,56 @@ class Gallery:
         """Names of the objects, in the order of the scores."""
         return tuple(self.objects)
 
+    @functools.cached_property
+    def union(self) -> ClassUnion:
+        """The trained classes and the objects."""
+        return ClassUnion(self.trained, self.names, self.hidden)
+
+    def name_to_enroll(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
+        """Return the name under which `with_object` adds views; the arguments and errors are those of `with_object`."""
+        known = find_name(name, (*self.objects, *self.trained)) or check_name(name)
+        if extend and replace:
+            raise InputError("extend and replace are both given; choose one")
+        if not (extend or replace) and (known in self.objects or self._is_answered_class(known)):
+            state = "enrolled already" if known in self.objects else "a trained class"
+            raise InputError(f"name: {known!r} is {state}; add views to it (extend) or replace it (replace)")
+        return known
+
     def with_object(self, name: str, views: GalleryObject, *, extend: bool = False, replace: bool = False) -> "Gallery":
         """Return the gallery with an object more.
 
         Args:
             name: name of the object.
             views: its views.
-            extend: add the views to those of an object that exists.
-            replace: discard the views of an object that exists.
+            extend: add the views to those of an object that exists, or to a trained class.
+            replace: discard the views of an object that exists, and hide a trained class.
 
         Raises:
             InputError: see `check_name`; or the name exists and neither `extend` nor `replace` is given, or both are.
         """
-        name = find_name(name, self.objects) or check_name(name)
-        if extend and replace:
-            raise InputError("extend and replace are both given; choose one")
-        if name in self.objects and not (extend or replace):
-            raise InputError(f"name: {name!r} is enrolled already; add views to it (extend) or replace it (replace)")
+        name = self.name_to_enroll(name, extend=extend, replace=replace)
         if name in self.objects and extend:
             views = self.objects[name] + views
-        return dataclasses.replace(self, objects={**self.objects, name: dataclasses.replace(views, file=None)})
+        hidden = (*self.hidden, name) if replace and self._is_answered_class(name) else self.hidden
+        objects = {**self.objects, name: dataclasses.replace(views, file=None)}
+        return dataclasses.replace(self, objects=objects, hidden=hidden)
 
-    def without(self, name: str, *, hide: bool = False) -> "Gallery":
-        """Return the gallery without an object; with `hide`, a trained class of this name is not answered any more.
+    def without(self, name: str) -> "Gallery":
+        """Return the gallery without an object, and with a trained class of this name hidden.
 
         Raises:
-            InputError: no object has the name, and `hide` is not given.
+            InputError: no object and no class has the name.
         """
-        if name not in self.objects and not hide:
+        name = find_name(name, (*self.objects, *self.trained)) or name
+        is_class = self._is_answered_class(name)
+        if name not in self.objects and not is_class:
             known = ", ".join(map(repr, self.names))
             raise InputError(f"name: {name!r} is not enrolled; expected one of {known or 'none'}")
         objects = {other: views for other, views in self.objects.items() if other != name}
-        hidden = (*self.hidden, name) if hide and name not in self.hidden else self.hidden
-        return dataclasses.replace(self, objects=objects, hidden=hidden)
+        return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
+
+    def _is_answered_class(self, name: str) -> bool:
+        return name in self.trained and name not in self.hidden
 
     def reembed(self, embedding: str, embed: Callable[[CompactClouds, str], NDArray[np.float16]]) -> "Gallery":
         """Return the gallery with all views embedded again.
@@ -270,23 +288,20 @@ class Gallery:
     def _search(self) -> ExactSearch | IndexSearch:
         return (IndexSearch if self.search == "usearch" else ExactSearch)(self.regression[0])
 
-    def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
+    def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
         A score is the value of the regression, times its share in the sum with the value of the best trained class.
 
         Args:
             embeddings: [B, D] of unit length, or [B, K, D] for K looks, whose scores are averaged.
-            weights: [B, K] weights of the looks, which sum to 1; equal by default.
         """
         queries = np.asarray(embeddings, np.float32)
         if not self.objects or not len(queries):
             return np.zeros((len(queries), len(self.objects)), np.float32)
         if queries.ndim == 3:
             each = self.scores(queries.reshape(-1, queries.shape[-1])).reshape(*queries.shape[:2], -1)
-            if weights is None:
-                return each.mean(axis=1)
-            return np.einsum("bkn,bk->bn", each, np.asarray(weights, np.float32))
+            return each.mean(axis=1)
         similarity, index = self._search.nearest(queries, NEAREST)
         embeddings, owner, ridge = self.regression
         views = embeddings[index].astype(np.float32)
@@ -300,8 +315,3 @@ class Gallery:
         if self.references is not None and trained.shape[1]:
             scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)
         return scores.astype(np.float32)
-
-
-def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
-    """Return the odds of scores against everything that is not enrolled."""
-    return np.asarray((scores / EVEN) ** STEEPNESS)

@@ -5,16 +5,12 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import embed_views, enrolled_views
-from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
-from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.printable import check_name, find_name
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 
 __all__ = ["ObjectGallery"]
 
@@ -45,11 +41,9 @@ class ObjectGallery:
         Raises:
             InputError: `search` is unknown.
         """
-        self._trained = trained
-        self._search = search
         self._embedding = embedding
         self.directory: Path | None = None
-        self.gallery = Gallery("", search=search)
+        self.gallery = Gallery("", trained=trained, search=search)
         self.lock_seconds = store.LOCK_SECONDS
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
@@ -80,18 +74,13 @@ class ObjectGallery:
         return self._embedding
 
     @property
-    def union(self) -> ClassUnion:
-        """The trained classes and the objects of the gallery."""
-        return ClassUnion(self._trained, self.gallery.names, self.gallery.hidden)
-
-    @property
     def weak_rejection(self) -> str:
         """Why unknown objects are hardly rejected, and what helps, in words; empty if they are not."""
         objects, references = self.gallery.objects.values(), self.gallery.references
         few = sum(len(views.clouds) < FEW for views in objects)
         if few:
             return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
-        if objects and references is None and not self._trained and len(objects) < FEW:
+        if objects and references is None and not self.gallery.trained and len(objects) < FEW:
             return f"{len(objects)} objects are enrolled in a run without background views; enroll more of them"
         return ""
 
@@ -109,43 +98,25 @@ class ObjectGallery:
     def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
         if self.directory is None:
             self._set(change(self.gallery))
-        else:
-            embedding = None if rebuild else self.embedding.fingerprint
-            self._set(store.update_gallery(self.directory, change, embedding, self.gallery, self.lock_seconds, rebuild))
+            return
+        trained, embedding = self.gallery.trained, None if rebuild else self.embedding.fingerprint
+
+        def change_stored(stored: Gallery) -> Gallery:
+            return change(dataclasses.replace(stored, trained=trained))
+
+        self._set(
+            store.update_gallery(self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild)
+        )
 
     def _set(self, gallery: Gallery) -> None:
-        """Keep a gallery, with what the embedding and the options add to it; references only once it has objects."""
-        references, version = self.embedding.references if gallery.objects else None, self.embedding.sizes.version
-        self.gallery = dataclasses.replace(gallery, search=self._search, references=references, version=version)
-
-    def check(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
-        """Return the name under which `enroll` would enroll an object, before its views are rendered or embedded.
-
-        Raises:
-            InputError: `enroll` would refuse it.
-        """
-        name = self._found(self.gallery, name) or check_name(name)
-        none = GalleryObject(np.zeros((0, self.embedding.size), np.float16), CompactClouds.of([]), "", "")
-        self._with_objects(self.gallery, {name: none}, extend, replace)
-        return name
-
-    def _found(self, gallery: Gallery, name: str) -> str | None:
-        return find_name(name, (*gallery.objects, *self._trained))
-
-    def _with_objects(
-        self, gallery: Gallery, objects: Mapping[str, GalleryObject], extend: bool, replace: bool
-    ) -> Gallery:
-        for given, views in objects.items():
-            name = self._found(gallery, given) or check_name(given)
-            gallery = gallery.with_object(name, views, extend=extend, replace=replace)
-            if name in self._trained and name not in gallery.hidden:
-                if replace:
-                    gallery = dataclasses.replace(gallery, hidden=(*gallery.hidden, name))
-                elif not extend:
-                    raise InputError(
-                        f"name: {name!r} is a trained class; add views to it (extend) or replace it (replace)"
-                    )
-        return gallery
+        """Keep a gallery, with what the run and the options add to it; references only once it has objects."""
+        self.gallery = dataclasses.replace(
+            gallery,
+            trained=self.gallery.trained,
+            search=self.gallery.search,
+            references=self.embedding.references if gallery.objects else None,
+            version=self.embedding.sizes.version,
+        )
 
     def enroll(
         self, name: str, views: Sequence[PreparedInstance], source: str, *, extend: bool = False, replace: bool = False
@@ -164,12 +135,18 @@ class ObjectGallery:
                 is enrolled.
             OSError: the gallery cannot be written; it is as before.
         """
-        name = self.check(name, extend=extend, replace=replace)
+        name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
         self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
-        self._change(lambda gallery: self._with_objects(gallery, objects, extend, replace))
+
+        def change(gallery: Gallery) -> Gallery:
+            for name, views in objects.items():
+                gallery = gallery.with_object(name, views, extend=extend, replace=replace)
+            return gallery
+
+        self._change(change)
 
     def forget(self, name: str) -> None:
         """Remove the views of an object, and never answer its trained class again.
@@ -178,14 +155,9 @@ class ObjectGallery:
             InputError: no object has this name.
             OSError: the gallery cannot be written; it is as before.
         """
-
-        def change(gallery: Gallery) -> Gallery:
-            known = self._found(gallery, name) or name
-            return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
-
         if self.directory is not None and store.gallery_stamp(self.directory) is None:
-            change(self.gallery)  # a name that is refused leaves nothing behind
-        self._change(change)
+            self.gallery.without(name)  # a name that is refused leaves nothing behind
+        self._change(lambda gallery: gallery.without(name))
 
     def undo(self, generation: int) -> None:
         """Take back the last change of a gallery on disk; `generation` is the one after that change.

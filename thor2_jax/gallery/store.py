@@ -21,11 +21,17 @@ from typing import Any
 
 import filelock
 import numpy as np
-import safetensors
-import safetensors.numpy
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, read_file, remove_leftovers, safetensors_metadata, write_text
+from thor2_jax.files import (
+    atomic_write,
+    content_digest,
+    pack_arrays,
+    read_file,
+    remove_leftovers,
+    unpack_arrays,
+    write_text,
+)
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 
 __all__ = [
@@ -52,9 +58,6 @@ INDEX_FILE = "index.json"
 _DIGEST = re.compile("[0-9a-f]{64}")
 
 PREVIOUS_FILE = "previous.json"
-
-_METADATA = "object"
-# safetensors writes several metadata keys in a random order, and equal objects shall have equal bytes.
 
 LOCK_SECONDS = 20.0
 """Time that a writer waits for another one; a change takes milliseconds."""
@@ -172,8 +175,7 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 
 def _object_content(name: str, views: GalleryObject) -> bytes:
     arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    return safetensors.numpy.save(contiguous, {_METADATA: json.dumps({"name": name, **_origin(views)})})
+    return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
@@ -187,12 +189,11 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     if content_digest([content]) != path.stem:
         raise GalleryError(f"gallery: {path} is damaged; restore it from a copy, or delete the gallery")
     try:
-        arrays = safetensors.numpy.load(content)
-        embeddings = arrays.pop("embeddings")
-        about = json.loads(safetensors_metadata(content).get(_METADATA, "{}"))
-        views = GalleryObject(embeddings, CompactClouds(**arrays), "", "", file=path.stem)
+        arrays, metadata = unpack_arrays(content)
+        about = json.loads(metadata.get("object", "{}"))
+        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", file=path.stem)
         return about.get("name"), _with_origin(views, about)
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.gallery.gallery import score_odds
-
-__all__ = ["TOYS", "ClassUnion"]
+__all__ = ["TOYS", "ClassUnion", "score_odds"]
 
 TOYS = frozenset(
     ("apple banana cereal_box_blue cereal_box_yellow hammer mug_blue mug_white screwdriver soup_can_green soup_can_red "
@@ -20,7 +18,15 @@ TOYS = frozenset(
 MAX_LISTED = 6
 """Names that `ClassUnion.summary` lists."""
 
+EVEN, STEEPNESS = 0.2, 3
+"""A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
+
 Values = NDArray[np.floating[Any]]
+
+
+def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
+    """Return the odds of scores against everything that is not enrolled."""
+    return np.asarray((scores / EVEN) ** STEEPNESS)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -103,14 +103,12 @@ class Inference(NamedTuple):
         probabilities: classifier -> class probabilities [B, C], fused over the looks; empty if the gallery alone
             answers. Those of the embedding sum to the probability that an object is one of the classes.
         embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
-        weights: [B, K] float32, weights of their looks; None likewise.
         scores: [B, n_objects] scores of the gallery, of an inference that is fused over frames, in place of embeddings.
     """
 
     overflow: Any
     probabilities: Mapping[str, Any]
     embeddings: Any = None
-    weights: Any = None
     scores: Any = None
 
 
@@ -132,11 +130,10 @@ def infer(
     ours, config = model.embedding.config, model.run.config
     is_ours = dataclasses.replace(config, homology=ours.homology, looks=ours.looks) == ours
     first = oriented
-    if not is_ours or oriented.weights.shape[1] < LOOKS:
+    if not is_ours or oriented.shape[1] < LOOKS:
         first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
     first = jax.tree.map(lambda a: a[:, :LOOKS], first)
-    weights = first.weights / first.weights.sum(axis=1, keepdims=True)
-    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), weights)
+    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds))
 
 
 def infer_clouds(
@@ -163,7 +160,7 @@ def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | 
     """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
     if inference.embeddings is None:
         return inference.scores
-    return model.gallery.scores(inference.embeddings, inference.weights)
+    return model.gallery.scores(inference.embeddings)
 
 
 def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:

@@ -68,7 +68,7 @@ class Model:
 
     run: TrainedRun
     classifiers: RunClassifiers
-    gallery: Gallery = Gallery("")
+    gallery: Gallery
     unknown_below: float | None = None
     rule: FusionRule = DEFAULT_RULE
     answer_by: AnswerBy | None = None
@@ -96,19 +96,17 @@ class Model:
         wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
         classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
         transform = _stored_value(ColorTransform, "color_transform", run.record, "adapt the run again")
-        return cls(
-            run, classifiers, unknown_below=unknown_below, rule=rule, answer_by=wanted, color_transform=transform
-        )
+        return cls(run, classifiers, Gallery("", trained=run.classes), unknown_below, rule, wanted, transform)
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:
         """Turns fused probabilities into confidences; None in runs without one."""
         return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
 
-    @functools.cached_property
+    @property
     def union(self) -> ClassUnion:
         """The trained classes and the enrolled objects."""
-        return ClassUnion(self.run.classes, self.gallery.names, self.gallery.hidden)
+        return self.gallery.union
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ class Recognition:
     Attributes:
         label: its number in the label image.
         name: the object's name. None if the instance could not be described (fewer points than
-            `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
+            `prepared_instance.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
             confidence is below `unknown_below` (see `inference.answers`): an unknown object.
         confidence: from 0 to 1, also of an unknown object: estimated probability that the name of a known object is
             correct; low for most unknown objects (see `model.fusion`). Without a calibration, the fused
@@ -90,7 +90,7 @@ class DescribedFrame:
     @property
     def packed(self) -> PointClouds:
         """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, len(self.oriented.weights))
+        return pack_instances(self.usable, self.oriented.shape[0])
 
 
 def check_answer_by(value: str | None) -> AnswerBy | None:

@@ -6,7 +6,7 @@ A frame has a name. COCO and BOP number images and objects instead: `image_numbe
 import dataclasses
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,14 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import has_json, write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.model.recognition import Detection, Recognition, detections_of
+from thor2_jax.model.recognition import Detection, Recognition
 
 __all__ = [
     "BOP_HEADER",
     "RESULT_FILES",
-    "bop_lines",
+    "ResultTables",
     "category_numbers",
     "check_no_foreign_results",
-    "coco_results",
     "image_numbers",
     "instances_as_json",
     "is_bop_file",
@@ -52,12 +51,12 @@ def check_no_foreign_results(out: Path) -> None:
 
 
 def is_coco_file(path: Path) -> bool:
-    """Return whether a file has entries of `coco_results`."""
+    """Return whether a file has the entries of COCO results that `ResultTables` writes."""
     return has_json(path, ("image_id", "category_id", "frame", "category_name"))
 
 
 def is_bop_file(path: Path) -> bool:
-    """Return whether a file has lines of `bop_lines`, whose rotations are all the identity."""
+    """Return whether a file has the lines of BOP results that `ResultTables` writes: all rotations are the identity."""
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
     except (OSError, ValueError):
@@ -130,70 +129,74 @@ def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
     return {"size": list(mask.shape), "counts": text.decode("ascii")}
 
 
-def _with_category(
-    frame: RGBDFrame, recognitions: Iterable[Recognition], categories: Mapping[str, int]
-) -> Iterator[tuple[Detection, int]]:
-    """Return the detections whose names have numbers, with their numbers."""
-    named = [each for each in recognitions if each.name in categories]
-    return zip(detections_of(frame, named), [categories[str(each.name)] for each in named], strict=True)
+class ResultTables:
+    """The COCO and BOP results of all frames, filled frame by frame and written at the end.
 
+    Instances without a name, or whose name has no number, are in neither file. THOR2 estimates no pose: in the lines of
+    BOP (`BOP_HEADER`), R is the identity, and t the mean of the visible points, in millimetres.
 
-def coco_results(
-    name: str, image_id: int, frame: RGBDFrame, recognitions: Iterable[Recognition], categories: Mapping[str, int]
-) -> list[dict[str, Any]]:
-    """Return the entries of a frame in COCO's results format, with mask, box and score.
-
-    Instances without a name, or whose name has no number in `categories`, have none.
-
-    Args:
-        name: name of the frame, which is stored with each entry, as is the name of the object.
-        image_id: its number.
-        frame: the frame.
-        recognitions: its answers.
-        categories: name -> category_id.
+    Attributes:
+        n_without_number: named instances whose class has no number.
     """
-    entries = []
-    for detection, category in _with_category(frame, recognitions, categories):
-        recognition = detection.recognition
-        entries.append(
-            {
-                "image_id": image_id,
-                "category_id": category,
-                "bbox": list(detection.box),
-                "score": recognition.confidence,
-                "segmentation": run_length_encoding(frame.label_image == recognition.label),
-                "frame": name,
-                "category_name": recognition.name,
-            }
-        )
-    return entries
 
+    def __init__(self, frames: Sequence[str], classes: Sequence[str], names: Mapping[int, str] | None = None) -> None:
+        """Number the frames and the classes.
 
-def bop_lines(
-    scene_id: int,
-    image_id: int,
-    frame: RGBDFrame,
-    recognitions: Iterable[Recognition],
-    categories: Mapping[str, int],
-    seconds: float,
-) -> list[str]:
-    """Return the lines of a frame in BOP's results format (`BOP_HEADER`).
+        Args:
+            frames: names of all frames, see `image_numbers`.
+            classes: names of all objects.
+            names: number -> name, see `category_numbers`.
+        """
+        self._categories = category_numbers(classes, names)
+        self._images = dict(zip(frames, image_numbers(frames), strict=True))
+        self._has_scenes = len({scene for scene, _ in self._images.values()}) > 1
+        self._places = {name: place for place, name in enumerate(frames, 1)}
+        self._coco: list[dict[str, Any]] = []
+        self._bop: list[str] = []
+        self.n_without_number = 0
 
-    THOR2 estimates no pose: R is the identity, and t the mean of the visible points, in millimetres. Instances without
-    a name, or whose name has no number in `categories`, have no line.
+    def add(self, name: str, frame: RGBDFrame, detections: Iterable[Detection], seconds: float) -> None:
+        """Add the detections of a frame.
 
-    Args:
-        scene_id: number of the scene.
-        image_id: number of the image.
-        frame: the frame.
-        recognitions: its answers.
-        categories: name -> obj_id.
-        seconds: time for the whole frame.
-    """
-    lines = []
-    for detection, category in _with_category(frame, recognitions, categories):
-        assert detection.position is not None  # An object with a name has points.
-        translation = " ".join(f"{1000 * value:.3f}" for value in detection.position)
-        score = detection.recognition.confidence
-        lines.append(f"{scene_id},{image_id},{category},{score},{_IDENTITY},{translation},{seconds:.4f}")
-    return lines
+        Args:
+            name: name of the frame, which is stored with each entry of COCO, as is the name of the object.
+            frame: the frame.
+            detections: its answers, and where the objects are.
+            seconds: time for the whole frame.
+        """
+        scene, image = self._images[name]
+        for detection in detections:
+            answer = detection.recognition
+            if answer.name is None:
+                continue
+            category = self._categories.get(answer.name)
+            if category is None:
+                self.n_without_number += 1
+                continue
+            self._coco.append(
+                {
+                    # COCO has no scenes: images of several scenes are counted from 1.
+                    "image_id": self._places[name] if self._has_scenes else image,
+                    "category_id": category,
+                    "bbox": list(detection.box),
+                    "score": answer.confidence,
+                    "segmentation": run_length_encoding(frame.label_image == answer.label),
+                    "frame": name,
+                    "category_name": answer.name,
+                }
+            )
+            assert detection.position is not None  # An object with a name has points.
+            place = " ".join(f"{1000 * value:.3f}" for value in detection.position)
+            self._bop.append(f"{scene},{image},{category},{answer.confidence},{_IDENTITY},{place},{seconds:.4f}")
+
+    def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
+        """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
+        contents = {coco: json.dumps(self._coco), bop: "\n".join([BOP_HEADER, *self._bop])}
+        for path, content in contents.items():
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_text(path, content + "\n")

@@ -25,18 +25,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import safetensors
-import safetensors.numpy
 from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_directory, check_output_directory, content_digest, read_file
-from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.classifier import MLP, Classifier, Feature, check_features, model_arrays, model_from_arrays
+from thor2_jax.files import (
+    atomic_directory,
+    check_output_directory,
+    content_digest,
+    pack_arrays,
+    read_file,
+    unpack_arrays,
+)
+from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
+from thor2_jax.model.classifier import Classifier, Feature, check_features
 from thor2_jax.model.run_record import RUN_FILE, RUN_FORMAT, read_description
+from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 
 __all__ = ["EMBEDDING_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
 
@@ -92,7 +97,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         (unfinished / "weights").mkdir()
         if run.embedding is not None:
             run.embedding.save(unfinished / EMBEDDING_FILE)
-        contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
+        contents = {name: pack_arrays(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
         embedding = run.embedding
@@ -172,7 +177,6 @@ def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> 
     if content_digest([content]) != digest:
         raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
     try:
-        arrays = safetensors.numpy.load(content)
-        return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), arrays)
-    except (ValueError, safetensors.SafetensorError) as error:
+        return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])
+    except ValueError as error:
         raise InputError(f"model: {path} does not fit the classifier ({error})") from None

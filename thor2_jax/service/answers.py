@@ -69,7 +69,7 @@ def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
     """Return the JSON records of all objects that may be answered."""
-    union, enrolled = objects.union, objects.gallery.objects
+    union, enrolled = objects.gallery.union, objects.gallery.objects
     answers = []
     for name, is_trained in zip(union.names, union.has_output, strict=True):
         about: dict[str, Any] = {"views": 0, "source": None, "date": None}

@@ -211,9 +211,9 @@ class InferenceEngine:
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
         clouds = pack_instances(instances, n_clouds, n_points)
         network, config = self.run.network, self.run.config
-        aligned, weights = aligned_looks(clouds, config, config.looks)
+        aligned = aligned_looks(clouds, config, config.looks)
         cloud_strips = strips(aligned, network, config)
-        oriented = describe_aligned_looks(aligned, weights, cloud_strips, network, config)
+        oriented = describe_aligned_looks(aligned, cloud_strips, network, config, config.looks)
         inference = infer(self.model, oriented, clouds if self._embeds else None)
         first = slice(None, None, config.looks)
         images, embeddings = oriented.first.images, oriented.first.embeddings
@@ -229,7 +229,7 @@ class InferenceEngine:
         model = self.model
         source = model.answers_by()  # A change of the gallery may change it.
         if source == "classifiers":
-            inference = inference._replace(embeddings=None, weights=None)
+            inference = inference._replace(embeddings=None)
         elif source == "gallery":
             inference = inference._replace(probabilities={})
         return answers(model, instances, inference)

@@ -279,7 +279,7 @@ class Service:
         """
         with self._gallery_errors(409, "name"):
             self.engine.objects.refresh()
-            self.engine.objects.check(name, **flags)
+            self.engine.objects.gallery.name_to_enroll(name, **flags)
         prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))

@@ -21,7 +21,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.instance_clouds import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.testing.comparing import UNIT, assert_equal, assert_near, joined, map_points, taken, with_points
 from thor2_jax.testing.strategies import settled
 from thor2_jax.types import Descriptors, PointClouds, Strips

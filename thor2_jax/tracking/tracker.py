@@ -32,8 +32,15 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, gallery_scores
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
-from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
-from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
+from thor2_jax.tracking.viewpoints import (
+    NextView,
+    PosedInstance,
+    ViewTable,
+    check_pose,
+    merge_views,
+    next_view,
+    transform,
+)
 
 if TYPE_CHECKING:
     from thor2_jax.recognizer import Recognizer

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.instance_clouds import flying_pixels
+from thor2_jax.frames.outliers import flying_pixels
 from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
 from training.augmentation.pixels import without

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
 from thor2_jax.frames.frames import Intrinsics, pixel_points
-from thor2_jax.frames.instance_clouds import PIECE_CELL
+from thor2_jax.frames.outliers import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, Range, pixel_width, without
 from training.rendering.view_sphere import TRAINING_CAMERA, RenderedView
 

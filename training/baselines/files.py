@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, json_digest, read_file, safetensors_metadata
+from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 
 __all__ = [
     "BASELINES",
@@ -116,11 +114,9 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], s
     if stored.weights:
         about["weights"] = dict(stored.weights)
     about["digest"] = _digest(stored.arrays, about)
-    arrays = {name: np.ascontiguousarray(array) for name, array in stored.arrays.items()}
     path.parent.mkdir(exist_ok=True)
-    content = safetensors.numpy.save(arrays, {"about": json.dumps(about)})
     with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(pack_arrays(stored.arrays, {"about": json.dumps(about)}))
 
 
 def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
@@ -134,9 +130,8 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         InputError: if the file is damaged or has another format or other classes; the message names the file.
     """
     try:
-        content = read_file(path)
-        arrays = safetensors.numpy.load(content)
-        about = json.loads(safetensors_metadata(content)["about"])
+        arrays, metadata = unpack_arrays(read_file(path))
+        about = json.loads(metadata["about"])
         if about["format"] != BASELINE_FORMAT:
             raise InputError(
                 f"model: {path} has format {about['format']!r}; expected {BASELINE_FORMAT}; train the baseline again"
@@ -148,5 +143,5 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None

@@ -10,8 +10,8 @@ import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import model_arrays, model_from_arrays
 from training.baselines.baseline import FitTask, NetworkFit, Predictor, compiled, fit_network, in_batches
 from training.baselines.files import StoredBaseline
 from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs

@@ -15,8 +15,8 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import model_arrays, model_from_arrays
 from training.baselines.baseline import FitTask, Predictor
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline
 from training.baselines.image_network import crop_function, read_samples

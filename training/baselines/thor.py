@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
-from thor2_jax.model.classifier import MLP, model_arrays, model_from_arrays
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled
 from training.baselines.files import StoredBaseline

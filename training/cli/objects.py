@@ -1,5 +1,6 @@
 """`thor2 objects`: list the objects that a run recognizes."""
 
+import dataclasses
 from typing import Annotated
 
 import typer
@@ -25,7 +26,6 @@ def objects(
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
     from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, load_gallery
-    from thor2_jax.gallery.union import ClassUnion
     from thor2_jax.model.run_record import read_description
 
     if gallery is not None and not (gallery / INDEX_FILE).is_file() and not (gallery / "objects").is_dir():
@@ -38,7 +38,7 @@ def objects(
     trained, embedding = tuple(description["classes"]), description.get("embedding")
     directory = model / GALLERY_DIRECTORY if gallery is None else gallery
     known = load_gallery(directory, None if embedding is None else str(embedding))
-    union = ClassUnion(trained, known.names, known.hidden)
+    union = dataclasses.replace(known, trained=trained).union
     table = Table("name", "views", "source", "enrolled")
     for name in union.names:
         sources, views, date = [], "", ""

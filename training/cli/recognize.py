@@ -69,7 +69,6 @@ def recognize(
     from thor2_jax.segmentation.segmenters import TABLE
     from training.frame_recognition import (
         RecognizerArguments,
-        ResultTables,
         recognize_frames,
         segmentation_failure,
         track_frames,
@@ -101,7 +100,7 @@ def recognize(
         bag, sources = given.open_bag(), []
     frame_poses = None
     if poses is not None:
-        from thor2_jax.tracking.poses import read_poses  # imports SciPy
+        from thor2_jax.tracking.viewpoints import read_poses  # imports SciPy
 
         frame_poses = read_poses(poses, [source.name for source in sources])
     if out is not None:
@@ -123,7 +122,7 @@ def recognize(
             for note in stack.enter_context(bag).notes:
                 print(escape_characters(f"note: {note}"), file=sys.stderr)
         recognizer = load()
-        tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
+        tables = result_files.ResultTables([source.name for source in sources], recognizer.classes, numbers)
         if bag is not None:
             recorded = itertools.islice(bag.frames(), 0, None, given.every)
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
@@ -152,7 +151,7 @@ def recognize(
                 if not as_json:
                     _print_table(answer.name if frames else None, answer.recognitions)
                 if coco or bop:
-                    tables.add(answer)
+                    tables.add(answer.name, answer.frame, answer.detections, answer.seconds)
                 if out is not None:
                     directory = out / answer.name if frames or recording else out
                     result_files.write_recognitions(directory, answer.frame, answer.recognitions)

@@ -26,8 +26,8 @@ from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, projected_features
-from thor2_jax.gallery.references import BACKGROUND, References
+from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
+from thor2_jax.networks import EmbeddingSizes, class_cosines, projected_features
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
 from training.fitting.fit import FitState, initial_state, network_step
@@ -67,7 +67,7 @@ def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -
     """Return the descriptors of the samples of a batch, one look each."""
     descriptors = batch_descriptors(batch.length, batch.color, network, config)
     each, statistics = jax.tree.map(lambda a: a[:, None], (descriptors, jnp.asarray(batch.statistics)))
-    return LookDescriptors(each, statistics, jnp.ones((len(batch.label), 1)))
+    return LookDescriptors(each, statistics)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

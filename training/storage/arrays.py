@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from numpy.typing import NDArray
 
-from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
+from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, safetensors_metadata, unpack_arrays
 
 __all__ = ["load_arrays", "load_metadata", "save_arrays"]
 
@@ -22,10 +20,8 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
     Raises:
         OSError: the file cannot be written; an older one stays.
     """
-    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    content = safetensors.numpy.save(contiguous, {**metadata, "sha256": _digest(contiguous)})
     with atomic_write(path) as temporary:
-        temporary.write_bytes(content)  # `save_file` has an error of its own for a full disk
+        temporary.write_bytes(pack_arrays(arrays, {**metadata, "sha256": _digest(arrays)}))
 
 
 def load_metadata(path: Path) -> dict[str, str]:
@@ -48,13 +44,13 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         ValueError: the file is missing or damaged.
     """
     try:
-        arrays = safetensors.numpy.load_file(path)
-    except (OSError, safetensors.SafetensorError) as error:
+        arrays, metadata = unpack_arrays(read_file(path))
+    except OSError as error:
         raise ValueError(str(error)) from None
-    if _digest(arrays) != load_metadata(path).get("sha256"):
+    if _digest(arrays) != metadata.get("sha256"):
         raise ValueError("its content is damaged")
     return arrays
 
 
 def _digest(arrays: Arrays) -> str:
-    return content_digest(part for name in sorted(arrays) for part in (name, arrays[name].tobytes()))
+    return content_digest(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]).tobytes()))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import pixel_points
-from thor2_jax.frames.instance_clouds import downsample_to_fit
+from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.objects.mesh import TexturedMesh

@@ -17,7 +17,6 @@ from thor2_jax.adaptation.estimate import (
     GRID,
     MIN_INSTANCES,
     PRIOR,
-    Criterion,
     adaptation_criterion,
     entropy,
     estimate_transform,
@@ -26,7 +25,7 @@ from thor2_jax.adaptation.estimate import (
     objective,
     posterior_mean,
 )
-from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FusionRule, fused_probabilities
 from thor2_jax.recognizer import Recognizer
@@ -72,36 +71,35 @@ def test_entropy_counts_what_the_classes_lack() -> None:
 def test_the_objective_is_the_entropy_of_the_answers() -> None:
     made = instances(11)  # two chunks, one with padding
     recognizer = Recognizer(run())
-    criterion = adaptation_criterion(recognizer.model)
-    total = objective(made, criterion)
+    total = objective(made, adaptation_criterion(recognizer.model))
     for transform in (ColorTransform(), WARM):
         corrected = [dataclasses.replace(each, colors=transform(each.colors)) for each in made]
-        oriented = describe_looks(pack_instances(corrected, 16), criterion.network, criterion.config, 2)
+        oriented = describe_looks(pack_instances(corrected, 16), run().network, run().config, 2)
         fused = recognizer.model.fused(class_probabilities(recognizer, oriented, ("tops", "tops2")))[: len(made)]
         expected = sum(scipy_entropy(row) for row in fused)
         # Colours are rounded to 8 bits before a camera's correction, not in between.
         assert total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
 
 
-def grey_is_known(oriented: LookDescriptors) -> jax.Array:
+def grey_is_known(clouds: thor2.PointClouds) -> jax.Array:
     """Answer one class, the more surely the closer the mean colour is to grey."""
-    mean = oriented.statistics[:, 0, 5:8]  # see `cloud_statistics`
+    mean = jnp.mean(clouds.colors, axis=1, where=clouds.mask[..., None])
     return jnp.exp(-10 * jnp.square(mean[:, :1] - mean[:, 2:]))
 
 
-def none_is_known(oriented: LookDescriptors) -> jax.Array:
-    return jnp.zeros((len(oriented.weights), 3))
+def none_is_known(clouds: thor2.PointClouds) -> jax.Array:
+    return jnp.zeros((len(clouds.mask), 3))
 
 
 @pytest.mark.slow
 def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
     warm = np.array([150, 110, 90], np.uint8)
     made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
-    adaptation = estimate_transform(made, Criterion(run().network, run().config, grey_is_known))
+    adaptation = estimate_transform(made, grey_is_known)
     assert -0.36 < adaptation.transform.warmth < -0.1
     assert adaptation.transform == ColorTransform(warmth=adaptation.transform.warmth)
     assert adaptation.uncertainty_after < adaptation.uncertainty_before and adaptation.instances == 40
-    unchanged = estimate_transform(made, Criterion(run().network, run().config, none_is_known)).transform
+    unchanged = estimate_transform(made, none_is_known).transform
     np.testing.assert_allclose(dataclasses.astuple(unchanged), 0, atol=1e-6)
 
 
@@ -119,7 +117,7 @@ def test_too_few_instances_are_refused_with_their_number() -> None:
     unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
     with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
-        estimate_transform(few, Criterion(run().network, run().config, none_is_known))
+        estimate_transform(few, none_is_known)
 
 
 def test_instances_are_spread_evenly() -> None:
@@ -166,7 +164,7 @@ def test_gallery_answers_are_its_scores() -> None:
     clouds = pack_instances(instances(4), 4)
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2).with_balanced(clouds)
     gallery = dataclasses.replace(recognizer.gallery, references=None)
-    scores = gallery.scores(embedding.embed_oriented(oriented), oriented.weights)
+    scores = gallery.scores(embedding.embed_oriented(oriented))
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
     np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
 
@@ -174,16 +172,17 @@ def test_gallery_answers_are_its_scores() -> None:
 @pytest.mark.parametrize("rule", ["max", *slow("mean", "log-mean")])
 def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
     recognizer = Recognizer(run(), rule=rule)
-    network, config, classify = adaptation_criterion(recognizer.model)
-    oriented = describe_looks(pack_instances(instances(4), 4), network, config, 2)
+    clouds = pack_instances(instances(4), 4)
+    oriented = describe_looks(clouds, run().network, run().config, 2)
     expected = fused_probabilities(class_probabilities(recognizer, oriented, ("tops", "tops2")), rule)
-    np.testing.assert_allclose(jax.jit(classify)(oriented), expected, atol=1e-5)
+    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(clouds), expected, atol=1e-5)
 
 
 def test_an_embedding_alone_is_the_criterion() -> None:
     recognizer = Recognizer(untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(run().config, looks=4)))
     adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
     assert recognizer.model.color_transform == adaptation.transform and adaptation.instances == 10
-    network, config, classify = adaptation_criterion(recognizer.model)
-    oriented = describe_looks(pack_instances(instances(4), 4), network, config, 2)
-    np.testing.assert_array_equal(classify(oriented), class_probabilities(recognizer, oriented)["embedding"])
+    clouds = pack_instances(instances(4), 4)
+    oriented = describe_looks(clouds, recognizer.run.network, recognizer.run.config, 2)
+    expected = class_probabilities(recognizer, oriented)["embedding"]
+    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(clouds), expected, rtol=1e-6)

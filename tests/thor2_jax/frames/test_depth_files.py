@@ -12,7 +12,7 @@ from PIL import Image
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_depth
-from thor2_jax.frames.instance_clouds import instance_cloud
+from thor2_jax.frames.prepared_instance import instance_cloud
 
 METRES = np.random.default_rng(0).uniform(0.3, 2.5, (5, 7)).astype(np.float32)
 UNITS = (METRES * 1000).astype(np.uint16)

@@ -11,8 +11,14 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.frames.instance_clouds import MIN_POINTS, instance_clouds, voxel_downsample
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.outliers import voxel_downsample
+from thor2_jax.frames.prepared_instance import (
+    MIN_POINTS,
+    PreparedInstance,
+    instance_clouds,
+    pack_instances,
+    prepare_instance,
+)
 from training.readers.frames import FrameFolder
 
 HEIGHT, WIDTH = 240, 320

@@ -8,8 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.instance_clouds import instance_clouds
-from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion
+from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion, instance_clouds
 
 HEIGHT, WIDTH = 120, 160
 CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)

@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.instance_clouds import flying_pixels, remove_outliers
+from thor2_jax.frames.outliers import flying_pixels, remove_outliers
 
 CAMERA = Intrinsics(611.3, 620.0, 10.0, 8.0)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.instance_clouds import downsample_to_fit, voxel_downsample
+from thor2_jax.frames.outliers import downsample_to_fit, voxel_downsample
 
 
 def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,8 @@ from sklearn.gaussian_process.kernels import RBF
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.embedding import BACKGROUND, References
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, CompactClouds, Gallery, GalleryObject
-from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 
 
@@ -133,11 +133,21 @@ def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
     assert extended.names == replaced.names == gallery.names
 
 
+def test_a_trained_class_needs_extend_or_replace(gallery: Gallery) -> None:
+    gallery = dataclasses.replace(gallery, trained=("a", "b", "c"))
+    with pytest.raises(InputError, match="'a' is a trained class"):
+        gallery.with_object("a", enrolled(1))
+    changed = gallery.with_object("a", enrolled(1), extend=True).with_object("b", enrolled(1), replace=True)
+    assert changed.hidden == ("b",) and changed.union.names == ("a", "c", *gallery.names, "b")
+
+
 def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:
     with pytest.raises(InputError, match="'cup'"):
         gallery.without("cup")
-    hidden = gallery.without("cup", hide=True).without("cup", hide=True)
+    hidden = dataclasses.replace(gallery, trained=("cup",)).without("cup")
     assert hidden.hidden == ("cup",) and hidden.names == gallery.names
+    with pytest.raises(InputError, match="'cup'"):
+        hidden.without("cup")
 
 
 NO_NAMES = ["", " ", "a\nb", "x" * 201, 3, ".", "..", "a/../b", "unknown", " Unknown", "mug\u200b", "\u3164", "\ud800"]

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
+from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
 
 VIEWS = np.eye(4, dtype=np.float16)[[0, 1, 2]]
 REFERENCES = References(VIEWS, np.array([0, 1, BACKGROUND], np.int32), ("mug", "bowl"))

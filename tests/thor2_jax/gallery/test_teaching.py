@@ -68,11 +68,11 @@ def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) 
 
 def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monkeypatch: pytest.MonkeyPatch) -> None:
     objects = ObjectGallery(tuple(builtin_objects()))
-    assert objects.union.summary == "18 toy objects of the demo; it knows nothing of yours"
+    assert objects.gallery.union.summary == "18 toy objects of the demo; it knows nothing of yours"
     objects.forget("apple")
-    assert objects.union.summary.startswith("17 toy objects")
+    assert objects.gallery.union.summary.startswith("17 toy objects")
     objects = taught(run, embedding).objects
-    assert objects.union.summary == "5 objects: a, b, c, brick, book"
+    assert objects.gallery.union.summary == "5 objects: a, b, c, brick, book"
     assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ()), embedding).objects
     assert "2 of 2 enrolled objects" in alone.weak_rejection
@@ -80,8 +80,8 @@ def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monke
     assert alone.weak_rejection.startswith("1 of 2")
     monkeypatch.setattr("thor2_jax.gallery.objects.FEW", 1)
     assert not alone.weak_rejection
-    assert ObjectGallery(()).union.summary == "no object yet"
-    assert ObjectGallery(tuple("abcdefg")).union.summary.endswith("f, ...")
+    assert ObjectGallery(()).gallery.union.summary == "no object yet"
+    assert ObjectGallery(tuple("abcdefg")).gallery.union.summary.endswith("f, ...")
 
 
 def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
@@ -172,17 +172,6 @@ def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embeddi
         assert all(name in left for top in answer.top.values() for name, _ in top)
     with pytest.raises(thor2.InputError, match="name"):
         recognizer.forget(next(iter(first)))  # type: ignore[arg-type]
-
-
-def test_a_trained_class_needs_extend_or_replace(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
-    with pytest.raises(thor2.InputError, match="'a' is a trained class"):
-        recognizer.enroll("a", [frame(RED)])
-    assert recognizer.gallery.names == ()
-    recognizer.enroll("a", [frame(RED)], extend=True)
-    recognizer.enroll("b", [frame(BLUE)], replace=True)
-    assert (recognizer.gallery.names, recognizer.gallery.hidden) == (("a", "b"), ("b",))
-    assert recognizer.classes == ("a", "c", "b")
 
 
 def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embedding: Embedding) -> None:

@@ -10,7 +10,8 @@ from flax import nnx
 from helpers import input_error, slow
 
 import thor2_jax as thor2
-from thor2_jax.model.classifier import FEATURES, HIDDEN, MLP, SPARSE_BATCH, check_features, feature_of
+from thor2_jax.model.classifier import FEATURES, check_features, feature_of
+from thor2_jax.networks import HIDDEN, MLP, SPARSE_BATCH
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))

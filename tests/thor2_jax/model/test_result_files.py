@@ -1,6 +1,5 @@
 """Files with answers: COCO results read by pycocotools, BOP results, and the numbers of images and objects."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,10 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.recognition import Recognition, detections_of
 from thor2_jax.model.result_files import (
-    BOP_HEADER,
-    bop_lines,
+    ResultTables,
     category_numbers,
-    coco_results,
     image_numbers,
     run_length_encoding,
 )
@@ -58,12 +55,12 @@ def test_run_lengths_are_those_of_pycocotools(name: str) -> None:
 
 
 def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
-    scene = frame()
-    results = coco_results("table/7", 7, scene, ANSWERS, {"bowl": 1, "mug": 2})
-    (tmp_path / "results.json").write_text(json.dumps(results))
+    scene, tables = frame(), ResultTables(["table/000007"], ["bowl", "mug"])
+    tables.add("table/000007", scene, detections_of(scene, ANSWERS), 0.25)
+    tables.write(coco=tmp_path / "results.json")
     dataset = COCO()
     dataset.dataset = {
-        "images": [{"id": 7, "height": 40, "width": 60}],
+        "images": [{"id": 1, "height": 40, "width": 60}],
         "annotations": [],
         "categories": [{"id": 1}, {"id": 2}],
     }
@@ -75,17 +72,19 @@ def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
         mask = scene.label_image == label
         entry = annotations[category]
         np.testing.assert_array_equal(loaded.annToMask(entry).astype(bool), mask)
-        assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 7
+        assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 1
         np.testing.assert_array_equal(entry["bbox"], coco_mask.toBbox(entry["segmentation"]))
+        assert entry["frame"] == "table/000007" and entry["category_name"] == ANSWERS[label - 1].name
     assert annotations[2]["bbox"] == [10, 5, 20, 15]
 
 
-def test_bop_lines() -> None:
-    scene = frame()
-    lines = bop_lines(48, 7, scene, ANSWERS, {"mug": 14}, 0.25)
-    assert BOP_HEADER.split(",") == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
-    assert len(lines) == 1
-    scene_id, im_id, obj_id, score, rotation, translation, seconds = lines[0].split(",")
+def test_bop_lines(tmp_path: Path) -> None:
+    scene, tables = frame(), ResultTables(["000048/000007"], ["bowl", "mug"], {14: "mug"})
+    tables.add("000048/000007", scene, detections_of(scene, ANSWERS), 0.25)
+    tables.write(bop=tmp_path / "results.csv")
+    header, line = (tmp_path / "results.csv").read_text().splitlines()
+    assert header == "scene_id,im_id,obj_id,score,R,t,time" and tables.n_without_number == 1
+    scene_id, im_id, obj_id, score, rotation, translation, seconds = line.split(",")
     assert (int(scene_id), int(im_id), int(obj_id), float(score), float(seconds)) == (48, 7, 14, 0.75, 0.25)
     np.testing.assert_array_equal(np.array(rotation.split(), float).reshape(3, 3), np.eye(3))
     points = backproject(scene.depth_m, scene.intrinsics)[(scene.label_image == 1) & (scene.depth_m > 0)]

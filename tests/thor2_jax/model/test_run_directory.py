@@ -17,7 +17,7 @@ from helpers import class_probabilities, full_disk, untrained_embedding_run, unt
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
-from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
+from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.recognizer import Recognizer
 
@@ -50,7 +50,7 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
     rng = np.random.default_rng(0)
     images, color = rng.random((1, 1, 2, 8, 8), np.float32), rng.random((1, 1, 2, 22, 5), np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros((1, 1), jnp.int32))
-    oriented = LookDescriptors(descriptors, jnp.zeros((1, 1, 34)), jnp.ones((1, 1)))
+    oriented = LookDescriptors(descriptors, jnp.zeros((1, 1, 34)))
     before, after = (class_probabilities(each, oriented) for each in (Recognizer(run), Recognizer.load(saved)))
     for name in run.classifiers:
         assert before[name].shape == (1, 3)

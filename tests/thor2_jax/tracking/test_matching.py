@@ -7,8 +7,8 @@ import pytest
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.tracking.poses import check_pose, merge_views
 from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
+from thor2_jax.tracking.viewpoints import check_pose, merge_views
 from training.rendering.view_sphere import camera_pose
 
 

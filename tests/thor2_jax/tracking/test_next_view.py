@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import entropy
 
 import thor2_jax as thor2
-from thor2_jax.tracking.next_view import ViewTable, next_view
+from thor2_jax.tracking.viewpoints import ViewTable, next_view
 from training.rendering.view_sphere import camera_pose
 
 AZIMUTHS = np.arange(8) * np.pi / 4

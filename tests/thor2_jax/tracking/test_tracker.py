@@ -12,8 +12,8 @@ import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.next_view import ViewTable
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker
+from thor2_jax.tracking.viewpoints import ViewTable
 from training.rendering.view_sphere import camera_pose
 
 CAMERA = thor2.Intrinsics(600.0, 600.0, 79.5, 59.5)

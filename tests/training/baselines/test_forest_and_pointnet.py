@@ -11,7 +11,7 @@ from sklearn.ensemble import RandomForestClassifier
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.model.classifier import model_arrays
+from thor2_jax.networks import model_arrays
 from training.baselines.baseline import BaselineInputs, Predictor
 from training.baselines.forest import forest_features, load_forest, predict, tree_arrays
 from training.baselines.pointnet import POINTS, PointNet, load_pointnet

@@ -11,7 +11,7 @@ from flax import nnx
 from helpers import random_classifier
 
 import thor2_jax as thor2
-from thor2_jax.model.classifier import MLP
+from thor2_jax.networks import MLP
 from training.baselines.baseline import BaselineInputs
 from training.baselines.thor import VIEW_TYPES, camera_types, library_arrays, load_thor, predictor, view_types
 

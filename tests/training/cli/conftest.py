@@ -9,9 +9,9 @@ from helpers import SMALL_CONFIG, Command, Recognize, json_lines, untrained_run
 from helpers import small_embedding as embedding_of_tests
 
 from thor2_jax.gallery import embedding, objects
-from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
+from thor2_jax.networks import EmbeddingSizes
 from training import protocol, train_run
 from training.embedding import fit
 from training.protocol import DEFAULT, PAPER

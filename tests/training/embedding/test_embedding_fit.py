@@ -15,9 +15,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.classifier import model_arrays
+from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
+from thor2_jax.networks import EmbeddingSizes, model_arrays
 from training.augmentation import orientation
 from training.embedding import fit
 from training.embedding import samples as module
@@ -83,7 +82,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     for mirror in ("", "x"):
         aligned = thor2.turn(thor2.mirror(normal, mirror), SMALL_CONFIG)
         described = strips(aligned, NETWORK, embedding.config)
-        oriented = describe_aligned_looks(aligned, jnp.ones((len(rows), 1)), described, NETWORK, embedding.config)
+        oriented = describe_aligned_looks(aligned, described, NETWORK, embedding.config, 1)
         similarity.append((actual * embedding.embed_oriented(oriented, aligned)[:, 0]).sum(axis=1))
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 

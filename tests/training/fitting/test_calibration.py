@@ -13,10 +13,11 @@ from sklearn.metrics import log_loss
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.model.classifier import MLP, Feature, class_probabilities
+from thor2_jax.model.classifier import Feature, class_probabilities
 from thor2_jax.model.fusion import Calibration, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
+from thor2_jax.networks import MLP
 from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.fit import FitContext

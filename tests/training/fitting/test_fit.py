@@ -15,7 +15,7 @@ from helpers import assert_refused, random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import region_sets
-from thor2_jax.model.classifier import MLP, model_arrays
+from thor2_jax.networks import MLP, model_arrays
 from training.fitting import loop
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions

@@ -1,13 +1,10 @@
-"""One coloured point cloud for each instance of a frame (paper, section "Recognition").
+"""Points of an instance: a voxel grid, and the rules that remove outliers (paper, section "Recognition").
 
-Pixels with valid depth are put on a voxel grid of 3 mm, which replaces the points of each voxel by their mean, as
-Open3D's `voxel_down_sample` does. A mask extends past the edge of its object, onto the background and onto flying
-pixels between the two. Three rules remove them: flying pixels are found by steps in depth, stray points by the mean
-distance to their neighbours, and background by small pieces that are apart from the rest. An instance that cannot be
-used is not dropped: its `reason` says why.
+A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Three rules
+remove them: flying pixels are found by steps in depth, stray points by the mean distance to their neighbours, and
+background by small pieces that are apart from the rest.
 """
 
-import dataclasses
 import math
 from typing import Any
 
@@ -17,20 +14,9 @@ from scipy import ndimage
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_points
+from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = [
-    "EMPTY_INSTANCE",
-    "MIN_POINTS",
-    "PreparedInstance",
-    "downsample_to_fit",
-    "flying_pixels",
-    "instance_cloud",
-    "instance_clouds",
-    "remove_outliers",
-    "unit_question",
-    "voxel_downsample",
-]
+__all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "voxel_downsample"]
 
 
 def voxel_downsample(
@@ -217,102 +203,3 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
     if not relaxed:
         kept = kept[among]
     return kept[_in_large_piece(cell[kept], shape)], relaxed
-
-
-CLOUD_VOXEL = 0.003
-"""Voxel side of the grid on which outliers are removed, metres."""
-
-RIM = 2
-"""Width of the rim of a mask, pixels: masks reach over the edges of their objects."""
-
-MIN_POINTS = 30
-"""Least number of points on that grid; an instance with fewer cannot be used."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class PreparedInstance:
-    """The cloud of an instance of a frame; one of `prepare_instance` is on the descriptors' voxel grid.
-
-    Attributes:
-        label: its number in the label image.
-        points: [n, 3] float32, metres, OpenCV camera frame; empty if the instance cannot be used.
-        colors: [n, 3] uint8, sRGB.
-        boundary: [n] bool, points on the occlusion boundary; all False if the instance is not occluded.
-        occluded: another instance hides a part of it, or the image border cuts it.
-        kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
-        reason: why the instance cannot be used; None if it can.
-        rim: [n] bool, points of pixels within `RIM` of the contour of the mask, if less than half of them are; None
-            without a mask.
-    """
-
-    label: int
-    points: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    boundary: NDArray[np.bool_]
-    occluded: bool = False
-    kept_by_fallback: bool = False
-    reason: str | None = None
-    rim: NDArray[np.bool_] | None = None
-
-
-EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
-"""An instance without points, which pads a batch."""
-
-
-def instance_clouds(frame: RGBDFrame) -> list[PreparedInstance]:
-    """Return the clouds of all instances in the order of `frame.instances`, including those that cannot be used."""
-    return [instance_cloud(frame, label) for label in frame.instances]
-
-
-def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> PreparedInstance:
-    """Return the cloud of one instance, on a voxel grid of 3 mm and before `find_occlusion`.
-
-    Args:
-        frame: the frame.
-        label: one of `frame.instances`.
-        with_rim: whether to find the rim.
-    """
-    pixels = frame.instance_pixels[label]
-    depth = frame.depth_m.ravel()[pixels]
-    trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
-    flying = flying_pixels(frame, pixels)
-    steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
-    if not steep:
-        trusted &= ~flying
-    valid, depth = pixels[trusted], depth[trusted]
-    points = pixel_points(valid, depth, frame.depth.shape[1], frame.intrinsics)
-    channels = frame.color.reshape(-1, 3).take(valid, axis=0)
-    if with_rim:  # as a further colour channel
-        channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
-    points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
-    if len(points) < MIN_POINTS:
-        reason = (
-            f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
-            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}"
-        )
-        if not frame.has_usable_depth:
-            reason += f"; no instance has such depth: {unit_question(frame)}"
-        return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=reason)
-    kept, relaxed = remove_outliers(points)
-    points, channels, none = points.take(kept, axis=0), channels.take(kept, axis=0), np.zeros(len(kept), bool)
-    rim = channels[:, 3] > 127 if with_rim else None
-    return PreparedInstance(label, points, channels[:, :3], none, False, steep or relaxed, rim=rim)
-
-
-def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which pixels [n] of a mask are within `RIM` of one that is not in it; the image border is no contour."""
-    (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
-    columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
-    window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    # As `scipy.ndimage.minimum_filter`, in half of the time.
-    padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
-    inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
-    inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
-    return ~inside[window]
-
-
-def unit_question(frame: RGBDFrame) -> str:
-    """Ask whether the unit of a frame's depth is right."""
-    if frame.depth.dtype.kind == "f":
-        return "is depth, in floating point, in metres?"
-    return f"is depth_scale right? It is {frame.intrinsics.depth_scale:g} units per metre"
