@@ -135,10 +135,10 @@ class Model:
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
         """Return the least confidence [n] of an answer with each of the `names`; with `unknown_below`, it is that.
 
-        By default it is the confidence that about 95 % of the correct answers to frames reach. That of a class with an
-        output of the classifiers is the run's own, measured on held-out views, or 0 in runs without one. That of other
-        objects, and of all where the gallery alone answers, depends on the number of their views, see
-        `Gallery.unknown_below`.
+        By default it is the confidence that 95 % of the correct answers on held-out views or frames reach (97 % in runs
+        of earlier versions). That of a class with an output of the classifiers is the run's own, measured on held-out
+        views, or 0 in runs without one. That of other objects, and of all where the gallery alone answers, depends on
+        the number of their views, see `Gallery.unknown_below`.
 
         Args:
             answer_by: source of the answers, see `answers_by`.

@@ -130,14 +130,13 @@ def misregistered(view: RenderedView, registration: Registration, rng: np.random
     if rng.random() < registration.shifted:
         shift = np.rint(rng.uniform(-registration.shift, registration.shift, 2) * scale).astype(int)
     background = rng.integers(0, 256, 3).astype(np.uint8)
-    color = view.color
+    values = view.color.astype(np.float32)
     if blur > 0.1:
-        color = blurred(color.astype(np.float32), seen, blur).clip(0, 255).astype(np.uint8)
+        values = blurred(values, seen, blur)
     if chroma > 0.1:
-        values = color.astype(np.float32)
         luma = (values @ LUMA)[..., None]
-        differences = np.where(seen[..., None], values - luma, 0)
-        color = (luma + blurred(differences, seen, chroma)).clip(0, 255).astype(np.uint8)
+        values = luma + blurred((values - luma) * seen[..., None], seen, chroma)
+    color = values.clip(0, 255).astype(np.uint8)
     margin = int(abs(shift).max())
     (row, column), (height, width) = margin + shift, seen.shape
     padded = np.full((height + 2 * margin, width + 2 * margin, 3), background)

@@ -15,6 +15,10 @@ FRAME_PIXEL = 0.001
 A pixel of a training view is 1.4 mm wide."""
 
 
+TRUNCATE = 2.5
+"""Reach of the Gaussians in standard deviations: farther pixels have 1 % of the weight."""
+
+
 def pixel_width(view: RenderedView) -> float:
     """Return the width of a pixel on the object, metres, at the mean depth; at least one pixel must have depth."""
     return float(view.depth.sum() / np.count_nonzero(view.depth)) / 1000 / view.intrinsics.fx
@@ -28,10 +32,9 @@ def blurred(values: NDArray[np.float32], seen: NDArray[np.bool_], deviation: flo
         seen: pixels with depth.
         deviation: standard deviation of the Gaussian, pixels.
     """
-    weight = np.maximum(gaussian_filter(seen.astype(np.float32), deviation), 1e-3)
-    further = values.ndim - seen.ndim
-    result = gaussian_filter(values, (deviation, deviation, 0)[: values.ndim])
-    return np.asarray(result / weight.reshape(seen.shape + (1,) * further))
+    weight = gaussian_filter(seen.astype(np.float32), deviation, truncate=TRUNCATE)
+    result = gaussian_filter(values, (deviation, deviation, 0)[: values.ndim], truncate=TRUNCATE)
+    return np.asarray(result / np.maximum(weight, np.float32(1e-3)).reshape(seen.shape + (1,) * (values.ndim - 2)))
 
 
 def without(view: RenderedView, pixels: NDArray[np.intp]) -> RenderedView:

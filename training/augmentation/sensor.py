@@ -91,8 +91,11 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
 
 def _patches(shape: tuple[int, ...], share: float, width: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return pixels [h, w] in random patches of `width` pixels that cover about `share` of the image."""
-    noise = gaussian_filter(rng.standard_normal(shape, np.float32), width)
-    return noise < np.quantile(noise, share)
+    height, width_of_image = shape
+    # In steps of two pixels, which takes a third of the time.
+    noise = gaussian_filter(rng.standard_normal((-(-height // 2), -(-width_of_image // 2)), np.float32), width / 2)
+    inside = noise < np.quantile(noise, share)
+    return inside.repeat(2, axis=0)[:height].repeat(2, axis=1)[:, :width_of_image]
 
 
 def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:

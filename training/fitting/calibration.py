@@ -101,9 +101,8 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
     return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
 
 
-KEPT = 0.85
-"""Share of the correct held-out answers whose confidence reaches the threshold of a run. Held-out views have more
-faults than frames, of whose correct answers 95 % reach it (real and simulated cameras)."""
+KEPT = 0.95
+"""Share of the correct held-out answers whose confidence reaches the threshold of a run."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:
