@@ -26,7 +26,7 @@ from training.embedding.samples import Samples, build_samples, render_clouds, sa
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
-OBJECTS = range(1, 41, 5)  # all of their views have enough points
+OBJECTS = range(2, 26, 3)  # all of their views have enough points
 CLASSES = ("a", "b")
 EPOCHS = 12
 
