@@ -11,7 +11,7 @@ occluded there, the file has the accuracy by the number of views when
 fused      the answers for the views are fused (`thor2_jax.tracking.tracker`), the views in the order around the table
 merged     fused, and each view is also described as one cloud with those before it (`merge_views`)
 random     fused, the further views in random order
-next_view  fused, each further view chosen by `thor2_jax.tracking.viewpoints`
+next_view  fused, each further view chosen by `thor2_jax.tracking.viewpoints.next_view`
 
 and the number of views that each needs for an accuracy of .95. Objects are identified by their labels here.
 

@@ -1,4 +1,4 @@
-"""Networks: that of a classifier and that of an embedding, compiled, and as named arrays.
+"""The networks of classifiers and embeddings, their compilation, and their weights as named arrays.
 
 The weights of Flax modules are stored as named arrays in safetensors files.
 """

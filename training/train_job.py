@@ -17,7 +17,7 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
 from training.readers.frames import FrameFolder, find_frames
-from training.storage.jobs import Progress, check_same_job, numbered, of_stage, prefixed
+from training.storage.jobs import Progress, add_prefix, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.dataset import ViewDataset, remove_views
@@ -109,7 +109,7 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         if job.sequences is not None:
-            shown = numbered(prefixed(progress, str(directory.relative_to(job.out))), _stages(job))
+            shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), _stages(job))
         runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown)
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)

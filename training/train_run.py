@@ -50,7 +50,7 @@ from training.fitting.loop import (
     append_metrics,
     discard_later_epochs,
     find_run_directories,
-    of_fit,
+    fit_progress,
     read_metrics,
     wait_for_all,
 )
@@ -216,7 +216,7 @@ class _Fold(NamedTuple):
         if not (directory / RUN_FILE).is_file():
             classifiers, best_epochs, calibrated = self.fit_classifiers()
             if jax.process_index() == 0:
-                run = self.completed(classifiers, best_epochs, calibrated)
+                run = self.complete_run(classifiers, best_epochs, calibrated)
                 _publish(run, self.scratch / "run", directory)
             wait_for_all("published")
         return load_run(directory)
@@ -230,13 +230,13 @@ class _Fold(NamedTuple):
         best_epochs: dict[Feature, int] = {}
         for name in settings.classifiers:
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
-            shown = of_fit(self.report, f"fit {name}", settings.fit.epochs)
+            shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
             classifiers[name], best_epochs[name] = fitted
         calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
         return classifiers, best_epochs, calibrated
 
-    def completed(
+    def complete_run(
         self,
         classifiers: Mapping[Feature, MLP],
         best_epochs: Mapping[Feature, int],
@@ -275,18 +275,19 @@ class _Fold(NamedTuple):
         config = dataclasses.replace(settings.config, homology="closed_form")
         scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
         others = distractor_samples(distractors, scratch, network, config, shown)
-        unknown = held_out_clouds(distractors, n_classes)
         kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(n_classes)}
         shown = of_stage(self.report, DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, kept, network, config, COPIES, seed, shown)
+        unknown = held_out_clouds(distractors, n_classes)
         samples = with_fitted_distractors(samples, others, n_classes)
+        del others  # takes as much memory as the samples
         embedding = fit_embedding(
             samples,
             network,
             config,
             distractors.epochs,
             RUN_SIZES,
-            of_fit(self.report, FIT_NETWORKS, distractors.epochs),
+            fit_progress(self.report, FIT_NETWORKS, distractors.epochs),
             views.classes,
             checkpoints,
             networks=distractors.networks,

@@ -16,7 +16,7 @@ if port != "0":
     jax.distributed.initialize(f"localhost:{port}", 2, rank)
 import numpy as np
 import thor2_jax as thor2
-from thor2_jax.model.classifier import model_arrays
+from thor2_jax.networks import model_arrays
 from training.fitting.loop import FitOptions
 from training.train_run import train_run
 from training.protocol import Protocol

@@ -18,10 +18,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
 from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
+from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
 __all__ = ["WARMTH", "LookDescriptors", "aligned_looks", "describe_aligned_looks", "describe_looks"]
@@ -125,7 +126,12 @@ def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
 
     Returns:
         [B * K, N] aligned clouds in scaled units, those of a cloud consecutive.
+
+    Raises:
+        InputError: `count` is none of `LOOK_COUNTS`.
     """
+    if count not in LOOK_COUNTS:
+        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
     if count == 1:
         return align(clouds, config)
     return _looks(clouds, np.float32(config.sigma_s), np.float32(config.alpha), count)

@@ -93,6 +93,7 @@ class Bag:
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
         self.is_truncated = False
         self.notes: list[str] = []
+        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> "Bag":
         """Open the recording, choose its topics and read the camera.

@@ -1,4 +1,4 @@
-"""What the service and the live view have in common as local servers: addresses, names of the host, headers of pages.
+"""Listening sockets, allowed names of the host, and headers of pages, for the service and the live view.
 
 A web page can give its own name the address of a local server (DNS rebinding), and is then of the same origin. Its
 requests still have that name in the header Host.
@@ -32,10 +32,12 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
         InputError: the address cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = host == "::" and socket.has_dualstack_ipv6()
     try:
-        listener = socket.create_server((host, port), family=family, backlog=BACKLOG)
-    except OSError as error:
-        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
+        listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=both)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        message = f"port is {port} and host {host}, which cannot be used ({reason}); choose others"
         raise InputError(message) from None
     with listener:
         url_host = f"[{host}]" if ":" in host else host

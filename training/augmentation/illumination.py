@@ -5,7 +5,7 @@ the camera's response. Applied in this order to sRGB values in [0, 1]: c ** gamm
 saturation (distance from the grey of the same luma); a veil of stray light; noise.
 
 Some RGB-D cameras blur colour and shift it by up to ten pixels against depth. Points near the outline then have colours
-of the background. Colour differences are blurred more than luma, as in compressed video.
+of the background. Compressed video has the differences between colours and their luma in half of the resolution.
 """
 
 import dataclasses

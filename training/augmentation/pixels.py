@@ -16,7 +16,7 @@ A pixel of a training view is 1.4 mm wide."""
 
 
 TRUNCATE = 2.5
-"""Reach of the Gaussians in standard deviations: farther pixels have 1 % of the weight."""
+"""Reach of the Gaussians, in standard deviations: beyond it lies about 1 % of their weight."""
 
 
 def pixel_width(view: RenderedView) -> float:

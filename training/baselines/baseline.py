@@ -19,7 +19,7 @@ from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
-from training.fitting.loop import Checkpoints, FitOptions, Steps, of_fit, run_epochs
+from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
@@ -192,7 +192,7 @@ def fit_network(
         return _step(graph, fit.inputs, fit.optimizer, state, *batch, rate)
 
     checkpoints = Checkpoints(task.scratch / fit.directory)
-    shown = of_fit(task.progress, f"fit {task.name}", steps.epochs)
+    shown = fit_progress(task.progress, f"fit {task.name}", steps.epochs)
     state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=shown)
     return nnx.merge(graph, state.params, state.rest)
 

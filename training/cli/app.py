@@ -75,6 +75,9 @@ def _bars() -> Iterator[Progress]:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:
+                # A live display is cut at the height of the terminal, so that its first stages leave it.
+                for task in bars.tasks[: max(0, len(bars.tasks) + 3 - bars.console.height)]:
+                    bars.update(task.id, visible=False)
                 # A resumed stage starts at what is already done, so that the remaining time is estimated correctly.
                 tasks[stage] = bars.add_task(stage, total=total, completed=done, note=note)
             bars.update(tasks[stage], completed=done, total=total, note=note)

@@ -78,7 +78,7 @@ def enroll(
         with show_progress(quiet) as progress:
             counts, known, skipped = enroll_objects(
                 model,
-                frames or (meshes, views_of_meshes),
+                (meshes, views_of_meshes) if frames is None else frames,
                 name=name,
                 label_name=label_name,
                 instance=instance,

@@ -111,14 +111,14 @@ def given_options(record: Any, without: str = "") -> list[str]:
 
 
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
-    """Raise InputError if `owner` is not given, but an option that belongs to it has a value, which is not None."""
+    """Raise InputError if an option that needs `owner` is given without it; values of None are not given."""
     for name, value in values.items():
         if value is not None and not is_given:
             raise InputError(f"{name} is {value}; it belongs to {owner}")
 
 
 def check_alone(option: str, given: object, **values: object) -> None:
-    """Raise InputError if an option is given, and another one that it excludes has a value, too."""
+    """Raise InputError if `option` is given together with one that it excludes."""
     for name, value in values.items():
         if value and given:
             raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
@@ -148,7 +148,7 @@ class FrameOptions:
     depth_topic: Annotated[str | None, recording_option(help="Depth aligned to colour. Default: likewise.")] = None
     camera_topic: Annotated[str | None, recording_option(help="camera_info of this camera. Default: likewise.")] = None
     max_gap: Annotated[float, recording_option(help="Seconds between colour and depth, at most.")] = DEFAULT_MAX_GAP
-    every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take the first of so many frames.")] = 1
+    every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     @property
     def arguments(self) -> list[str]:

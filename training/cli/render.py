@@ -15,11 +15,11 @@ class AugmentationOptions:
     """The augmentations of the copies."""
 
     illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False
-    sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False
+    sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise, smoothing and gaps of depth.")] = False
     occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False
     segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False
     registration: Annotated[
-        bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
+        bool, typer.Option("--registration", help="Augment: blurred colour, shifted against depth.")
     ] = False
     base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest part.")] = False
 

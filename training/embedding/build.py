@@ -21,7 +21,7 @@ from thor2_jax.files import check_output_file
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import fit_embedding, reference_views
 from training.embedding.samples import ObjectSource, build_samples
-from training.fitting.loop import of_fit
+from training.fitting.loop import fit_progress
 from training.objects.meshes import find_meshes
 from training.storage.jobs import of_stage
 from training.storage.workers import local_workers
@@ -50,7 +50,7 @@ def build_embedding(
     def show(stage: str, done: int, total: int, note: str) -> None:
         print(f"{time.monotonic() - start:6.0f} s  {stage}: {done} of {total}, {note}", file=sys.stderr, flush=True)
 
-    rendered, fitted = of_stage(show, "render", "objects"), of_fit(show, "fit", epochs)
+    rendered, fitted = of_stage(show, "render", "objects"), fit_progress(show, "fit", epochs)
     samples = build_samples(sources, network, config, views, pool=local_workers(workers), progress=rendered)
     embedding = fit_embedding(samples, network, config, epochs, progress=fitted)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))

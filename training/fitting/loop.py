@@ -41,7 +41,7 @@ __all__ = [
     "append_metrics",
     "discard_later_epochs",
     "find_run_directories",
-    "of_fit",
+    "fit_progress",
     "read_metrics",
     "run_epochs",
     "wait_for_all",
@@ -97,7 +97,7 @@ class EpochMetrics:
     held_out_accuracy: float | None = None
 
 
-def of_fit(progress: Progress, stage: str, epochs: int) -> Callable[[int, int, EpochMetrics], object]:
+def fit_progress(progress: Progress, stage: str, epochs: int) -> Callable[[int, int, EpochMetrics], object]:
     """Return the callback of a stage that fits networks in so many epochs: its note has the metrics."""
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:

@@ -78,9 +78,11 @@ class LabelledFrame:
 class LabelledFrames(abc.ABC):
     """The frames of a dataset in a fixed order; a frame is read when it is indexed.
 
+    A reader sets both attributes and implements `read`.
+
     Attributes:
         identifiers: identifiers of all frames, known without reading them.
-        sources: what each frame is read from, for instance its colour image.
+        sources: source of each frame, for instance the path of its colour image.
     """
 
     identifiers: Sequence[str]

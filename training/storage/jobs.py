@@ -31,7 +31,7 @@ __all__ = [
     "locked",
     "numbered",
     "of_stage",
-    "prefixed",
+    "add_prefix",
     "processor",
 ]
 
@@ -78,7 +78,7 @@ def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, i
     return show
 
 
-def prefixed(progress: Progress, name: str) -> Progress:
+def add_prefix(progress: Progress, name: str) -> Progress:
     """Return a callback that puts a name before each stage."""
     return lambda stage, done, total, note: progress(f"{name}: {stage}", done, total, note)
 

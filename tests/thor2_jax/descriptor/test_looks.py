@@ -100,6 +100,14 @@ def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
     assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
 
 
+@pytest.mark.parametrize("count", [0, 3, 5])
+def test_other_counts_are_refused(count: int) -> None:
+    with pytest.raises(thor2.InputError, match=f"count is {count}"):
+        aligned_looks(PACKED, CONFIG, count)
+    with pytest.raises(thor2.InputError, match=f"count is {count}"):
+        describe_looks(PACKED, NETWORK, CONFIG, count)
+
+
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])
 def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = describe_looks(PACKED, NETWORK, CONFIG, 4)

@@ -19,6 +19,10 @@ from thor2_jax.service.settings import Settings
 Files = dict[str, bytes]
 
 
+def failing(frame: thor2.RGBDFrame) -> np.ndarray:
+    raise RuntimeError("no weights\nin this folder")
+
+
 def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
     raise SystemExit(3)
 
@@ -48,6 +52,7 @@ def test_a_frame_without_labels_is_segmented(
 @pytest.mark.parametrize(
     ("segmenter", "status", "words"),
     [
+        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
         (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
         (many, 422, "labels has 76799 instances"),
         (None, 422, "labels is missing"),

@@ -167,6 +167,8 @@ def test_bad_fields_are_refused_in_one_line(http: httpx.Client, files: Files, ga
 
 
 def test_bad_requests_are_refused(http: httpx.Client, files: Files) -> None:
+    without = {name: content for name, content in files.items() if name != "depth"}
+    check_refused(enroll(http, without, "tall"), 422, "depth")
     check_refused(http.post("/v1/objects", files=files), 422, "name")
     check_refused(http.post("/v1/objects", files=files | {"name": b"\xff\xfe", "instance": b"200"}), 422, "name")
     camera = json.dumps({"fx": 60.0, "fy": 60.0, "cx": 159.5, "cy": 119.5, "depth_scale": 1000 / 2.6}).encode()

@@ -87,6 +87,8 @@ def test_evaluate_frames(
     before = (tmp_path / "report" / "answers.jsonl").read_bytes()
     assert "nothing was recomputed" in printed(*command)
     assert (tmp_path / "report" / "answers.jsonl").read_bytes() == before
+    alone = ("evaluate", "frames", images.parent, "--model", model, "--out")
+    assert "already contains" in refused(*alone, tmp_path / "answer")
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
