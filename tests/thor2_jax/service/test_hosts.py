@@ -1,8 +1,8 @@
-"""Which values of the header Host a local server accepts."""
+"""Addresses and values of the header Host that a local server accepts."""
 
 from helpers import assert_refused
 
-from thor2_jax.service.hosts import check_host_names, is_allowed_host
+from thor2_jax.service.hosts import check_host_names, is_allowed_host, listening
 
 ALLOWED = """
     localhost LOCALHOST:8080 127.0.0.1:80 127.9.9.9 [::1] [::1]:8080 robot.local Robot.Local:1 10.0.0.7:80
@@ -24,3 +24,8 @@ def test_listed_hosts_are_names_or_addresses() -> None:
     check_host_names(["robot.local", "10.0.0.7", "fe80::7", "[fe80::7]"])
     for name in ("", "robot.local:80", "http://robot.local", "*", "a b", "[::1]:80"):
         assert_refused("allow_host", check_host_names, [name])
+
+
+def test_addresses_that_cannot_be_used_are_refused() -> None:
+    for host, port in (("127.0.0.1", 70_000), ("203.0.113.9", 0)):  # the second is of no machine
+        assert_refused(f"port is {port} and host {host}", listening(host, port).__enter__)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rich.progress
 from helpers import Command, assert_refused, run_thor2, untrained_run, write_frame
 from processes import HANG
 
@@ -222,6 +223,22 @@ def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: p
         show("render [red]", 3, 10, "of [/x]")
     err: Any = capsys.readouterr().err
     assert "━" in err and "render [red]" in err and "3/10" in err and "of [/x]" in err
+
+
+def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A live display is cut at the height of the terminal."""
+    bars: list[rich.progress.Progress] = []
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("LINES", "10")
+    whole = rich.progress.Progress.__init__
+    monkeypatch.setattr(
+        rich.progress.Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1]
+    )
+    with show_progress() as show:
+        for number in range(30):
+            show(f"stage {number}", 1, 2, "")
+        visible = [task.description for task in bars[0].tasks if task.visible]
+    assert visible[-1] == "stage 29" and 5 < len(visible) < 10
 
 
 # Compiled programs.
