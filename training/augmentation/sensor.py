@@ -1,21 +1,20 @@
 """Augmentation of the depth sensor: noise, smoothing, missing and flying pixels, depth rounded to 1 mm.
 
-The axial standard deviation is at most 1.2 mm + 1.9 mm (z / m - 0.4)^2, the lateral one 0.8 pixels (Nguyen, Izadi and
-Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012).
+The lateral standard deviation is at most 0.8 pixels (Nguyen, Izadi and Lovell 2012, as the axial one).
 """
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from training.augmentation.pixels import FRAME_PIXEL, Range, blurred, pixel_width, without
+from training.rendering.depth_camera import axial_deviation, depth_edges
 from training.rendering.view_sphere import RenderedView
 
-__all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
+__all__ = ["Sensor", "sensed"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +45,6 @@ class Sensor:
     smooth: Range = (0.0, 2.0)
     patches: Range = (0.0, 0.2)
     patch: Range = (2.0, 8.0)
-
-
-def axial_deviation(z: Any) -> Any:
-    """Return the axial standard deviation of depth at distances z, both in metres (Nguyen, Izadi and Lovell 2012)."""
-    return 0.0012 + 0.0019 * (z - 0.4) ** 2
 
 
 def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> RenderedView:
@@ -96,13 +90,3 @@ def _patches(shape: tuple[int, ...], share: float, size: float, rng: np.random.G
     noise = gaussian_filter(rng.standard_normal(((height + 1) // 2, (width + 1) // 2), np.float32), size / 2)
     inside = noise < np.quantile(noise, share)
     return inside.repeat(2, axis=0)[:height].repeat(2, axis=1)[:, :width]
-
-
-def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:
-    """Return the pixels whose depth differs from a neighbour's by more than `step`; missing depth counts as 0."""
-    edge = np.zeros(depth.shape, bool)
-    for here, beside in ((edge, depth), (edge.T, depth.T)):
-        far = np.abs(np.diff(beside, axis=0)) > step
-        here[1:] |= far
-        here[:-1] |= far
-    return edge

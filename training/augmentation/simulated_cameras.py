@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from training.augmentation.illumination import LUMA
-from training.augmentation.sensor import axial_deviation
+from training.rendering.depth_camera import axial_deviation
 
 __all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]
 

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from training.augmentation.sensor import axial_deviation, depth_edges
 from training.objects.mesh import TexturedMesh, moved
+from training.rendering.depth_camera import axial_deviation, depth_edges
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import Camera, camera_pose
 
