@@ -12,7 +12,6 @@ from thor2_jax.config import Relaxation as Relaxation
 from thor2_jax.errors import InputError as InputError
 
 if TYPE_CHECKING:
-    from thor2_jax.adaptation.color_transform import ColorTransform as ColorTransform
     from thor2_jax.descriptor.describe import describe as describe
     from thor2_jax.descriptor.describe import describe_aligned as describe_aligned
     from thor2_jax.descriptor.describe import describe_strips as describe_strips
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from thor2_jax.descriptor.view_normalization import view_normalize as view_normalize
     from thor2_jax.explanation.explain import Explanation as Explanation
     from thor2_jax.explanation.explain import explain as explain
+    from thor2_jax.frames.color_transform import ColorTransform as ColorTransform
     from thor2_jax.frames.frames import Intrinsics as Intrinsics
     from thor2_jax.frames.frames import RGBDFrame as RGBDFrame
     from thor2_jax.frames.frames import read_frame as read_frame
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from thor2_jax.types import Strips as Strips
 else:
     _MODULES = {
-        "adaptation.color_transform": ("ColorTransform",),
+        "frames.color_transform": ("ColorTransform",),
         "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "explanation.explain": ("Explanation", "explain"),

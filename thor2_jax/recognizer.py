@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, camera_instances, estimate_transform
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import with_context
+from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
+from thor2_jax.frames.color_transform import ColorTransform, transform_colors
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding

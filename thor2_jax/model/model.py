@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.errors import InputError
+from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery

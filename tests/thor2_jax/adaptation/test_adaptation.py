@@ -11,7 +11,6 @@ from helpers import class_probabilities, slow, untrained_embedding_run, untraine
 from scipy.stats import entropy as scipy_entropy
 
 import thor2_jax as thor2
-from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
 from thor2_jax.adaptation.estimate import (
     EVIDENCE,
     GRID,
@@ -26,6 +25,7 @@ from thor2_jax.adaptation.estimate import (
     posterior_mean,
 )
 from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.frames.color_transform import ColorTransform, transform_colors
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FusionRule, fused_probabilities
 from thor2_jax.recognizer import Recognizer

@@ -13,8 +13,8 @@ from helpers import SMALL_CONFIG, assert_same_answers, slow, small_embedding, un
 import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
-from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
+from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference

@@ -9,8 +9,8 @@ import pytest
 from helpers import Command, assert_refused, json_lines, run_thor2, untrained_run, write_frame
 
 from thor2_jax import recognizer as module
-from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
+from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.runs import load_runs
