@@ -10,6 +10,7 @@ from sklearn.gaussian_process.kernels import RBF
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery import search
 from thor2_jax.gallery.embedding import BACKGROUND, References
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
@@ -109,6 +110,7 @@ def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: 
     def threads() -> set[int]:
         return {pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"}
 
+    search._thread_pools.cache_clear()  # it has the libraries that were loaded when it was made
     before, inside, solve = threads(), [], np.linalg.solve
     monkeypatch.setattr(np.linalg, "solve", lambda a, b: inside.append(threads()) or solve(a, b))
     gallery.scores(views_around(0, 5, seed=1))
