@@ -33,11 +33,12 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     both = host == "::" and socket.has_dualstack_ipv6()
+    if not 0 <= port <= 65_535:
+        raise InputError(f"port is {port}; expected 0 to 65535, where 0 chooses a free one")
     try:
         listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=both)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        message = f"port is {port} and host {host}, which cannot be used ({reason}); choose others"
+    except OSError as error:
+        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
         raise InputError(message) from None
     with listener:
         url_host = f"[{host}]" if ":" in host else host
