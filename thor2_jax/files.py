@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from numpy.typing import NDArray
 
 from colornet.files import (
@@ -221,6 +219,8 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str] 
 
     Equal arrays and texts give equal bytes if there is at most one text: the order of several is random.
     """
+    import safetensors.numpy  # every command would import it at its start
+
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     return safetensors.numpy.save(contiguous, None if metadata is None else dict(metadata))
 
@@ -231,6 +231,8 @@ def unpack_arrays(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, st
     Raises:
         ValueError: the content is damaged.
     """
+    import safetensors.numpy
+
     try:
         return safetensors.numpy.load(content), safetensors_metadata(content)
     except safetensors.SafetensorError as error:

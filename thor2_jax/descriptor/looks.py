@@ -171,6 +171,9 @@ def describe_looks(
         network: colour network.
         config: static.
         count: number of looks K, one of `LOOK_COUNTS`; by default `config.looks`. Static.
+
+    Raises:
+        InputError: as `aligned_looks`.
     """
     count = config.looks if count is None else count
 
