@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import io
 import os
 import shutil
@@ -72,14 +73,18 @@ def check_replaceable(path: Path) -> None:
 
 @contextlib.contextmanager
 def temporary_directory(parent: str | Path) -> Iterator[Path]:
-    """Yield a new hidden directory in `parent`, which is removed at the end; a killed process leaves it.
+    """Yield a new hidden directory in `parent` and remove it at the end; what a killed process left is removed before.
 
-    Its name and a file in it say that it is one, see `remove_leftovers`.
+    Its name and a file in it, locked while it is in use, say that it is one, see `remove_leftovers`.
     """
+    remove_leftovers(Path(parent))
     directory = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
     try:
-        (directory / _MARKER).write_bytes(_MARKER_TEXT)
-        yield directory
+        with open(directory / _MARKER, "wb", buffering=0) as marker:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(marker, fcntl.LOCK_EX)
+            marker.write(_MARKER_TEXT)
+            yield directory
     finally:
         shutil.rmtree(directory, ignore_errors=True)
 
@@ -105,15 +110,17 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the temporary directories that a killed process has left in a directory, if it exists.
+    """Remove the temporary directories that killed processes have left in a directory, if it exists.
 
-    Other files stay, whatever their names.
+    Those of other processes, which still run, and all other files stay, whatever their names.
     """
     for path in directory.glob(f"{_PREFIX}*"):
-        marker = path / _MARKER
-        with contextlib.suppress(PermissionError):  # another user's
-            if not path.is_symlink() and marker.is_file() and marker.read_bytes() == _MARKER_TEXT:
-                shutil.rmtree(path)
+        with contextlib.suppress(OSError):  # another user's, or in use
+            if not path.is_symlink() and (path / _MARKER).is_file():
+                with open(path / _MARKER, "r+b") as marker:  # network file systems lock no file that is only read
+                    fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    if marker.read() == _MARKER_TEXT:
+                        shutil.rmtree(path)
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from thor2_jax.files import check_output_directory, remove_leftovers, write_text
+from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -104,8 +104,6 @@ def run_demo(
     objects = builtin_objects()
     trained = _train(objects, out / "run", seed, progress, workers)
     pictures.mkdir(exist_ok=True)
-    for directory in (out, pictures):
-        remove_leftovers(directory)
     scenes = _compose_scenes(objects, seed, progress)
     (run,) = load_runs([out / "run"])
     answers = _answer_scenes(run, scenes, progress)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
+from thor2_jax.files import check_output_directory, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, Feature
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
@@ -162,7 +162,6 @@ def train_run(
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
-            remove_leftovers(out)
         wait_for_all("begun")
         runs = [
             _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()

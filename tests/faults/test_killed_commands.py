@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 KILLED = """
 import fnmatch, os, signal, sys
 when, place = sys.argv.pop(1).split()
-out = sys.argv[sys.argv.index("--out") + 1]
+out = sys.argv[sys.argv.index("--out" if "--out" in sys.argv else "--model") + 1]
 
 def killing(function):
     def called(*arguments, **options):
@@ -43,7 +43,7 @@ main()
 
 
 def kill(place: str, *command: object) -> None:
-    """Run a command and kill it before or after it renames a file or directory to its place in --out."""
+    """Run a command and kill it before or after it renames a file or directory to its place in --out or --model."""
     arguments = [sys.executable, "-c", KILLED, place, *map(str, command)]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG)
     assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
@@ -172,3 +172,13 @@ def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
     assert run_thor2(*command, out) == 0
     assert files(out) == files(whole)
+
+
+def test_enroll(meshes: Path, tmp_path: Path) -> None:
+    command = "enroll", "brick", "--mesh", meshes / "brick.ply", "--model", tmp_path / "run"
+    for place in ("before ../.thor2-*/run/gallery/index.json", "before ."):
+        kill(place, *command)
+        (left,) = tmp_path.iterdir()  # what the process before has left is removed
+        assert left.name.startswith(".thor2-")
+    assert run_thor2(*command) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -3,10 +3,14 @@
 import errno
 import hashlib
 import shutil
+import signal
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from processes import HANG
 
 from thor2_jax import files
 from thor2_jax.errors import InputError
@@ -128,6 +132,19 @@ def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:
     remove_leftovers(tmp_path)
     remove_leftovers(tmp_path / "missing")
     assert all(path.read_text() == "a user's" for path in users) and (link / "half").exists() and not own.exists()
+
+
+def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys\nfrom colornet.files import atomic_write\n"
+        "with atomic_write(sys.argv[1]) as file:\n    file.touch()\n    os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.txt"], timeout=HANG)
+    (left,) = tmp_path.iterdir()
+    assert done.returncode == -signal.SIGKILL and left.name.startswith(".thor2-")
+    with temporary_directory(tmp_path) as running:
+        write_text(tmp_path / "b.txt", "")
+        assert {path.name for path in tmp_path.iterdir()} == {running.name, "b.txt"} and list(running.iterdir())
 
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from flax import nnx
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import file_digest, remove_leftovers, remove_written
+from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.baseline import FitTask, Predictor
 from training.baselines.files import (
@@ -106,7 +106,6 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
 
 def _train(task: FitTask) -> None:
     file, start = baseline_file(task.directory, task.name), time.perf_counter()
-    remove_leftovers(file.parent)
     fitted = _METHODS[task.name][0](task)
     write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
     remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, also those of earlier versions

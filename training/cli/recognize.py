@@ -62,7 +62,7 @@ def recognize(
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
     the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
     """
-    from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
+    from thor2_jax.files import check_output_directory, check_output_file
     from thor2_jax.model import result_files
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile
@@ -108,7 +108,6 @@ def recognize(
         check_output_directory(out, resumable=() if recording else resumable)
         for directory in [out / source.name for source in sources] if frames else [out]:
             result_files.check_no_foreign_results(directory)
-            remove_leftovers(directory)
     if coco is not None and bop is not None and coco.absolute() == bop.absolute():
         raise InputError(f"coco and bop are {coco}; expected two files")
     detection_bag = None if out_bag is None else DetectionBag(out_bag)

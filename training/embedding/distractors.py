@@ -24,7 +24,7 @@ import training
 from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, json_digest, remove_leftovers
+from thor2_jax.files import content_digest, json_digest
 from thor2_jax.types import Cloud
 from training.embedding.samples import AUGMENTATIONS, ObjectSource, Samples, build_samples, render_clouds
 from training.objects.meshes import load_mesh
@@ -210,7 +210,6 @@ def _store(samples: Samples, file: Path) -> bool:
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with locked(file.parent):
-            remove_leftovers(file.parent)
             if file.exists() and not _is_own(file):
                 return False
             save_arrays(file, samples.arrays(), {"format": FORMAT})

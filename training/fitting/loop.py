@@ -26,7 +26,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import errors_name, remove_leftovers, write_text
+from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.run_record import RUN_FILE
 from training.storage.arrays import load_arrays, load_metadata, save_arrays
 from training.storage.jobs import Progress
@@ -161,7 +161,6 @@ class Checkpoints:
         """
         self.directory, self.log = Path(directory).absolute(), log
         self.directory.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(self.directory)
         self._scores: dict[int, float] = {}
         for path in self.directory.glob("[0-9]*.safetensors"):
             with self._readable(path):

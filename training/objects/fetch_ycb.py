@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import httpx
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import remove_leftovers, temporary_directory
+from thor2_jax.files import temporary_directory
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress, locked
 
@@ -66,7 +66,6 @@ def fetch_ycb(
     directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
     with locked(directory):
-        remove_leftovers(directory)
         for name in objects:
             meshes[name] = directory / name / MESH_FILE
             if meshes[name].is_file():

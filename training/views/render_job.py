@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import atomic_write, check_output_directory, remove_leftovers
+from thor2_jax.files import atomic_write, check_output_directory
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
@@ -159,7 +159,6 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
     if stored:
         check_same_job(directory, stored.job, job)
-    remove_leftovers(directory)
     shards = stored.shards if stored else ()
     is_intact = [intact_content(directory, shard.file, shard.sha256) is not None for shard in shards]
     manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)))
@@ -253,7 +252,6 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
     stored_size, digest, files = read_crop_manifest(directory)
     requested = {"crops": size, "dataset": dataset.digest}
     check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
-    remove_leftovers(directory)
     return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
 
 
