@@ -285,10 +285,10 @@ class _Fold(NamedTuple):
             network,
             config,
             distractors.epochs,
+            checkpoints,
             RUN_SIZES,
             fit_progress(self.report, FIT_NETWORKS, distractors.epochs),
             views.classes,
-            checkpoints,
             networks=distractors.networks,
             seed=seed,
         )

@@ -17,7 +17,7 @@ from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module
-from training.embedding import distractors, fit
+from training.embedding import distractors, fit, samples
 from training.embedding.distractors import Distractors
 from training.embedding.samples import render_clouds
 from training.fitting.calibration import fit_calibration
@@ -105,12 +105,12 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
 def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a cache, the samples of the distractors are those of the run's own directory."""
+    """Without a cache, the samples of the distractors are those in the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
     out = tmp_path / "run"
-    render = mock.Mock(wraps=distractors.build_samples)
-    monkeypatch.setattr(distractors, "build_samples", render)
-    for stage, step in (("describe for the embedding", 1), ("fit networks", 2)):
+    render = mock.Mock(wraps=samples.render_clouds)
+    monkeypatch.setattr(samples, "render_clouds", render)
+    for stage, step in (("render distractors", 10), ("describe for the embedding", 1), ("fit networks", 2)):
         with pytest.raises(Interrupted):
             train(out, progress=stop_when(stage, step))
         assert_refused(r"run\.json", load_run, out)

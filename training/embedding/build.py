@@ -3,7 +3,8 @@
 The packaged network was fitted with the default options and the weaker augmentations of an earlier version: with the
 present ones, a gallery separates unknown objects less well. The principal components and reference views beside it were
 computed later (benchmarks/notes/accuracy.md). On two cores that other jobs shared, it took 1,280 s: 90 s for
-the views and 1,190 s for the fit. `--meshes` adds the objects of a directory.
+the views and 1,190 s for the fit. `--meshes` adds the objects of a directory. An interrupted fit resumes from the
+directory FILE.checkpoints when the command is repeated.
 """
 
 import dataclasses
@@ -17,13 +18,14 @@ import typer
 import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_file
+from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
+from training.embedding.distractors import COPIES, SEED
 from training.embedding.fit import fit_embedding, reference_views
-from training.embedding.samples import ObjectSource, build_samples
-from training.fitting.loop import fit_progress
+from training.embedding.samples import ObjectSource, build_samples, samples_record
+from training.fitting.loop import Checkpoints, fit_progress
 from training.objects.meshes import find_meshes
-from training.storage.jobs import of_stage
+from training.storage.jobs import begin_job, locked, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding"]
@@ -45,17 +47,22 @@ def build_embedding(
     of_meshes = find_meshes(meshes).values() if meshes else ()
     sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in of_meshes for _ in range(MESH_WEIGHT))]
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
+    arguments = sources, network, config, views, COPIES, SEED
+    job, directory = samples_record(*arguments) | {"epochs": epochs}, out.with_name(f"{out.name}.checkpoints")
     start = time.monotonic()
 
     def show(stage: str, done: int, total: int, note: str) -> None:
         print(f"{time.monotonic() - start:6.0f} s  {stage}: {done} of {total}, {note}", file=sys.stderr, flush=True)
 
     rendered, fitted = of_stage(show, "render", "objects"), fit_progress(show, "fit", epochs)
-    samples = build_samples(sources, network, config, views, pool=local_workers(workers), progress=rendered)
-    embedding = fit_embedding(samples, network, config, epochs, progress=fitted)
-    embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    embedding.save(out)
+    with locked(directory):
+        begin_job(directory, job)
+        samples = build_samples(*arguments, local_workers(workers), rendered, directory / "samples")
+        checkpoints = Checkpoints(directory / "networks")
+        embedding = fit_embedding(samples, network, config, epochs, checkpoints, progress=fitted)
+        embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
+        embedding.save(out)
+        remove_written(directory, r"job\.json", r"\.lock", r"(samples|networks)/[0-9]+\.safetensors")
     print(f"{out}: {embedding.fingerprint}")
 
 

@@ -16,20 +16,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-import thor2_jax
-import training
 from colornet import ColorNetwork
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, json_digest
+from thor2_jax.files import json_digest
 from thor2_jax.types import Cloud
-from training.embedding.samples import AUGMENTATIONS, ObjectSource, Samples, build_samples, render_clouds
-from training.objects.meshes import load_mesh
+from training.embedding.samples import ObjectSource, Samples, build_samples, render_clouds, samples_record
 from training.storage.arrays import load_arrays, load_metadata, save_arrays
-from training.storage.jobs import cache_directory, locked, processor
+from training.storage.jobs import cache_directory, locked
 from training.storage.workers import local_workers
 
 __all__ = [
@@ -112,32 +108,23 @@ def distractor_samples(
 
     Args:
         distractors: the distractors; labels are indices into `sources`.
-        directory: directory of the training, for the samples if the user's cache cannot be used.
+        directory: directory of the training, for the samples so far: an interrupted training resumes.
         network: colour network.
         config: descriptor. Static.
         progress: called with (distractors done, number of distractors).
 
     Raises:
         InputError: a mesh is unreadable or visible in none of its views.
+        OSError: the directory cannot be written.
     """
     sources = distractors.sources
+    arguments = sources, network, config, distractors.views, COPIES, SEED
+    name = f"distractors-{json_digest(samples_record(*arguments))}"
 
     def build() -> Samples:
-        pool = local_workers(distractors.workers)
-        return build_samples(sources, network, config, distractors.views, COPIES, SEED, pool, progress)
+        return build_samples(*arguments, local_workers(distractors.workers), progress, directory / name)
 
-    job = {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
-        "views": distractors.views,
-        "copies": COPIES,
-        "seed": SEED,
-        "augmentations": AUGMENTATIONS.record(),
-    }
-    cache = cache_directory("distractors")
-    samples = stored_samples(job, [directory] if cache is None else [cache, directory], build)
+    samples = stored_samples(f"{name}.safetensors", build)
     progress(len(sources), len(sources))
     return samples
 
@@ -167,73 +154,54 @@ MAX_FILES = 3
 FORMAT = "thor2 samples of distractors"
 NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
 
-CODE = ("augmentation", "embedding", "objects", "rendering", "views")
-LIBRARY_CODE = (".", "descriptor", "frames")
-"""Packages of training and of the library whose code determines the samples."""
-
 log = logging.getLogger(__name__)
 
 
-def stored_samples(job: Mapping[str, Any], directories: Sequence[Path], build: Callable[[], Samples]) -> Samples:
-    """Return the samples of a job from a directory, or build them and store them in the first that can be written.
+def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
+    """Return the samples of a file in the user's cache, if there is one, or build them and store them in it.
 
-    A directory that cannot be used is logged as a warning.
+    A cache that cannot be used is logged as a warning.
 
     Args:
-        job: record of everything that determines the samples beside the software and the kind of processor.
-        directories: the user's cache, if there is one, and a directory of the training.
+        name: name of the file, which has the digest of the samples' record.
         build: returns the samples.
 
     Raises:
         InputError: as `build`.
         OSError: as `build`.
     """
-    name = f"distractors-{json_digest({**job, **_software()})}.safetensors"
-    for file in (directory / name for directory in directories):
-        try:
-            if file.is_file():
-                samples = Samples(**load_arrays(file))
-                with contextlib.suppress(OSError):  # a read-only cache is used as it is
-                    os.utime(file)
-                return samples
-        except (OSError, ValueError, TypeError) as error:
-            log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
+    cache = cache_directory("distractors")
+    if cache is None:
+        return build()
+    file = cache / name
+    try:
+        if file.is_file():
+            samples = Samples(**load_arrays(file))
+            with contextlib.suppress(OSError):  # a read-only cache is used as it is
+                os.utime(file)
+            return samples
+    except (OSError, ValueError, TypeError) as error:
+        log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
     samples = build()
-    for directory in directories:
-        if _store(samples, directory / name):
-            break
+    _store(samples, file)
     return samples
 
 
-def _store(samples: Samples, file: Path) -> bool:
-    """Store samples unless the file is a user's, or another process is writing; return whether they are stored."""
+def _store(samples: Samples, file: Path) -> None:
+    """Store samples unless the file is a user's, or another process is writing."""
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with locked(file.parent):
             if file.exists() and not _is_own(file):
-                return False
+                return
             save_arrays(file, samples.arrays(), {"format": FORMAT})
             own = [path for path in file.parent.iterdir() if _is_own(path)]
             for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
                 path.unlink(missing_ok=True)
-            return True
     except InputError:
-        return False  # another process is writing, usually the same file
+        return  # another process is writing, usually the same file
     except OSError as error:
         log.warning("the distractors cannot be kept for the next training: %s", error)
-        return False
-
-
-def _software() -> dict[str, str]:
-    """Return the record of the software: users of a checkout change code within a version."""
-    root = Path(training.__file__).parent
-    folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
-    files = (file for folder in folders for file in sorted(folder.glob("*.py")))
-    return {
-        "version": thor2_jax.__version__,
-        "code": content_digest(file.read_bytes() for file in files),
-        "platform": f"{jax.default_backend()} {processor()}",
-    }
 
 
 def _is_own(path: Path) -> bool:

@@ -129,10 +129,10 @@ def fit_embedding(
     network: ColorNetwork,
     config: DescriptorConfig,
     epochs: int,
+    checkpoints: Checkpoints,
     sizes: EmbeddingSizes | None = None,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     classes: tuple[str, ...] = (),
-    checkpoints: Checkpoints | None = None,
     *,
     networks: int = 1,
     seed: int = 0,
@@ -146,11 +146,11 @@ def fit_embedding(
         network: colour network of the samples.
         config: descriptor of the samples.
         epochs: passes over the samples.
+        checkpoints: of this fit only, written after each epoch.
         sizes: of the network.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
             objects as distractors, are kept. None by default: the proxies are discarded.
-        checkpoints: of this fit only, written after each epoch; None writes none.
         networks: number of networks, fitted together on the same batches from different weights. Only the first one
             embeds; all classify. Use 1 without classes.
         seed: seed for weights, proxies, sample order and dropout.

@@ -8,24 +8,28 @@ Views of objects are rendered from random cameras, with stronger augmentation th
 on cameras and objects that it never saw; a classifier is fitted on its own objects.
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+import thor2_jax
+import training
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
 from thor2_jax.errors import InputError
+from thor2_jax.files import content_digest
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.orientation import reorient
@@ -33,6 +37,8 @@ from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import Camera, camera_pose, random_angles
+from training.storage.arrays import load_arrays, save_arrays
+from training.storage.jobs import processor
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import ViewSource, padded_batches
@@ -46,6 +52,7 @@ __all__ = [
     "render_clouds",
     "sample_clouds",
     "sample_views",
+    "samples_record",
 ]
 
 CLOUDS_PER_BATCH = 64
@@ -204,6 +211,36 @@ def render_clouds(objects: Mapping[int, ObjectSource], views: int, seed: int) ->
     return clouds
 
 
+CODE = ("augmentation", "embedding", "objects", "rendering", "views")
+LIBRARY_CODE = (".", "descriptor", "frames")
+"""Packages of training and of the library whose code determines the samples."""
+
+
+def samples_record(
+    sources: Sequence[ObjectSource], network: ColorNetwork, config: DescriptorConfig, views: int, copies: int, seed: int
+) -> dict[str, Any]:
+    """Return everything that determines the samples of `build_samples`, whose arguments these are, as JSON holds it.
+
+    It has the code, too: users of a checkout change code within a version.
+    """
+    root = Path(training.__file__).parent
+    folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
+    files = (file for folder in folders for file in sorted(folder.glob("*.py")))
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
+        "views": views,
+        "copies": copies,
+        "seed": seed,
+        "augmentations": AUGMENTATIONS.record(),
+        "version": thor2_jax.__version__,
+        "code": content_digest(file.read_bytes() for file in files),
+        "platform": f"{jax.default_backend()} {processor()}",
+    }
+
+
 def build_samples(
     sources: Sequence[ObjectSource],
     network: ColorNetwork,
@@ -213,6 +250,7 @@ def build_samples(
     seed: int = 0,
     pool: WorkerPool = IN_PROCESS,
     progress: Callable[[int, int], object] = lambda done, total: None,
+    directory: Path | None = None,
 ) -> Samples:
     """Render views of objects and sample them.
 
@@ -226,25 +264,49 @@ def build_samples(
         seed: seed for cameras, augmentations and orientations.
         pool: worker processes that render; does not affect the result.
         progress: called with (objects done, number of objects) at the start and after each task of a worker.
+        directory: directory of these samples only, where those of each task are stored, so that an interrupted call
+            resumes; None stores none.
 
     Raises:
         InputError: a mesh is unreadable or is visible in none of its views.
+        OSError: the directory cannot be written.
     """
     numbered = list(enumerate(sources))
     label_of = {source: index for index, source in reversed(numbered)}
     tasks = [dict(numbered[first : first + OBJECTS_PER_TASK]) for first in range(0, len(sources), OBJECTS_PER_TASK)]
-    chunks: list[Samples] = []
-    progress(0, len(sources))
-    with closing(pool(functools.partial(render_clouds, views=views, seed=seed), tasks)) as results:
-        for task, rendered in zip(tasks, results, strict=True):
+    chunks = {} if directory is None else _stored_chunks(directory, len(tasks))
+    missing = [number for number in range(len(tasks)) if number not in chunks]
+    done = sum(len(tasks[number]) for number in chunks)
+    progress(done, len(sources))
+    render = functools.partial(render_clouds, views=views, seed=seed)
+    with contextlib.closing(pool(render, [tasks[number] for number in missing])) as results:
+        for number, rendered in zip(missing, results, strict=True):
+            task = tasks[number]
             invisible = task.keys() - {index for index, _ in rendered}
             if invisible:
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
             rng = np.random.default_rng([seed, len(sources), min(task)])
             labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
-            chunks.append(sample_clouds(clouds, labels, network, config, copies, rng))
-            progress(max(task) + 1, len(sources))
-    return Samples.concatenated(chunks)
+            chunks[number] = sample_clouds(clouds, labels, network, config, copies, rng)
+            if directory is not None:
+                save_arrays(_chunk_file(directory, number), chunks[number].arrays(), {})
+            done += len(task)
+            progress(done, len(sources))
+    return Samples.concatenated([chunks[number] for number in range(len(tasks))])
+
+
+def _chunk_file(directory: Path, number: int) -> Path:
+    return directory / f"{number:04d}.safetensors"
+
+
+def _stored_chunks(directory: Path, count: int) -> dict[int, Samples]:
+    """Return task -> its samples, of those that a directory has intact files of; create it if it is missing."""
+    directory.mkdir(parents=True, exist_ok=True)
+    chunks = {}
+    for number in range(count):
+        with contextlib.suppress(ValueError):  # missing or damaged
+            chunks[number] = Samples(**load_arrays(_chunk_file(directory, number)))
+    return chunks
 
 
 def sample_views(

@@ -282,7 +282,7 @@ def run_epochs(
     steps: Steps,
     batches: Callable[[int], Iterable[Item]],
     step: Callable[[State, int, Item], tuple[State, Any]],
-    checkpoints: Checkpoints | None = None,
+    checkpoints: Checkpoints,
     *,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     held_out_accuracy: Callable[[State], float | None] = lambda state: None,
@@ -299,8 +299,8 @@ def run_epochs(
         batches: function of an epoch, from 1, that yields its batches.
         step: function of the state, the number of the step, from 0, and a batch that returns the next state, and loss
             and accuracy of the batch.
-        checkpoints: of this fit only, written after each epoch; None writes none. The score of one is the held-out
-            accuracy or, without one, the negative loss.
+        checkpoints: of this fit only, written after each epoch. The score of one is the held-out accuracy or, without
+            one, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         held_out_accuracy: function of the state after an epoch; None without a held-out set.
         place: function that moves a state to the devices.
@@ -309,11 +309,8 @@ def run_epochs(
         InputError: the loss is not finite (the last checkpoint stays), or a checkpoint is unreadable.
         OSError: a checkpoint cannot be written; the previous one stays.
     """
-    done = 0 if checkpoints is None else checkpoints.last_epoch
-    if checkpoints is not None and done:
-        state = checkpoints.last(state)
-    state = place(state)
-    for epoch in range(done + 1, steps.epochs + 1):
+    state = place(checkpoints.last(state) if checkpoints.last_epoch else state)
+    for epoch in range(checkpoints.last_epoch + 1, steps.epochs + 1):
         total, pending, start = np.zeros(2), [], 0.0
         for number, batch in enumerate(batches(epoch), 1):
             state, computed = step(state, (epoch - 1) * steps.of_epoch + number - 1, batch)
@@ -335,9 +332,8 @@ def run_epochs(
             metrics = EpochMetrics(epoch, loss, accuracy, rate)
             progress((epoch - 1) * steps.of_epoch + number, steps.epochs * steps.of_epoch, metrics)
         metrics = dataclasses.replace(metrics, held_out_accuracy=held_out_accuracy(state))
-        if checkpoints is not None:
-            if jax.process_index() == 0:
-                checkpoints.log(metrics)
-            score = -metrics.loss if metrics.held_out_accuracy is None else metrics.held_out_accuracy
-            checkpoints.save(epoch, state, score)
+        if jax.process_index() == 0:
+            checkpoints.log(metrics)
+        score = -metrics.loss if metrics.held_out_accuracy is None else metrics.held_out_accuracy
+        checkpoints.save(epoch, state, score)
     return state

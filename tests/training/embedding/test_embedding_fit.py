@@ -1,15 +1,17 @@
 """Fitting of embeddings: samples, orientations, resumption, determinism, and what a short fit achieves."""
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import SMALL_CONFIG, assert_refused
+from helpers import SMALL_CONFIG, Interrupted, assert_refused
 
 import colornet
 import thor2_jax as thor2
@@ -18,11 +20,12 @@ from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.networks import EmbeddingSizes, model_arrays
 from training.augmentation import orientation
-from training.embedding import fit
+from training.embedding import build, fit
 from training.embedding import samples as module
 from training.embedding.build import build_embedding
 from training.embedding.fit import fit_embedding
 from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
+from training.fitting.loop import Checkpoints
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
@@ -101,12 +104,41 @@ def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.M
     np.testing.assert_array_equal((batch.color != 0).any(axis=-1).sum(axis=(1, 2)), chosen.strips)
 
 
+def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
+    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2)
+    rendered: list[int] = []
+    done: list[Any] = []
+
+    def stopped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
+        for task in tasks:
+            if rendered == [0, 3]:
+                raise Interrupted
+            rendered.append(min(task))
+            yield function(task)
+
+    def render() -> Samples:
+        show = lambda *numbers: done.append(numbers)  # noqa: E731
+        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, 2, 0, stopped, show, tmp_path / "samples")
+
+    with pytest.raises(Interrupted):
+        render()
+    (tmp_path / "samples" / "0000.safetensors").write_bytes(b"damaged")
+    rendered.clear()
+    done.clear()
+    np.testing.assert_equal(vars(render()), vars(whole))
+    assert rendered == [0, 6] and done == [(3, 8), (6, 8), (8, 8)]
+    np.testing.assert_equal(vars(render()), vars(whole))
+    assert rendered == [0, 6]
+
+
 @pytest.fixture(scope="module")
-def fitted(views: Samples) -> tuple[Embedding, list[Any]]:
+def fitted(views: Samples, tmp_path_factory: pytest.TempPathFactory) -> tuple[Embedding, list[Any]]:
     """A fit of one network, and its progress."""
     losses: list[Any] = []
     show = lambda *numbers: losses.append(numbers)  # noqa: E731
-    return fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, SIZES, show, CLASSES), losses
+    checkpoints = Checkpoints(tmp_path_factory.mktemp("fit"))
+    return fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, checkpoints, SIZES, show, CLASSES), losses
 
 
 def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
@@ -125,11 +157,13 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
 
-def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
+def test_further_networks_leave_the_first_as_it_is(
+    views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path
+) -> None:
     done = []
     show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
     programs = fit._step._cache_size()
-    two = fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, SIZES, show, CLASSES, networks=2)
+    two = fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, Checkpoints(tmp_path), SIZES, show, CLASSES, networks=2)
     assert fit._step._cache_size() == programs + 1  # all steps share one
     assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
     (second,) = two.further
@@ -139,9 +173,11 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
 
 
-def test_too_few_samples_and_invisible_objects_are_refused(views: Samples, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_few_samples_and_invisible_objects_are_refused(
+    views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
-    assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1)
+    assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1, Checkpoints(tmp_path))
     monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
     assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1)
 
@@ -153,8 +189,20 @@ def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_an_embedding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "new" / "embedding.safetensors"
-    build_embedding(out, objects=24, views=6, epochs=1, workers=1)
+def test_the_command_writes_an_embedding_and_resumes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, other = tmp_path / "new" / "embedding.safetensors", tmp_path / "other.safetensors"
+    command = functools.partial(build_embedding, objects=24, views=6, epochs=1, workers=1)
+    command(out)
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
     assert {path.name for path in out.parent.iterdir()} == {out.name, REFERENCES_FILE}
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(build, "reference_views", mock.Mock(side_effect=Interrupted))
+        command(other)
+    assert_refused("epochs 1, not 2", command, other, epochs=2)
+    for repeated in ((module, "render_clouds"), (fit, "_step")):
+        monkeypatch.setattr(*repeated, mock.Mock(side_effect=AssertionError))
+    command(other)
+    assert other.read_bytes() == out.read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"new", other.name, REFERENCES_FILE}

@@ -1,11 +1,9 @@
 """Samples of distractors in the user's cache: kept, renewed, bounded, and unusable caches."""
 
-import contextlib
 import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -14,10 +12,12 @@ from helpers import SMALL_CONFIG, small_disk, write_box
 
 import colornet
 import thor2_jax as thor2
+import training
+from thor2_jax.files import json_digest
 from training.embedding import distractors as module
 from training.embedding.distractors import Distractors, distractor_samples, stored_samples
-from training.embedding.samples import Samples
-from training.storage.jobs import cache_directory, locked
+from training.embedding.samples import Samples, samples_record
+from training.storage.jobs import locked
 
 SAMPLES = Samples(
     strips=np.array([2, 1]),
@@ -39,13 +39,12 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def counted(tmp_path: Path) -> Callable[..., int]:
-    """Return a function that asks for samples, checks them and returns how often they were built."""
+    """Return a function that asks for the samples of a seed, checks them and returns how often they were built."""
 
-    def get(job: dict[str, Any] | None = None, with_run: bool = False) -> int:
+    def get(seed: int = 0) -> int:
         build = mock.Mock(return_value=SAMPLES)
-        directory = cache_directory("distractors")
-        directories = [each for each in (directory, tmp_path / "run" if with_run else None) if each is not None]
-        samples = stored_samples(job or {"seed": 0}, directories, build)
+        record = samples_record([0], colornet.load_default(), SMALL_CONFIG, 1, 1, seed)
+        samples = stored_samples(f"distractors-{json_digest(record)}.safetensors", build)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
         return build.call_count
@@ -63,14 +62,14 @@ def test_samples_are_built_once(
     """Each job and each version of the code has its own samples."""
     with locked(cache):
         assert counted() == 1  # does not wait for another process
-    assert [counted(), counted(), counted({"seed": 1}), counted(), counted({"seed": 1})] == [1, 0, 1, 0, 0]
+    assert [counted(), counted(), counted(1), counted(), counted(1)] == [1, 0, 1, 0, 0]
     assert len(files(cache)) == 2
     with monkeypatch.context() as patch:
         patch.setattr(thor2, "__version__", "99")
         assert [counted(), counted()] == [1, 0]
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
-    monkeypatch.setattr(module.training, "__file__", str(code.parent / "__init__.py"))
+    monkeypatch.setattr(training, "__file__", str(code.parent / "__init__.py"))
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
     assert [counted(), counted()] == [1, 0] and files(tmp_path / "elsewhere") and len(files(cache)) == 3
     monkeypatch.delenv("THOR2_CACHE")
@@ -86,14 +85,14 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     for path, content in users.items():
         path.write_bytes(content)
     for seed in range(3):
-        assert counted({"seed": seed}) == 1
+        assert counted(seed) == 1
     for path in files(cache):
         os.utime(path, (1, 1))
-    assert counted({"seed": 0}) == 0  # the file used last
-    assert counted({"seed": 3}) == 1
+    assert counted(0) == 0  # the file used last
+    assert counted(3) == 1
     own = [path for path in files(cache) if path not in users]
     assert len(own) == 3 and all(path.read_bytes() == users[path] for path in users)
-    assert counted({"seed": 0}) == 0
+    assert counted(0) == 0
 
 
 @pytest.mark.parametrize(
@@ -120,19 +119,6 @@ def test_a_damaged_file_costs_one_warning(
         assert counted() == 0
 
 
-@pytest.mark.parametrize("fault", ["off", "locked", "read-only"])
-def test_folds_share_samples_without_a_cache(
-    fault: str, cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """They are in the directory of the training, which a resumed training reads, too."""
-    if fault in ("off", "read-only"):
-        monkeypatch.setenv("THOR2_CACHE", {"off": "off", "read-only": "/proc/no-such-directory"}[fault])
-    with locked(cache) if fault == "locked" else contextlib.nullcontext():
-        assert [counted(with_run=True), counted(with_run=True)] == [1, 0]
-    assert counted(with_run=True) == 0
-    assert len(files(tmp_path / "run")) == 1 and files(cache) == []
-
-
 def test_a_full_or_unwritable_disk_costs_one_warning(
     cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,17 +131,19 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
 
 def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
-    network, jobs = colornet.load_default(), list[dict[str, Any]]()
-    monkeypatch.setattr(module, "stored_samples", lambda job, directories, build: jobs.append(job))
+    network = colornet.load_default()
+    stored = mock.Mock()
+    monkeypatch.setattr(module, "stored_samples", stored)
 
-    def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> dict[str, Any]:
+    def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> str:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}
         distractors = Distractors(**{"procedural": 10, **options}, meshes=meshes)
         distractor_samples(distractors, tmp_path / "new", network, config, lambda *values: None)
-        return jobs[-1]
+        return str(stored.call_args.args[0])
 
     same, box = key(), key(box=0.1)
     assert key(epochs=3, networks=2, workers=2) == same and key(box=0.1) == box
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
-    assert same["color_network"] == network.fingerprint and "augmentations" in same
+    record = samples_record([0], network, SMALL_CONFIG, 1, 1, 0)
+    assert record["color_network"] == network.fingerprint and "augmentations" in record
