@@ -57,7 +57,7 @@ def build_embedding(
     rendered, fitted = of_stage(show, "render", "objects"), fit_progress(show, "fit", epochs)
     with locked(directory):
         begin_job(directory, job)
-        samples = build_samples(*arguments, local_workers(workers), rendered, directory / "samples")
+        samples = build_samples(*arguments, local_workers(workers), rendered, directory=directory / "samples")
         checkpoints = Checkpoints(directory / "networks")
         embedding = fit_embedding(samples, network, config, epochs, checkpoints, progress=fitted)
         embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))

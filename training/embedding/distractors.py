@@ -122,7 +122,7 @@ def distractor_samples(
     name = f"distractors-{json_digest(samples_record(*arguments))}"
 
     def build() -> Samples:
-        return build_samples(*arguments, local_workers(distractors.workers), progress, directory / name)
+        return build_samples(*arguments, local_workers(distractors.workers), progress, directory=directory / name)
 
     samples = stored_samples(f"{name}.safetensors", build)
     progress(len(sources), len(sources))

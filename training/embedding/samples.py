@@ -1,6 +1,6 @@
 """Samples that an embedding is fitted on: the strips of clouds in random orientations.
 
-    samples = build_samples(range(400), network, config, views=16, pool=local_workers(2))
+    samples = build_samples(range(400), network, config, views=16, pool=local_workers(2), directory=Path("chunks"))
 
 A sample stores only its occupied strips, about a tenth of all, and the statistics of its cloud.
 
@@ -250,7 +250,8 @@ def build_samples(
     seed: int = 0,
     pool: WorkerPool = IN_PROCESS,
     progress: Callable[[int, int], object] = lambda done, total: None,
-    directory: Path | None = None,
+    *,
+    directory: Path,
 ) -> Samples:
     """Render views of objects and sample them.
 
@@ -264,8 +265,8 @@ def build_samples(
         seed: seed for cameras, augmentations and orientations.
         pool: worker processes that render; does not affect the result.
         progress: called with (objects done, number of objects) at the start and after each task of a worker.
-        directory: directory of these samples only, where those of each task are stored, so that an interrupted call
-            resumes; None stores none.
+        directory: directory of these samples only, created if it is missing, where those of each task are stored, so
+            that an interrupted call resumes.
 
     Raises:
         InputError: a mesh is unreadable or is visible in none of its views.
@@ -273,40 +274,31 @@ def build_samples(
     """
     numbered = list(enumerate(sources))
     label_of = {source: index for index, source in reversed(numbered)}
-    tasks = [dict(numbered[first : first + OBJECTS_PER_TASK]) for first in range(0, len(sources), OBJECTS_PER_TASK)]
-    chunks = {} if directory is None else _stored_chunks(directory, len(tasks))
-    missing = [number for number in range(len(tasks)) if number not in chunks]
-    done = sum(len(tasks[number]) for number in chunks)
+    tasks = {
+        directory / f"{first:06d}.safetensors": dict(numbered[first : first + OBJECTS_PER_TASK])
+        for first in range(0, len(sources), OBJECTS_PER_TASK)
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    chunks: dict[Path, Samples] = {}
+    for file in tasks:
+        with contextlib.suppress(ValueError):  # missing or damaged
+            chunks[file] = Samples(**load_arrays(file))
+    missing = {file: task for file, task in tasks.items() if file not in chunks}
+    done = sum(len(tasks[file]) for file in chunks)
     progress(done, len(sources))
     render = functools.partial(render_clouds, views=views, seed=seed)
-    with contextlib.closing(pool(render, [tasks[number] for number in missing])) as results:
-        for number, rendered in zip(missing, results, strict=True):
-            task = tasks[number]
+    with contextlib.closing(pool(render, missing.values())) as results:
+        for (file, task), rendered in zip(missing.items(), results, strict=True):
             invisible = task.keys() - {index for index, _ in rendered}
             if invisible:
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
             rng = np.random.default_rng([seed, len(sources), min(task)])
             labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
-            chunks[number] = sample_clouds(clouds, labels, network, config, copies, rng)
-            if directory is not None:
-                save_arrays(_chunk_file(directory, number), chunks[number].arrays(), {})
+            chunks[file] = sample_clouds(clouds, labels, network, config, copies, rng)
+            save_arrays(file, chunks[file].arrays(), {})
             done += len(task)
             progress(done, len(sources))
-    return Samples.concatenated([chunks[number] for number in range(len(tasks))])
-
-
-def _chunk_file(directory: Path, number: int) -> Path:
-    return directory / f"{number:04d}.safetensors"
-
-
-def _stored_chunks(directory: Path, count: int) -> dict[int, Samples]:
-    """Return task -> its samples, of those that a directory has intact files of; create it if it is missing."""
-    directory.mkdir(parents=True, exist_ok=True)
-    chunks = {}
-    for number in range(count):
-        with contextlib.suppress(ValueError):  # missing or damaged
-            chunks[number] = Samples(**load_arrays(_chunk_file(directory, number)))
-    return chunks
+    return Samples.concatenated([chunks[file] for file in tasks])
 
 
 def sample_views(

@@ -46,8 +46,8 @@ def small_batches() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def views() -> Samples:
-    return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, views=6)
+def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
+    return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, views=6, directory=tmp_path_factory.mktemp("samples"))
 
 
 def test_views_depend_on_seed_and_object_only() -> None:
@@ -59,9 +59,9 @@ def test_views_depend_on_seed_and_object_only() -> None:
     assert not np.array_equal(other[0][1][0], again[0][1][0])
 
 
-def test_each_object_has_one_label(views: Samples) -> None:
+def test_each_object_has_one_label(views: Samples, tmp_path: Path) -> None:
     assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
-    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, copies=1)
+    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, copies=1, directory=tmp_path)
     assert sorted(repeated.label) == [0, 0, 0, 0, 1, 1]
     first = repeated.statistics[repeated.label == 0]
     assert len(np.unique(first, axis=0)) == 4
@@ -90,12 +90,14 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 
 
-def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A batch is made of the selected samples; a selection has the samples in its order."""
     monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
     done = []
-    pooled = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=lambda function, tasks: (function(t) for t in tasks))
-    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=lambda *numbers: done.append(numbers))
+    pool = lambda function, tasks: (function(t) for t in tasks)  # noqa: E731
+    show = lambda *numbers: done.append(numbers)  # noqa: E731
+    pooled = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=pool, directory=tmp_path / "pooled")
+    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show, directory=tmp_path / "whole")
     assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
     np.testing.assert_equal(vars(pooled), vars(whole))
     rows = np.array([5, 0, 5])
@@ -106,7 +108,7 @@ def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.M
 
 def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
-    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2)
+    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, directory=tmp_path / "whole")
     rendered: list[int] = []
     done: list[Any] = []
 
@@ -119,11 +121,11 @@ def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.M
 
     def render() -> Samples:
         show = lambda *numbers: done.append(numbers)  # noqa: E731
-        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, 2, 0, stopped, show, tmp_path / "samples")
+        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, 2, 0, stopped, show, directory=tmp_path / "samples")
 
     with pytest.raises(Interrupted):
         render()
-    (tmp_path / "samples" / "0000.safetensors").write_bytes(b"damaged")
+    (tmp_path / "samples" / "000000.safetensors").write_bytes(b"damaged")
     rendered.clear()
     done.clear()
     np.testing.assert_equal(vars(render()), vars(whole))
@@ -179,7 +181,7 @@ def test_too_few_samples_and_invisible_objects_are_refused(
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
     assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1, Checkpoints(tmp_path))
     monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
-    assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1)
+    assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
 
 
 def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
