@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, square_root
-from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.types import Descriptors
 
 __all__ = [
@@ -245,8 +244,8 @@ def projected_features(descriptors: Descriptors, statistics: jax.Array, version:
 
 def compiled(
     function: Callable[..., jax.Array], models: Sequence[tuple[Any, Any]], *static: Any
-) -> Callable[[LookDescriptors], jax.Array]:
-    """Return the compiled `function(modules, descriptors, *static)` as a function of the descriptors of looks.
+) -> Callable[[Any], jax.Array]:
+    """Return the compiled `function(modules, inputs, *static)` as a function of the inputs, a pytree of arrays.
 
     Models of the same sizes share the programs. JAX would take a state apart and hash each graph, in Python, at every
     call, which takes 4 % of the time of a frame: the weights are a flat list, and the graphs no argument.
@@ -264,10 +263,10 @@ def compiled(
 @lru_cache(maxsize=32)
 def _compiled(
     function: Callable[..., jax.Array], graphs: tuple[Any, ...], structure: Any, static: tuple[Any, ...]
-) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
+) -> Callable[[list[jax.Array], Any], jax.Array]:
     @jax.jit
-    def call(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
-        return function([*map(nnx.merge, graphs, jax.tree.unflatten(structure, leaves))], oriented, *static)
+    def call(leaves: list[jax.Array], inputs: Any) -> jax.Array:
+        return function([*map(nnx.merge, graphs, jax.tree.unflatten(structure, leaves))], inputs, *static)
 
     return call
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import compiled
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
@@ -30,7 +31,7 @@ __all__ = [
     "Predictor",
     "as_given",
     "baseline_inputs",
-    "compiled",
+    "compiled_network",
     "fit_network",
     "in_batches",
 ]
@@ -197,23 +198,22 @@ def fit_network(
     return nnx.merge(graph, state.params, state.rest)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2, 3))
-def _apply(graph: Any, state: Any, inputs: Any, output: Any, *arrays: Any) -> jax.Array:
-    return output(nnx.merge(graph, state)(*inputs(*arrays)))
+def _apply(models: Sequence[Any], arrays: tuple[Any, ...], inputs: Any, output: Any) -> jax.Array:
+    (model,) = models
+    return output(model(*inputs(*arrays)))
 
 
-def compiled(
+def compiled_network(
     model: nnx.Module, inputs: Callable[..., tuple[Any, ...]], output: Callable[[Any], Any] = jax.nn.softmax
-) -> Callable[..., jax.Array]:
-    """Return a compiled function of arrays: `output` of a network that is applied to `inputs` of them."""
-    graph, state = nnx.split(model)
-    return functools.partial(_apply, graph, state, inputs, output)
+) -> Callable[[tuple[Any, ...]], jax.Array]:
+    """Return a compiled function of a tuple of arrays: `output` of a network that is applied to `inputs` of them."""
+    return compiled(_apply, [nnx.split(model)], inputs, output)
 
 
-def in_batches(function: Callable[..., Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:
+def in_batches(function: Callable[[tuple[Any, ...]], Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:
     """Return the results [V, ...] of a function of `size` rows of arrays [V, ...]; V is at least 1."""
     count, results = len(arrays[0]), []
     for first in range(0, count, size):
         rows = np.resize(np.arange(first, min(first + size, count)), size)
-        results.append(np.asarray(function(*(array[rows] for array in arrays)))[: count - first])
+        results.append(np.asarray(function(tuple(array[rows] for array in arrays)))[: count - first])
     return np.concatenate(results)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import model_arrays, model_from_arrays
-from training.baselines.baseline import FitTask, NetworkFit, Predictor, compiled, fit_network, in_batches
+from training.baselines.baseline import FitTask, NetworkFit, Predictor, compiled_network, fit_network, in_batches
 from training.baselines.files import StoredBaseline
 from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
 from training.views.crops import ViewCrops
@@ -30,7 +30,7 @@ def crop_function(
 ) -> Callable[[ViewCrops], NDArray[np.float32]]:
     """Return a function of V crops, at least 1: `output` [V, ...] of a network that is applied to `inputs` of them."""
     model.eval()
-    function = compiled(model, inputs, output)
+    function = compiled_network(model, inputs, output)
     return lambda crops: in_batches(function, INFERENCE_BATCH, crops.color, crops.normals)
 
 

@@ -18,7 +18,7 @@ from training.baselines.baseline import (
     NetworkFit,
     Predictor,
     as_given,
-    compiled,
+    compiled_network,
     fit_network,
     in_batches,
 )
@@ -75,7 +75,7 @@ def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predic
         ValueError: an array is missing or has another shape.
     """
     model = model_from_arrays(lambda: PointNet(len(run.classes), rngs=nnx.Rngs(0)), arrays)
-    predict = compiled(model, point_features)
+    predict = compiled_network(model, point_features)
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
         points, colors = np.asarray(inputs.normal.points), np.asarray(inputs.normal.colors)
@@ -87,7 +87,7 @@ def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predic
                 sample = random_indices(count, POINTS, np.random.default_rng(SAMPLING_SEED))
                 xyz[row], rgb[row] = points[row, sample], colors[row, sample] * 255
                 box[row] = points[row, :count].max(axis=0)
-        return np.asarray(predict(xyz, rgb, box))
+        return np.asarray(predict((xyz, rgb, box)))
 
     return probabilities
 
@@ -138,6 +138,6 @@ def fit_pointnet(task: FitTask) -> StoredBaseline:
     network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
     model = fit_network(task, fit, network, label, fitted_rows, len(fitted_rows))
     stored = xyz[held_out, :POINTS].astype(np.float32), rgb[held_out, :POINTS], box[held_out]
-    predict = compiled(model, point_features)
+    predict = compiled_network(model, point_features)
     temperature = task.temperature(label, held_out, lambda: in_batches(predict, INFERENCE_BATCH, *stored))
     return StoredBaseline(model_arrays(model), temperature)

@@ -28,7 +28,7 @@ from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
-from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled_network
 from training.baselines.files import StoredBaseline
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
@@ -123,7 +123,7 @@ def predictor(library: Library, config: DescriptorConfig) -> Predictor:
 
     The class probabilities of a cloud are those of the most confident classifier that is selected for it.
     """
-    predict = {key: compiled(model, as_given) for key, model in library.items()}
+    predict = {key: compiled_network(model, as_given) for key, model in library.items()}
     size = config.image_size**2
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
@@ -132,7 +132,7 @@ def predictor(library: Library, config: DescriptorConfig) -> Predictor:
         types = [view_types(*areas) for areas in _face_areas(normal).tolist()]
         selected = [[(name, k) for name in names] for names, k in zip(types, slices, strict=True)]
         values = {
-            key: np.asarray(predict[key](jnp.asarray(inputs.tops[:, : key[1] * size])))
+            key: np.asarray(predict[key]((jnp.asarray(inputs.tops[:, : key[1] * size]),)))
             for key in sorted({key for keys in selected for key in keys})
         }
         rows = [
