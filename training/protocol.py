@@ -126,10 +126,30 @@ class Protocol:
             "learning_rates": list(self.fit.learning_rates),
         }
 
+    def with_distractors(self, procedural: int | None, meshes: Mapping[str, Path], workers: int) -> "Protocol":
+        """Return the protocol with an embedding fitted on these distractors; without any, with classifiers alone.
+
+        Args:
+            procedural: number of procedural objects; None keeps the protocol's own number, 0 without an embedding.
+            meshes: name -> file of other objects.
+            workers: rendering processes.
+
+        Raises:
+            InputError: as `Distractors`.
+        """
+        own = self.distractors or Distractors()
+        if procedural is None:
+            procedural = 0 if self.distractors is None else own.procedural
+        if not procedural and not meshes:
+            return dataclasses.replace(self, classifiers=self.classifiers or FEATURES, distractors=None)
+        others = dataclasses.replace(own, procedural=procedural, meshes=meshes, workers=workers)
+        return dataclasses.replace(self, distractors=others)
+
     def replace(self, **values: Any) -> "Protocol":
         """Return the protocol with the given values of its fields or of those of `fit`; None keeps the protocol's own.
 
-        Without copies in other orientations, views are also used in a mirror.
+        The epochs are also those of the embedding. Without copies in other orientations, views are also used in a
+        mirror.
 
         Raises:
             InputError: A value of the fit is invalid.
@@ -137,6 +157,8 @@ class Protocol:
         given = {name: value for name, value in values.items() if value is not None}
         if given.get("orientation_copies") == 0 and self.orientation_copies:
             given["mirrors"] = MIRRORS
+        if self.distractors is not None and "epochs" in given:
+            given["distractors"] = dataclasses.replace(self.distractors, epochs=given["epochs"])
         of_fit = {field.name for field in dataclasses.fields(FitOptions)} & given.keys()
         fit = dataclasses.replace(self.fit, **{name: given.pop(name) for name in of_fit})
         return dataclasses.replace(self, fit=fit, **given)

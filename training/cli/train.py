@@ -1,6 +1,5 @@
 """`thor2 train`: train a recognizer."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -167,9 +166,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.model.classifier import FEATURES, check_features
     from thor2_jax.model.run_record import RUN_FILE
-    from training.embedding.distractors import Distractors
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
@@ -177,22 +174,15 @@ def train(
 
     keep_freed_memory()
     protocol = PAPER if paper else QUICK if quick else DEFAULT
+    others = {} if distractors is None else find_meshes(distractors)
+    protocol = protocol.with_distractors(embedding, others, workers)
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
     protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
-    default = protocol.distractors or Distractors()
-    if embedding is None:
-        embedding = 0 if protocol.distractors is None else default.procedural
-    others = None
-    if embedding or distractors is not None:
-        further = {} if distractors is None else find_meshes(distractors)
-        passes = default.epochs if epochs is None else epochs
-        others = dataclasses.replace(default, procedural=embedding, meshes=further, epochs=passes, workers=workers)
-    features = protocol.classifiers if others is not None else FEATURES
     if classifiers is not None:
-        features = check_features(options.split_names(classifiers), "classifiers")
+        protocol = protocol.replace(classifiers=options.split_names(classifiers))
     job = TrainJob(
         out=out,
-        protocol=dataclasses.replace(protocol, classifiers=features, distractors=others),
+        protocol=protocol,
         meshes=meshes,
         dataset=dataset,
         frames=frames or (),
