@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.printable import first_names
+
 __all__ = ["TOYS", "ClassUnion", "score_odds"]
 
 TOYS = frozenset(
@@ -65,7 +67,7 @@ class ClassUnion:
         """The names in words, such as "21 objects: mug, bowl, ..."."""
         toys = [name for name in self.names if name in TOYS] if set(self.trained) == TOYS else []
         own = [name for name in self.names if name not in toys]
-        listed = ", ".join(own[:MAX_LISTED]) + (", ..." if len(own) > MAX_LISTED else "")
+        listed = first_names(own, MAX_LISTED)
         if toys:
             others = f", and {listed}" if own else "; it knows nothing of yours"
             return f"{len(toys)} toy objects of the demo{others}"

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from thor2_jax.printable import escape_characters
+from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
 from training.cli.app import app, console, finish, show_help, show_progress
 
@@ -159,8 +159,7 @@ def _print_report(report: Mapping[str, Any]) -> None:
     )
     if report["no_pixels"]:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
-        more = ", ..." if len(missing) > MAX_LISTED else ""
-        console.print(f"labels without pixels in the label image: {', '.join(missing[:MAX_LISTED])}{more}")
+        console.print(f"labels without pixels in the label image: {first_names(missing, MAX_LISTED)}")
     console.print(
         f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
         f"median {speed['median_seconds']:.2f} s a frame"

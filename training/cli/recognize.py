@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import escape_characters
+from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
 from training.cli.app import app, console, finish
 
@@ -183,8 +183,7 @@ def recognize(
     if tables.n_without_number:
         print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)
     if failed:
-        listed = ", ".join(failed[:MAX_LISTED]) + (", ..." if len(failed) > MAX_LISTED else "")
-        total = len(failed) + len(empty)
+        total, listed = len(failed) + len(empty), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
     if empty and all(empty):
         raise InputError(empty[0])

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.fusion import DEFAULT_RULE
+from thor2_jax.printable import first_names
 from training.evaluation import scores
 from training.evaluation.answers import (
     RULES,
@@ -185,8 +186,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
 
 
 def _listed(names: Iterable[str]) -> str:
-    first = sorted(names)[:MAX_LISTED]
-    return ", ".join(first) + (", ..." if len(first) == MAX_LISTED else "") if first else "no names"
+    return first_names(sorted(names), MAX_LISTED) or "no names"
 
 
 def _accuracy(

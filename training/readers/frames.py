@@ -15,6 +15,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RecordedFrame, RGBDFrame, read_frame
+from thor2_jax.printable import first_names
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
@@ -194,12 +195,14 @@ class FrameFolder(LabelledFrames):
         self.named = bool(labelled)
         if named and not self.named:
             raise InputError(
-                f"frames: {_first_names(sources)} has no labels.json; expected the names of the objects in the frames"
+                f"frames: {first_names([each.name for each in sources], MAX_LISTED)} has no labels.json; expected the "
+                "names of the objects in the frames"
             )
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
-        left_out = others if labelled else []
-        self.note = f"{len(left_out)} frames without labels.json: {_first_names(left_out)}" if left_out else ""
+        left_out = [source.name for source in others] if labelled else []
+        listed = first_names(left_out, MAX_LISTED)
+        self.note = f"{len(left_out)} frames without labels.json: {listed}" if left_out else ""
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, its names if they are known, and no attributes."""
@@ -221,10 +224,6 @@ class FrameFolder(LabelledFrames):
         """Return the files of a frame; none are known of a recording."""
         files = self.sources[number].files
         return [*filter(None, vars(files).values()), files.names] if files else []
-
-
-def _first_names(sources: Sequence[FrameSource]) -> str:
-    return ", ".join(source.name for source in sources[:MAX_LISTED]) + (", ..." if len(sources) > MAX_LISTED else "")
 
 
 def _listed(labels: Iterable[int]) -> str:
