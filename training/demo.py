@@ -17,7 +17,7 @@ import numpy as np
 from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.classifier import FEATURES
-from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.model.run_directory import load_run
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
 from training.embedding.samples import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers
@@ -33,12 +33,10 @@ from training.rendering.view_sphere import camera_pose
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
-from training.storage.jobs import Progress, check_same_job, of_stage
-from training.storage.workers import local_workers
-from training.train_run import VIEWS, is_finished, train_run
-from training.views.dataset import remove_views
+from training.storage.jobs import Progress
+from training.train_job import TrainJob, run_train_job
+from training.train_run import is_finished
 from training.views.mesh_views import view_cloud
-from training.views.render_job import render_dataset
 
 __all__ = ["DemoSummary", "run_demo"]
 
@@ -102,7 +100,8 @@ def run_demo(
     # Without a run, pictures are not those of a demo.
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
-    trained = _train(objects, out / "run", seed, progress, workers)
+    run_train_job(TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers), progress)
+    trained = load_run(out / "run")
     pictures.mkdir(exist_ok=True)
     scenes = _compose_scenes(objects, seed, progress)
     (run,) = load_runs([out / "run"])
@@ -130,18 +129,6 @@ def run_demo(
     write_text(out / "demo.json", json.dumps(content, indent=1) + "\n")
     _write_report(out, summary, len(objects), trained.record["dataset"]["views"])
     return summary
-
-
-def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: Progress, workers: int) -> TrainedRun:
-    if is_finished(out):
-        run = load_run(out)
-        check_same_job(out, {"seed": run.record["seed"]}, {"seed": seed})
-    else:
-        protocol, shown = PROTOCOL.replace(seed=seed), of_stage(progress, "render views")
-        dataset = render_dataset(protocol.render_job(objects), out / VIEWS, local_workers(workers), shown)
-        (run,) = train_run(dataset, out, protocol, progress)
-    remove_views(out / VIEWS)
-    return run
 
 
 def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Progress) -> list[Scene]:

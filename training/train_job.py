@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -38,7 +38,7 @@ class TrainJob:
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
         protocol: the settings of the runs and of their views.
-        meshes: directory of meshes; their views are rendered for this run and removed afterwards.
+        meshes: directory of meshes, or name -> mesh; their views are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
@@ -52,7 +52,7 @@ class TrainJob:
 
     out: Path
     protocol: Protocol
-    meshes: Path | None = None
+    meshes: Path | Mapping[str, TexturedMesh] | None = None
     dataset: Path | None = None
     frames: Sequence[Path] = ()
     names: Path | None = None
@@ -163,6 +163,8 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
     assert job.meshes is not None
+    if not isinstance(job.meshes, Path):
+        return dict(job.meshes)
     return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
 
 

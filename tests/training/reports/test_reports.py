@@ -87,7 +87,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     for last in ("fit tops", "recognize scenes"):
 
         def interrupt(stage: str, *_: object) -> None:
-            if stage == last:  # noqa: B023
+            if stage.endswith(last):  # noqa: B023
                 raise Interrupted
 
         with pytest.raises(Interrupted):
