@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -113,13 +112,14 @@ def _evaluate(
     names: Path | None = None,
     given: Sequence[str] = (),
 ) -> None:
+    from thor2_jax.files import file_digest
     from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_evaluated
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
     load = models, tuple(frames.identifiers) if per_sequence else None
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
-        description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
+        description["names"] = file_digest(names)
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
         loaded = load_evaluated(*load)

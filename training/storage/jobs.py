@@ -3,7 +3,6 @@
 The cache directory may be deleted at any time. The environment variable THOR2_CACHE names another one, or is `off`.
 """
 
-import hashlib
 import itertools
 import json
 import os
@@ -18,7 +17,7 @@ import filelock
 import platformdirs
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import content_digest, write_text
 
 __all__ = [
     "JOB_FILE",
@@ -62,7 +61,7 @@ def processor() -> str:
         features = next(line for line in lines if line.lower().startswith(("flags", "features")))
     except (OSError, StopIteration):
         features = platform.processor()
-    return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
+    return f"{platform.machine()}-{content_digest([features])[:12]}"
 
 
 Progress = Callable[[str, int, int, str], object]

@@ -28,7 +28,6 @@ Image networks are trained on crops of the same views, which `render_crops` adds
 
 import contextlib
 import dataclasses
-import hashlib
 import io
 import json
 from collections.abc import Mapping
@@ -40,7 +39,7 @@ import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import read_file, remove_written, write_text
+from thor2_jax.files import content_digest, read_file, remove_written, write_text
 from training.views.crops import ViewCrops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
@@ -88,7 +87,7 @@ def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
     """Return the bytes of a file; None if it is missing or has another checksum."""
     path = directory / name
     content = path.read_bytes() if path.is_file() else b""
-    return content if hashlib.sha256(content).hexdigest() == sha256 else None
+    return content if content_digest([content]) == sha256 else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +151,7 @@ class Manifest:
             "job": self.job,
             "shards": [dataclasses.asdict(shard) for shard in self.shards],
         }
-        checksum = hashlib.sha256(_dump(table).encode()).hexdigest()
+        checksum = content_digest([_dump(table)])
         write_text(directory / MANIFEST, _dump({**table, "sha256": checksum}))
 
     @classmethod
@@ -166,7 +165,7 @@ class Manifest:
             table = json.loads(content)
             if table["format"] == MANIFEST_FORMAT:
                 checksum = table.pop("sha256")
-                if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
+                if checksum != content_digest([_dump(table)]):
                     raise ValueError("its checksum differs")
                 return cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -268,7 +267,7 @@ class ViewDataset:
                 f"dataset: {directory / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
                 "repeat the `thor2 render` command to finish it"
             )
-        return cls(directory, manifest, hashlib.sha256(content).hexdigest())
+        return cls(directory, manifest, content_digest([content]))
 
     def __len__(self) -> int:
         return self.manifest.views

@@ -6,7 +6,6 @@ source = WithLabelledViews(instances, config, ViewDataset.open("views"))
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -150,7 +149,7 @@ class WithLabelledViews:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
         rendered = self._rendered.digest if self._rendered else None
         copies = [self._copies(name) for name in self._views]
-        return hashlib.sha256(repr((rendered, self._instances.digest, copies)).encode()).hexdigest()
+        return content_digest([repr((rendered, self._instances.digest, copies))])
 
     @property
     def record(self) -> Mapping[str, Any]:

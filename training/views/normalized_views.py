@@ -10,7 +10,6 @@ a dataset, on the sequence's objects only, which is the papers' OCID protocol.
 
 import dataclasses
 import functools
-import hashlib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -239,7 +238,7 @@ class WithoutClasses:
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of the source's digest and the omitted names."""
-        return hashlib.sha256(repr((self._source.digest, self._names)).encode()).hexdigest()
+        return content_digest([repr((self._source.digest, self._names))])
 
     @property
     def record(self) -> Mapping[str, Any]:

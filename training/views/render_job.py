@@ -15,7 +15,6 @@ do not change: crops may be added to views that runs were trained on.
 import contextlib
 import dataclasses
 import functools
-import hashlib
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import atomic_write, check_output_directory
+from thor2_jax.files import atomic_write, check_output_directory, content_digest
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
@@ -171,7 +170,7 @@ def _write(path: Path, content: bytes) -> str:
     """Write a file and return its SHA-256."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
-    return hashlib.sha256(content).hexdigest()
+    return content_digest([content])
 
 
 def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
