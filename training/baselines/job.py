@@ -63,7 +63,7 @@ def train_baselines(
 ) -> None:
     """Train the baselines that a run lacks.
 
-    An interrupted training of THOR or of an image network resumes, the others start again.
+    An interrupted fit of a network resumes; the forest and the templates start again.
 
     Args:
         path: run directory, or a directory with the folds of a training: then for each fold.
