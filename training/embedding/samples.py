@@ -223,6 +223,7 @@ def samples_record(
 
     It has the code, too: users of a checkout change code within a version.
     """
+    digests = {each: load_mesh(each).digest if isinstance(each, Path) else each for each in dict.fromkeys(sources)}
     root = Path(training.__file__).parent
     folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
     files = (file for folder in folders for file in sorted(folder.glob("*.py")))
@@ -230,7 +231,7 @@ def samples_record(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
-        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
+        "objects": [digests[each] for each in sources],
         "views": views,
         "copies": copies,
         "seed": seed,
