@@ -94,6 +94,7 @@ def resized(**fields: int) -> Any:
         (color_image, image(COLOR, "bayer_rggb8")),
         (depth_image, image(COLOR, "rgb8")),
         (color_image, compressed(encode_image(COLOR, "PNG")[:40], "png")),
+        (color_image, compressed(encode_image(COLOR, "PNG")[:-16] + bytes(4) + encode_image(COLOR, "PNG")[-12:], "png")),
         (color_image, compressed(encode_image(DEPTH, "PNG"), "png")),
         (depth_image, compressed(encode_image(COLOR, "PNG"), "16UC1; png compressed")),
         (depth_image, compressed(b"123", "16UC1; compressedDepth png")),
