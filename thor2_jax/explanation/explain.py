@@ -25,8 +25,8 @@ from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
-from thor2_jax.gallery.enrollment import embed_looks, instance_view
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view
+from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.image_files import ImageSizeError, decode_image, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
@@ -53,10 +52,8 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
         "intrinsics": lambda: _decode_intrinsics(intrinsics),
     }
     fields = parse_fields(parsers)
-    try:
+    with field_errors():
         frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
-    except InputError as error:
-        raise RequestError(422, str(error).split(maxsplit=1)[0], f"{error}.") from None
     if labels is not None:
         check_instances(frame)
     return frame
