@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_points, pixel_rays
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
 from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, voxel_downsample
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
     steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
     if not steep:
         trusted &= ~flying
-    valid, depth = pixels[trusted], depth[trusted]
-    points = pixel_points(valid, depth, frame.depth.shape[1], frame.intrinsics)
+    valid = pixels[trusted]
+    points = frame.points(valid).astype(np.float32)
     channels = frame.color.reshape(-1, 3).take(valid, axis=0)
     if with_rim:  # as a further colour channel
         channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
