@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import needs_extra
-from thor2_jax.signals import ended_by_signals
+from thor2_jax.service.signals import ended_by_signals
 from training.cli import options
 from training.cli.app import app
 
