@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colornet.lab import LUMA
 from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.frames.color_transform import LUMA
 from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import CompactClouds, GalleryObject
