@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import time_calls
+from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import NEAREST, CompactClouds, GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.search import ExactSearch, IndexSearch

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from numpy.typing import NDArray
 
 from colornet.files import atomic_write
-from colornet.lab import MEAN_WHITE, to_lab
+from colornet.lab import LUMA, MEAN_WHITE, to_lab
 from colornet.network import ColorNetwork
 
 __all__ = ["draw_network", "draw_similarity", "plot_network"]
@@ -130,7 +130,7 @@ def _width(weight: float) -> float:
 
 def _contrasting(rgb: NDArray[np.float64]) -> str:
     """Return black or white, whichever has more contrast to a colour."""
-    return "black" if rgb @ [0.299, 0.587, 0.114] > 128 else "white"
+    return "black" if rgb @ LUMA > 128 else "white"
 
 
 def _save(figure: Figure, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Conversion to CIELAB, by colour-science, and the HyAB colour difference.
+"""Conversion to CIELAB, by colour-science, the HyAB colour difference, and luma.
 
 Reproducing the reference values (golden files) exactly requires two D65 white points: that of colour-science for the
 colours of the grid, and one with a fifth digit for the mean colours of regions. The difference matters for greys: the
@@ -9,13 +9,16 @@ that hue from one interval of the cover to the next.
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GRID_WHITE", "MEAN_WHITE", "hyab", "to_lab"]
+__all__ = ["GRID_WHITE", "LUMA", "MEAN_WHITE", "hyab", "to_lab"]
 
 GRID_WHITE = (0.3127, 0.3290)
 """Chromaticity of D65 (2 degree observer) for the colours of the grid."""
 
 MEAN_WHITE = (0.31271, 0.32902)
 """Chromaticity of D65 (2 degree observer) for mean colours."""
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
 
 
 def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["InputError", "decoding", "needs_extra", "with_context"]
+__all__ = ["InputError", "decoding", "needs_extra", "reason_of", "with_context"]
 
 MAX_MESSAGE = 1000
 """Characters of a message that are kept: a damaged file may have a name or a number of millions."""
@@ -20,6 +20,11 @@ class InputError(ValueError):
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
+
+
+def reason_of(error: BaseException) -> str:
+    """Return why an exception was raised, in one line: its message, which may be from another package, or its type."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 @contextlib.contextmanager
@@ -43,8 +48,7 @@ def decoding(message: str, expected: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{message} ({reason}); expected {expected}") from None
+        raise InputError(f"{message} ({reason_of(error)}); expected {expected}") from None
 
 
 @contextlib.contextmanager

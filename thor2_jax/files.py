@@ -24,7 +24,7 @@ from colornet.files import (
     remove_leftovers,
     temporary_directory,
 )
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 
 __all__ = [
     "atomic_directory",
@@ -291,7 +291,7 @@ def parse_yaml(content: bytes) -> Any:
         size = _expanded_size(value, {})
     # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.
     except Exception as error:
-        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from None
+        raise ValueError(reason_of(error)) from None
     if size > MAX_YAML_VALUES:
         raise ValueError(f"its aliases expand to more than {MAX_YAML_VALUES} values")
     return value

@@ -277,24 +277,26 @@ def _variables(model: nnx.Module) -> tuple[Any, dict[str, Any]]:
     return state, {"/".join(map(str, path)): variable for path, variable in nnx.to_flat_state(state)}
 
 
-def model_arrays(model: nnx.Module) -> dict[str, NDArray[Any]]:
-    """Return the parameters and batch statistics of a model by their paths, for example layers/0/kernel."""
-    return {name: np.asarray(variable[...]) for name, variable in _variables(model)[1].items()}
+def model_arrays(model: nnx.Module, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """Return the parameters and batch statistics of a model by a prefix and their paths, such as layers/0/kernel."""
+    return {prefix + path: np.asarray(variable[...]) for path, variable in _variables(model)[1].items()}
 
 
-def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray[Any]]) -> Module:
+def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Module:
     """Create a model with the given parameters and batch statistics; no weights are drawn.
 
     Args:
         create: function without arguments that constructs the model, its random generators included.
-        arrays: arrays by name, as `model_arrays` returns them.
+        arrays: arrays by name, as `model_arrays` returns them; others are ignored.
+        prefix: prefix of the names.
 
     Raises:
         ValueError: if an array is missing or has another shape.
     """
     model = nnx.eval_shape(create)
     state, variables = _variables(model)
-    for name, variable in variables.items():
+    for path, variable in variables.items():
+        name = prefix + path
         if name not in arrays or arrays[name].shape != variable.shape:
             raise ValueError(f"{name} is missing or does not have the shape {variable.shape}")
         variable.set_value(jax.device_put(arrays[name]))  # `asarray` compiles a program for each shape

@@ -29,9 +29,8 @@ from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import with_context
 from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY

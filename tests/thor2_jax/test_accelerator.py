@@ -16,7 +16,6 @@ import colornet
 import thor2_jax as thor2
 from benchmarks import run_gpu
 from benchmarks.timing import time_calls
-from thor2_jax.model.classifier import class_probabilities
 from thor2_jax.networks import MLP
 
 NETWORK = colornet.load_default()
@@ -96,7 +95,7 @@ def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2
     described = thor2.describe(clouds, NETWORK, thor2.DescriptorConfig(homology="closed_form"))
     model = MLP(described.tops2.shape[1], 17, rngs=nnx.Rngs(0))
     graph, state = nnx.split(model)
-    forward = jax.jit(lambda state, descriptors: class_probabilities(nnx.merge(graph, state), descriptors, "tops2"))
+    forward = jax.jit(lambda state, descriptors: jax.nn.softmax(nnx.merge(graph, state)(descriptors.tops2)))
     probabilities, expected = (
         np.asarray(forward(*jax.device_put((state, described), device)))
         for device in (accelerator, jax.devices("cpu")[0])

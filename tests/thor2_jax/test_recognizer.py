@@ -102,7 +102,7 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     described = recognizer.describe(tilted(patches()))
     for name, probabilities in class_probabilities(recognizer, described.oriented).items():
-        expected = classifier.class_probabilities(run.classifiers[name], described.descriptors, name)
+        expected = jax.nn.softmax(run.classifiers[name](classifier.feature_of(described.descriptors, name)))
         np.testing.assert_allclose(probabilities, expected, atol=1e-5)
 
 

@@ -24,9 +24,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_points, leave_out
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
-from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
-from thor2_jax.gallery.enrollment import embed_looks, instance_view
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view
+from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -279,11 +279,10 @@ def pixel_attributions(explanation: Explanation, frame: RGBDFrame) -> NDArray[np
     Pixels of the background are NaN, and pixels whose depth is not in the cloud, for example outliers.
     """
     pixels = frame.instance_pixels[explanation.instance.label]
-    depth = frame.depth_m.ravel()[pixels]
-    points = pixel_rays(pixels, frame.depth.shape[1], frame.intrinsics) * depth[:, None]
+    points = frame.points(pixels)
     reach = 2 * DESCRIPTOR_VOXEL / explanation.config.sigma_s
     distance, nearest = KDTree(explanation.instance.points).query(points, distance_upper_bound=reach)
-    near = np.isfinite(distance) & (depth > 0)
+    near = np.isfinite(distance) & (points[:, 2] > 0)
     painted = np.full(frame.depth.size, np.nan, np.float32)
     painted[pixels[near]] = explanation.attributions.values[nearest[near]]
     return painted.reshape(frame.depth.shape)

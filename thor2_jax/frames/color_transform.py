@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from colornet.lab import LUMA
 from thor2_jax.errors import InputError
 
-__all__ = ["LUMA", "MAX_PARAMETER", "ColorTransform", "transform_colors"]
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
+__all__ = ["MAX_PARAMETER", "ColorTransform", "transform_colors"]
 
 MAX_PARAMETER = 1.5
 """Largest absolute value of a parameter: a factor of 4.5 of gamma, gain or saturation."""

@@ -144,6 +144,13 @@ class RGBDFrame:
         """Label numbers of the frame in increasing order, without 0; raises InputError as `instance_pixels`."""
         return tuple(self.instance_pixels)
 
+    def points(self, pixels: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the points [n, 3] of pixels (flat indices [n]) in metres; zeros where there is no depth.
+
+        The frame is that of `backproject`.
+        """
+        return pixel_rays(pixels, self.depth.shape[1], self.intrinsics) * self.depth_m.ravel()[pixels, None]
+
 
 def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
     """Raise InputError unless shapes and types of the images of a frame fit; the type of depth is not checked."""

@@ -1,4 +1,4 @@
-"""Reading of files whose content is not trusted: PNG, JPEG and TIFF, and depth also as NPY and EXR."""
+"""Images whose content is not trusted: PNG, JPEG and TIFF, and files of depth also as NPY and EXR."""
 
 import math
 from pathlib import Path
@@ -6,12 +6,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageFile
+from PIL import Image
 
 from thor2_jax.errors import InputError, decoding, needs_extra
 from thor2_jax.files import open_file
 
-__all__ = ["MAX_IMAGE_PIXELS", "check_size", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
+__all__ = ["MAX_IMAGE_PIXELS", "ImageSizeError", "check_size", "decode_image", "read_depth", "read_image", "read_npy"]
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
 """Image formats that are read. For some of its other formats, Pillow runs external programs."""
@@ -25,19 +25,43 @@ _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 """Names of the channel of an EXR file that holds depth, if it has several."""
 
 
-def check_size(width: int, height: int) -> None:
-    """Raise ValueError unless an image has 1 to `MAX_IMAGE_PIXELS` pixels."""
-    if not 0 < width * height <= MAX_IMAGE_PIXELS:
-        raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+class ImageSizeError(ValueError):
+    """An image has no pixels, or more than are read."""
 
 
-def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
-    """Return whether a newly opened colour image has 16 bits per channel, of which Pillow keeps 8."""
-    return image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
+def check_size(width: int, height: int, max_pixels: int = MAX_IMAGE_PIXELS) -> None:
+    """Raise ImageSizeError unless an image has 1 to `max_pixels` pixels."""
+    if not 0 < width * height <= max_pixels:
+        raise ImageSizeError(f"{width} x {height} pixels; expected at most {max_pixels}")
+
+
+def decode_image(
+    stream: BinaryIO,
+    formats: tuple[str, ...] = IMAGE_FORMATS,
+    max_pixels: int = MAX_IMAGE_PIXELS,
+    lossless: bool = False,
+) -> tuple[NDArray[Any], str]:
+    """Decode an image; return its pixels and its Pillow mode, with ";16" for colour of 16 bits per channel.
+
+    Pillow keeps 8 of these 16 bits.
+
+    Raises:
+        ImageSizeError: it has more than `max_pixels`.
+        Exception: of many kinds, if it is damaged, not of `formats` or, with `lossless`, has JPEG compression.
+    """
+    with Image.open(stream, formats=formats) as image:
+        check_size(*image.size, max_pixels)
+        if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
+            raise ValueError("JPEG compression changes label numbers")
+        image.verify()  # decoding does not check the checksums of a PNG
+    stream.seek(0)
+    with Image.open(stream, formats=formats) as image:
+        is_deep = image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
+        return np.asarray(image), f"{image.mode};16" if is_deep else image.mode
 
 
 def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
-    """Read an image file; return its pixels and its Pillow mode, with ";16" for colour of 16 bits per channel.
+    """Read an image file by `decode_image`.
 
     Raises:
         InputError: the file is damaged, not of `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
@@ -46,15 +70,7 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
     """
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
     with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
-        with Image.open(stream, formats=IMAGE_FORMATS) as image:
-            check_size(*image.size)
-            if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
-                raise ValueError("JPEG compression changes label numbers")
-            image.verify()  # decoding does not check the checksums of a PNG
-        stream.seek(0)
-        with Image.open(stream, formats=IMAGE_FORMATS) as image:
-            mode = f"{image.mode};16" if has_16_bit_channels(image) else image.mode
-            return np.asarray(image), mode
+        return decode_image(stream, lossless=lossless)
 
 
 def read_depth(path: str | Path) -> NDArray[Any]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
+from colornet.lab import LUMA
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
 from thor2_jax.frames.frames import check_images
@@ -201,8 +202,7 @@ def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thicknes
 
 def _ink(paint: Paint) -> Paint:
     """Return black or white, whichever has more contrast with a colour."""
-    red, green, blue = paint
-    return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
+    return (0, 0, 0) if LUMA @ paint > 100 else (255, 255, 255)
 
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]) -> _Lettering | None:

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_points, pixel_rays
+from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
 from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, voxel_downsample
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ __all__ = [
     "find_occlusion",
     "instance_cloud",
     "instance_clouds",
+    "instance_view",
     "pack_instances",
     "prepare_instance",
     "unit_question",
@@ -93,6 +95,9 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
         frame: the frame.
         label: one of `frame.instances`.
         with_rim: whether to find the rim.
+
+    Raises:
+        InputError: the points are too far apart for the grid, as with wrong intrinsics.
     """
     pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
@@ -101,12 +106,17 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
     steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
     if not steep:
         trusted &= ~flying
-    valid, depth = pixels[trusted], depth[trusted]
-    points = pixel_points(valid, depth, frame.depth.shape[1], frame.intrinsics)
+    valid = pixels[trusted]
+    points = frame.points(valid).astype(np.float32)
     channels = frame.color.reshape(-1, 3).take(valid, axis=0)
     if with_rim:  # as a further colour channel
         channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
-    points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
+    try:
+        points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
+    except InputError:
+        raise InputError(
+            "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale"
+        ) from None
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
@@ -246,6 +256,9 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
         label: one of `frame.instances`.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
         with_rim: whether to find the rim, see `DescriptorConfig.uses_rim`.
+
+    Raises:
+        InputError: as `instance_cloud`.
     """
     cloud = instance_cloud(frame, label, with_rim)
     if cloud.reason is not None:
@@ -260,6 +273,27 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
         rim[:] = False
     colors, boundary = channels[:, :3], channels[:, 3] > 0
     return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim)
+
+
+def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
+    """Prepare one instance of a frame, which is to be enrolled or explained.
+
+    Args:
+        frame: the frame.
+        label: number of the instance; None if it is the only one.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+
+    Raises:
+        InputError: the frame has no such instance, or several and no number is given, or the instance cannot be used.
+    """
+    if label is None and len(frame.instances) != 1:
+        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
+    if label is not None and label not in frame.instances:
+        raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
+    view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
+    if view.reason is not None:
+        raise InputError(f"instance {view.label} cannot be used: {view.reason}")
+    return view
 
 
 def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity: int | None = None) -> "PointClouds":

@@ -305,7 +305,7 @@ class Embedding:
             about["further"] = len(self.further)
         arrays = model_arrays(self.model)
         for number, model in enumerate(self.further):
-            arrays |= {_FURTHER.format(number) + name: array for name, array in model_arrays(model).items()}
+            arrays |= model_arrays(model, _FURTHER.format(number))
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
         return pack_arrays(arrays, {"embedding": json.dumps(about, sort_keys=True)})
 
@@ -358,8 +358,7 @@ class Embedding:
             embedding = cls(config, network, sizes, model, classes, distractors)
             further = []
             for prefix in map(_FURTHER.format, range(count)):
-                own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-                further.append(model_from_arrays(embedding.create_further, own))
+                further.append(model_from_arrays(embedding.create_further, arrays, prefix))
         file, references = path.with_name(REFERENCES_FILE), None
         if file.is_file():
             references = References.load(file, content_digest([content]), embedding.size)

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colornet.lab import LUMA
 from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.frames.color_transform import LUMA
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import CompactClouds, GalleryObject
 
@@ -31,7 +30,6 @@ __all__ = [
     "embed_views",
     "enrolled_object",
     "enrolled_views",
-    "instance_view",
     "views_to_embed",
 ]
 
@@ -56,27 +54,6 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
         looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
         batches.append(embedding.embed_oriented(looks, clouds))
     return np.concatenate(batches)[: len(views)]
-
-
-def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
-    """Return one instance of a frame as a view to enroll.
-
-    Args:
-        frame: the frame.
-        label: number of the instance; None if it is the only one.
-        sigma_s: scaled units per metre, see `DescriptorConfig`.
-
-    Raises:
-        InputError: the frame has no such instance, or several and no number is given, or the instance cannot be used.
-    """
-    if label is None and len(frame.instances) != 1:
-        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
-    if label is not None and label not in frame.instances:
-        raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
-    view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
-    if view.reason is not None:
-        raise InputError(f"instance {view.label} cannot be used: {view.reason}")
-    return view
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:

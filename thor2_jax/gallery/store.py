@@ -22,7 +22,7 @@ from typing import Any
 import filelock
 import numpy as np
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.files import (
     atomic_write,
     content_digest,
@@ -139,10 +139,9 @@ def _read_index(path: Path) -> dict[str, Any] | None:
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
         raise GalleryError(
-            f"gallery: {path} is damaged ({reason}); restore it from a copy, or delete this file and rebuild it: "
-            f"thor2 objects --reembed --model RUN --gallery {path.parent}"
+            f"gallery: {path} is damaged ({reason_of(error)}); restore it from a copy, or delete this file and rebuild "
+            f"it: thor2 objects --reembed --model RUN --gallery {path.parent}"
         ) from None
     if index["format"] != GALLERY_FORMAT:
         raise GalleryError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")

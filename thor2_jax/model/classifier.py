@@ -22,7 +22,6 @@ __all__ = [
     "Feature",
     "RunClassifiers",
     "check_features",
-    "class_probabilities",
     "feature_of",
 ]
 
@@ -55,11 +54,6 @@ def check_features(names: object, argument: str) -> tuple[Feature, ...]:
 def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
     """Return the flat descriptor [B, F] that the classifier of this name reads."""
     return {"ce": descriptors.color, "tops": descriptors.tops, "tops2": descriptors.tops2}[name]
-
-
-def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> jax.Array:
-    """Return the class probabilities [B, n_classes] of a trained classifier that reads the descriptor `name`."""
-    return jax.nn.softmax(model(feature_of(descriptors, name)))
 
 
 def _fused_probabilities(models: Sequence[MLP], oriented: LookDescriptors, name: Feature) -> jax.Array:

@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, cast, get_args
 
+import numpy as np
+
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import Descriptors, PointClouds
 
@@ -132,17 +134,16 @@ class Detection:
 def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list[Detection]:
     """Return the detections of a frame with labels, one for each answer."""
     width = frame.depth.shape[1]
-    depth = frame.depth_m.ravel()
     detections = []
     for recognition in recognitions:
         pixels = frame.instance_pixels[recognition.label]
-        rows, columns = pixels // width, pixels % width
+        rows, columns = np.divmod(pixels, width)
         left, top = int(columns.min()), int(rows.min())
         box = Box(left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
-        valid = pixels[depth[pixels] > 0]
-        position = None
-        if len(valid):
-            x, y, z = (pixel_rays(valid, width, frame.intrinsics) * depth[valid, None]).mean(axis=0).tolist()
+        points, position = frame.points(pixels), None
+        points = points[points[:, 2] > 0]
+        if len(points):
+            x, y, z = points.mean(axis=0).tolist()
             position = (x, y, z)
         detections.append(Detection(recognition, box, position))
     return detections

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError, needs_extra, with_context
+from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
 from thor2_jax.files import open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
@@ -241,7 +241,7 @@ class Bag:
         except (OSError, InputError):
             raise
         except Exception as error:
-            reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+            reason = reason_of(error).rstrip(".")
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
             repair = _REPAIR.get(".db3" if self.path.is_dir() else self.path.suffix)
             raise InputError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, check_size
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, decode_image
 from thor2_jax.model.recognition import Box, Detection
 
 __all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_of"]
@@ -34,6 +34,9 @@ _DEPTH_TYPES: dict[str, np.dtype[Any]] = {
     "32fc1": np.dtype(np.float32),
 }
 """Encoding in lower case -> type of a pixel: millimetres as integers, metres as floats (REP 118)."""
+
+_FORMATS = ("PNG", "JPEG")
+"""Formats of compressed images."""
 
 _DEPTH_HEADER = struct.Struct("<iff")
 """Header of compressedDepth: format, and the two numbers of the quantization of inverse depth."""
@@ -56,7 +59,7 @@ def image_kind(message: Any) -> str:
     if encoding.strip() in _DEPTH_TYPES:
         return "depth"
     try:
-        with Image.open(io.BytesIO(bytes(message.data)), formats=("PNG", "JPEG")) as image:
+        with Image.open(io.BytesIO(bytes(message.data)), formats=_FORMATS) as image:
             return "color" if image.mode in ("RGB", "RGBA") else "depth" if image.mode.startswith("I") else "other"
     except Exception:  # Decoders raise many kinds of exception on damaged images.
         return "other"
@@ -118,9 +121,7 @@ def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
 def _decoded(content: bytes, described: str) -> NDArray[Any]:
     """Return the pixels of a PNG or JPEG whose content is not trusted."""
     with decoding(f"a compressed image ({described}) is damaged", "PNG or JPEG"):
-        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
-            check_size(*image.size)
-            return np.asarray(image)
+        return decode_image(io.BytesIO(content), _FORMATS)[0]
 
 
 def _compressed_depth(content: bytes, described: str) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import InputError, needs_extra, reason_of
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
 
@@ -80,7 +80,7 @@ class RealSenseCamera:
             try:
                 color, depth = self._next()
             except RuntimeError as error:
-                reason = " ".join(str(error).split()).rstrip(".")
+                reason = reason_of(error).rstrip(".")
                 raise InputError(
                     f"realsense: no frame for {self._timeout:g} s after {n_frames} frames ({reason}); the camera was "
                     "unplugged or has stopped; check the cable"

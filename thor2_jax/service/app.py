@@ -33,7 +33,7 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.signals import handlers_replaced
+from thor2_jax.service.signals import handlers_replaced
 
 __all__ = ["create_app"]
 

@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
+from thor2_jax.frames.image_files import ImageSizeError, decode_image, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.service.problem import RequestError, field_errors, parse_fields
 from thor2_jax.service.schemas import CloudsBody
@@ -54,10 +52,8 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
         "intrinsics": lambda: _decode_intrinsics(intrinsics),
     }
     fields = parse_fields(parsers)
-    try:
+    with field_errors():
         frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
-    except InputError as error:
-        raise RequestError(422, str(error).split(maxsplit=1)[0], f"{error}.") from None
     if labels is not None:
         check_instances(frame)
     return frame
@@ -80,30 +76,22 @@ def _decode_intrinsics(content: bytes) -> Intrinsics:
 
 
 def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:
-    def image_error(status: int, description: str) -> RequestError:
-        return RequestError(status, field, f"{field} {description}.")
-
     try:
-        image = Image.open(io.BytesIO(content), formats=formats)
+        pixels, mode = decode_image(io.BytesIO(content), formats, MAX_UPLOAD_PIXELS)
+    except ImageSizeError as error:
+        raise RequestError(413, field, f"{field} has {error}.") from None
     except Exception:  # Damaged files make the decoders raise many types of exception.
-        raise image_error(422, f"is not a {' or '.join(formats)} image, or its header is damaged") from None
-    width, height = image.size
-    if width * height > MAX_UPLOAD_PIXELS:
-        raise image_error(413, f"has {width} x {height} pixels; expected at most {MAX_UPLOAD_PIXELS}")
-    if image.mode not in modes:
-        raise image_error(422, f"is {_mode_name(image.mode)}; expected {' or '.join(map(_mode_name, modes))}")
-    if field == "color" and has_16_bit_channels(image):
-        raise image_error(422, "has 16 bits per channel; expected 8")
-    try:
-        image.verify()  # Decoding alone ignores the checksums of a PNG's pixels.
-        return np.asarray(Image.open(io.BytesIO(content), formats=formats))
-    except Exception:  # As above.
-        raise image_error(422, "is damaged or truncated") from None
+        raise RequestError(422, field, f"{field} is damaged, or not a {' or '.join(formats)} image.") from None
+    if mode not in modes:
+        expected = " or ".join(map(_mode_name, modes))
+        raise RequestError(422, field, f"{field} is {_mode_name(mode)}; expected {expected}.")
+    return pixels
 
 
 def _mode_name(mode: str) -> str:
-    names = {"1": "black and white", "L": "8-bit grey", "I;16": "16-bit grey", "I": "32-bit grey", "P": "indexed"}
-    return names.get(mode, mode)
+    depth, _, bits = mode.partition(";")
+    names = {"1": "black and white", "L": "8-bit grey", "I": f"{bits or 32}-bit grey", "P": "indexed"}
+    return names.get(depth, f"{bits or 8}-bit {depth}")
 
 
 def decode_json_clouds(content: bytes) -> CloudArrays:

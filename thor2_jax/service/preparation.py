@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, prepare_instance
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
-from thor2_jax.service.problem import RequestError, deadline_exceeded
+from thor2_jax.service.problem import RequestError, deadline_exceeded, field_errors
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.signals import signals_blocked
+from thor2_jax.service.signals import signals_blocked
 
 __all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
@@ -79,8 +79,8 @@ def prepare_frame(
         with timed(seconds, "segment"):
             frame = _segmented(frame, segmenter)
         with_label_map = True
-    with timed(seconds, "clouds"):
-        instances = _prepare_instances(frame, frame.instances, config)
+    with timed(seconds, "clouds"), field_errors():
+        instances = [prepare_instance(frame, k, config.sigma_s, config.uses_rim) for k in frame.instances]
         label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, seconds, label_map)
 
@@ -119,23 +119,9 @@ def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) 
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
         frame = decode_frame(**files)
-    if label not in frame.instances:
-        first = ", ".join(map(str, frame.instances[:10])) or "none"
-        more = " ..." if len(frame.instances) > 10 else ""
-        raise RequestError(422, "instance", f"instance is {label}; expected a number of labels: {first}{more}.")
-    with timed(seconds, "clouds"):
-        (view,) = _prepare_instances(frame, [label], config)
-    if view.reason is not None:
-        raise RequestError(422, "instance", f"instance {label} cannot be used: {view.reason}.")
+    with timed(seconds, "clouds"), field_errors():
+        view = instance_view(frame, label, config.sigma_s)
     return PreparedRequest([view], seconds, frame=frame)
-
-
-def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], config: DescriptorConfig) -> list[PreparedInstance]:
-    try:
-        return [prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in labels]
-    except InputError:  # The images and the intrinsics are valid, but their combination exceeds the voxel grid.
-        message = "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
-        raise RequestError(422, "intrinsics", message) from None
 
 
 def _encode_label_map(labels: NDArray[Any]) -> LabelMap:

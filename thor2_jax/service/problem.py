@@ -67,12 +67,12 @@ class RequestError(Exception):
 
 
 @contextlib.contextmanager
-def field_errors(field: str) -> Iterator[None]:
-    """Turn an InputError into a RequestError (422) about a field."""
+def field_errors(field: str | None = None) -> Iterator[None]:
+    """Turn an InputError into a RequestError (422) about a field, by default the first word of the message."""
     try:
         yield
     except InputError as error:
-        raise RequestError(422, field, f"{error}.") from None
+        raise RequestError(422, field or str(error).split(maxsplit=1)[0], f"{error}.") from None
 
 
 def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:

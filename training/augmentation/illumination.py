@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from colornet.lab import LUMA
 from training.augmentation.pixels import FRAME_PIXEL, Range, blurred, pixel_width
 from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Illumination", "Registration", "misregistered", "relit"]
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
 
 STRIDE = 2
 """Pixels between computed shading values: still finer than the voxels of the clouds."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
+from colornet.lab import LUMA
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from training.augmentation.illumination import LUMA
 from training.rendering.depth_camera import axial_deviation
 
 __all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]

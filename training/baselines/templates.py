@@ -66,8 +66,7 @@ def load_templates(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predi
         KeyError, ValueError: an array is missing or has another shape.
     """
     name, n_classes = BACKBONES[int(arrays["number"][0])], len(run.classes)
-    weights = {k.removeprefix("backbone/"): a for k, a in arrays.items() if k.startswith("backbone/")}
-    embed = crop_function(model_from_arrays(partial(create_backbone, name), weights), _color, _unit)
+    embed = crop_function(model_from_arrays(partial(create_backbone, name), arrays, "backbone/"), _color, _unit)
     features, label = arrays["features"], arrays["label"]
 
     def predict(crops: ViewCrops) -> NDArray[np.float32]:
@@ -128,6 +127,6 @@ def fit_templates(task: FitTask) -> StoredBaseline:
     stored = features[~held_out].astype(np.float16), label[~held_out].astype(np.int16)
     n_classes = len(task.source.classes)
     temperature = task.temperature(label, held_out, lambda: compare(features[held_out], *stored, n_classes))
-    arrays = {f"backbone/{path}": array for path, array in model_arrays(model).items()}
+    arrays = model_arrays(model, "backbone/")
     arrays |= {"number": np.array([number]), "features": stored[0], "label": stored[1]}
     return StoredBaseline(arrays, temperature, weights)

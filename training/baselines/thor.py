@@ -111,10 +111,8 @@ def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     config, library = run.config, {}
     for name in VIEW_TYPES:
         for k in range(1, config.n_slices + 1):
-            prefix = f"{name}-{k}/"
-            weights = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
             create = partial(_create_mlp, k * config.image_size**2, len(run.classes))
-            library[name, k] = model_from_arrays(create, weights)
+            library[name, k] = model_from_arrays(create, arrays, f"{name}-{k}/")
     return predictor(library, config)
 
 
@@ -146,11 +144,10 @@ def predictor(library: Library, config: DescriptorConfig) -> Predictor:
 
 def library_arrays(library: Library) -> dict[str, NDArray[Any]]:
     """Return the weights of a library, as `load_thor` reads them."""
-    return {
-        f"{name}-{k}/{path}": array
-        for (name, k), model in library.items()
-        for path, array in model_arrays(model).items()
-    }
+    arrays: dict[str, NDArray[Any]] = {}
+    for (name, k), model in library.items():
+        arrays |= model_arrays(model, f"{name}-{k}/")
+    return arrays
 
 
 def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:

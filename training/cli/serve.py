@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import needs_extra
-from thor2_jax.signals import ended_by_signals
 from training.cli import options
 from training.cli.app import app
 
@@ -51,6 +50,8 @@ def serve(
     ] = None,
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
+    from thor2_jax.service.signals import ended_by_signals
+
     with ended_by_signals():
         with needs_extra("serve", "FastAPI and uvicorn", "serve"):
             from thor2_jax.service.server import serve as serve_forever

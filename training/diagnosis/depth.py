@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
 from training.diagnosis.checks import Diagnosis
 
 __all__ = ["check_depth", "instance_extents"]
@@ -60,7 +60,7 @@ def instance_extents(frame: RGBDFrame) -> dict[int, float]:
         chosen = (depth > 0) & (np.abs(depth - median) < 0.25 * median)
         if chosen.sum() < MIN_PIXELS:
             continue
-        points = pixel_rays(pixels[chosen], frame.depth.shape[1], frame.intrinsics) * depth[chosen, None]
+        points = frame.points(pixels[chosen])
         axes = np.linalg.eigh(np.cov(points.T))[1]
         extents[label] = float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max())
     return extents

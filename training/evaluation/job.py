@@ -20,7 +20,7 @@ import numpy as np
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
-from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
@@ -229,11 +229,9 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
 
 def _position(frame: RGBDFrame, label: int) -> tuple[float, float, float] | None:
     """Return the median x, y and z of an instance's points, rounded to 0.1 mm; None if no pixel has depth."""
-    pixels = frame.instance_pixels.get(label, np.zeros(0, np.intp))
-    depth = frame.depth_m.ravel()[pixels]
-    pixels, depth = pixels[depth > 0], depth[depth > 0]
-    if not len(pixels):
+    points = frame.points(frame.instance_pixels.get(label, np.zeros(0, np.intp)))
+    points = points[points[:, 2] > 0]
+    if not len(points):
         return None
-    points = pixel_rays(pixels, frame.depth.shape[1], frame.intrinsics) * depth[:, None]
     x, y, z = np.median(points, axis=0).round(4).tolist()
     return x, y, z

@@ -16,7 +16,7 @@ from sklearn.linear_model import LogisticRegression
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import EMBEDDING, Feature, class_probabilities
+from thor2_jax.model.classifier import EMBEDDING, Feature, feature_of
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
@@ -42,7 +42,7 @@ SAMPLES_PER_BATCH = 256
 @partial(jax.jit, static_argnums=(0, 1))
 def _probabilities(context: FitContext, graph: Any, state: Any, batch: Batch) -> jax.Array:
     descriptors = describe_batch(batch, context.network, context.config)
-    return class_probabilities(nnx.merge(graph, state), descriptors, context.feature)
+    return jax.nn.softmax(nnx.merge(graph, state)(feature_of(descriptors, context.feature)))
 
 
 def sample_probabilities(

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 import httpx
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.files import temporary_directory
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress, locked
@@ -112,10 +112,9 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
         raise
     # The last two are raised for proxies of other kinds and by the resolution of names.
     except (httpx.HTTPError, httpx.InvalidURL, ImportError, ValueError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"url: {address} cannot be read ({reason}); expected an address such as {YCB_URL}; check the network, then "
-            "repeat the command, it resumes"
+            f"url: {address} cannot be read ({reason_of(error)}); expected an address such as {YCB_URL}; check the "
+            "network, then repeat the command, it resumes"
         ) from None
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.image_files import check_size
 from thor2_jax.printable import check_name
@@ -169,8 +169,7 @@ def _parsed(path: Path) -> TexturedMesh:
         raise InputError(f"mesh {path}: {error}") from error
     # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"mesh {path}: cannot be read ({reason})") from error
+        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)})") from error
     return mesh
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
-from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import augmented_view, instance_view
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
+from thor2_jax.gallery.enrollment import augmented_view
 from thor2_jax.printable import check_name, normal_name
 from training.readers.frames import FrameFolder
 from training.views.crops import QuantizedCrop, ViewCrops, quantized, rgbd_crop, stacked

@@ -1,5 +1,6 @@
 """Instance clouds: which pixels become points, and which points of analytic scenes are kept."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
+from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.frames.outliers import voxel_downsample
 from thor2_jax.frames.prepared_instance import (
@@ -69,6 +71,12 @@ def test_one_cloud_per_instance_in_the_order_of_labels() -> None:
         assert cloud.colors.dtype == np.uint8 and cloud.colors.shape == cloud.points.shape
         nearest = np.rint(pixels_of(cloud.points)).astype(int)
         assert (labels[nearest[:, 0], nearest[:, 1]] == cloud.label).all()
+
+
+def test_intrinsics_with_which_points_are_too_far_apart() -> None:
+    frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
+    with pytest.raises(InputError, match="^intrinsics place the points of an instance too far apart"):
+        only(dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0)))
 
 
 def test_points_are_voxel_means_of_backprojected_pixels() -> None:

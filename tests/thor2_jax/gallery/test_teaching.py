@@ -9,8 +9,9 @@ import pytest
 from helpers import small_embedding, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import augmented_copies, instance_view
+from thor2_jax.gallery.enrollment import augmented_copies
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.fusion import Calibration

@@ -15,6 +15,7 @@ from thor2_jax.recordings.messages import color_image, depth_image, image_kind
 RNG = np.random.default_rng(0)
 COLOR = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 3000, (5, 7), dtype=np.uint16)
+PNG = encode_image(COLOR, "PNG")
 
 
 @pytest.mark.parametrize("padding", [0, 3])
@@ -57,7 +58,7 @@ def test_raw_images_of_too_many_pixels(encoding: str, read: Callable[[Any], Any]
 def test_compressed_images() -> None:
     smooth = np.full((16, 16, 3), (200, 60, 20), np.uint8)
     for message, read, kind, expected, tolerance in (
-        (compressed(encode_image(COLOR, "PNG"), "bgr8; png compressed bgr8"), color_image, "color", COLOR, 0),
+        (compressed(PNG, "bgr8; png compressed bgr8"), color_image, "color", COLOR, 0),
         (compressed(encode_image(smooth, "JPEG", quality=95), "jpeg"), color_image, "color", smooth, 5),
         (compressed_depth(DEPTH), depth_image, "depth", DEPTH, 0),
         (compressed(encode_image(DEPTH, "PNG"), "png"), depth_image, "depth", DEPTH, 0),
@@ -93,9 +94,10 @@ def resized(**fields: int) -> Any:
         (color_image, image(DEPTH.astype(np.uint8), "mono8")),
         (color_image, image(COLOR, "bayer_rggb8")),
         (depth_image, image(COLOR, "rgb8")),
-        (color_image, compressed(encode_image(COLOR, "PNG")[:40], "png")),
+        (color_image, compressed(PNG[:40], "png")),
+        (color_image, compressed(PNG[:-16] + bytes(4) + PNG[-12:], "png")),  # a wrong checksum
         (color_image, compressed(encode_image(DEPTH, "PNG"), "png")),
-        (depth_image, compressed(encode_image(COLOR, "PNG"), "16UC1; png compressed")),
+        (depth_image, compressed(PNG, "16UC1; png compressed")),
         (depth_image, compressed(b"123", "16UC1; compressedDepth png")),
         (depth_image, compressed(b"0" * 99, "16UC1; compressedDepth rvl")),
     ],

@@ -9,7 +9,6 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -21,8 +20,6 @@ from PIL.PngImagePlugin import PngInfo
 from processes import HANG
 from service_requests import check_refused
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import read_labels
 from thor2_jax.service.decoding import decode_frame
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import MAX_BODY
@@ -46,8 +43,8 @@ def png_bomb(width: int, height: int) -> bytes:
     return png_file(with_checksums((b"IHDR", header), (b"IDAT", zlib.compress(bytes(10**7), 9)), (b"IEND", b"")))
 
 
-def test_png_with_an_invalid_checksum(tmp_path: Path) -> None:
-    """The service and the library refuse it, even if its pixels can be decoded."""
+def test_png_with_an_invalid_checksum() -> None:
+    """It is refused even if its pixels can be decoded."""
     text = PngInfo()
     text.add_text("Title", "scene")
     pixels = np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2
@@ -63,9 +60,6 @@ def test_png_with_an_invalid_checksum(tmp_path: Path) -> None:
         with pytest.raises(RequestError) as error:
             decode_frame(**contents | {"labels": changed})
         assert (error.value.status, error.value.field) == (422, "labels")
-        (tmp_path / "labels.png").write_bytes(changed)
-        with pytest.raises(InputError, match="^labels: .* is damaged"):
-            read_labels(tmp_path / "labels.png")
 
 
 @pytest.mark.parametrize("field", ["color", "depth", "labels"])

@@ -13,7 +13,7 @@ from sklearn.metrics import log_loss
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.model.classifier import Feature, class_probabilities
+from thor2_jax.model.classifier import Feature, feature_of
 from thor2_jax.model.fusion import Calibration, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
@@ -43,7 +43,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     rows = np.array([7, 0, 7, 3, 5])
     context = FitContext(feature, NETWORK, CONFIG)
     probabilities = calibration.sample_probabilities(model, samples, rows, context)
-    probabilities_of = jax.jit(lambda described: class_probabilities(model, described, feature))
+    probabilities_of = jax.jit(lambda described: jax.nn.softmax(model(feature_of(described, feature))))
     expected = []
     for index in range(2):
         ((_, normal),) = padded_batches(views.read(index).clouds(), 2)
