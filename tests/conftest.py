@@ -144,7 +144,7 @@ def browser() -> "Iterator[Browser]":
 
 
 def _run_command(capfd: pytest.CaptureFixture[str], status: int, arguments: tuple[object, ...]) -> tuple[str, str]:
-    from helpers import run_thor2
+    from commands import run_thor2
 
     capfd.readouterr()
     assert run_thor2(*arguments) == status
@@ -180,15 +180,15 @@ def small_classifiers() -> Iterator[None]:
 
     Other processes have to be given the layers, since they do not see the change.
     """
-    import helpers
+    import small_runs
 
     from thor2_jax import networks
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "HIDDEN", (32, 16))
-        helpers._drawn.cache_clear()
+        small_runs._drawn.cache_clear()
         yield
-    helpers._drawn.cache_clear()
+    small_runs._drawn.cache_clear()
 
 
 @pytest.fixture(scope="session")

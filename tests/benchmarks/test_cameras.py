@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers import small_frame, untrained_run, write_frame_files
+from image_files import small_frame, write_frame_files
+from small_runs import untrained_run
 
 from benchmarks import cameras
 from thor2_jax.errors import InputError

@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import Interrupted, brick_and_stick, files_of, stop_when
+from commands import files_of
+from failures import Interrupted, stop_when
+from small_clouds import brick_and_stick
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from dataset_files import ocid_scene, pack_pcd, points_of
-from helpers import encode_image, png_file, with_checksums
 from hypothesis import given
 from hypothesis import strategies as st
+from image_files import encode_image, png_file, with_checksums
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_table

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import slow
+from slow_tier import slow
 
 import colornet
 import thor2_jax as thor2

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.export
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, class_probabilities, untrained_embedding_run
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import persim
 import pytest
-from helpers import slow
+from slow_tier import slow
 
 import thor2_jax as thor2
 from thor2_jax import persistence

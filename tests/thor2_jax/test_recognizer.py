@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import assert_same_answers, class_probabilities, patches, tilted, untrained_run
+from image_files import patches, tilted
 from scipy.stats import gmean
+from small_runs import assert_same_answers, class_probabilities, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance

@@ -9,8 +9,11 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full_disk, random_clouds, stop_when
+from commands import files_of
+from failures import Interrupted, full_disk, stop_when
 from PIL import Image
+from refusals import assert_refused
+from small_clouds import brick_and_stick, random_clouds
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import class_probabilities, slow, untrained_embedding_run, untrained_run
 from scipy.stats import entropy as scipy_entropy
+from slow_tier import slow
+from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.adaptation.estimate import (

@@ -9,8 +9,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, aligned_cloud, slow
 from scipy.spatial.transform import Rotation
+from slow_tier import slow
+from small_clouds import aligned_cloud
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2

@@ -7,8 +7,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, aligned_cloud, finish_programs, free_port, start_program
 from jax.sharding import Mesh
+from processes import finish_programs, free_port, start_program
+from small_clouds import aligned_cloud
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2

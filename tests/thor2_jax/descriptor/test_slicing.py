@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import aligned_cloud, as_8_bit
+from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
@@ -96,6 +96,11 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     for far, number in ((1.3, 1), (1.4, 14)):
         i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
+
+
+def as_8_bit(colors: np.ndarray) -> np.ndarray:
+    """Round colours in [0, 1], float32, to the nearest of 256 levels, halves up."""
+    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 def weights(colors: np.ndarray) -> np.ndarray:

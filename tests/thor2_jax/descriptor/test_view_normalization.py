@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from helpers import DEGENERATE
 from scipy.spatial.transform import Rotation
+from small_clouds import DEGENERATE
 
 import thor2_jax as thor2
 

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, class_probabilities, slow, untrained_embedding_run, untrained_run
 from scipy.special import logit
+from slow_tier import slow
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
 
 import colornet
 import thor2_jax as thor2

@@ -20,8 +20,8 @@ import pytest
 import schemathesis
 import uvicorn
 from fastapi import FastAPI
-from helpers import encode_image, patches, small_embedding, tilted, untrained_run
 from hypothesis import HealthCheck
+from image_files import encode_image, patches, tilted
 from playwright.sync_api import Browser, Page, Route, expect
 from processes import HANG, wait_until
 from schemathesis.checks import not_a_server_error
@@ -31,6 +31,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 from segmentation_scenes import Box, render
+from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run

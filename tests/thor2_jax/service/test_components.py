@@ -17,8 +17,7 @@ import httpx
 import jax
 import pytest
 from fastapi import FastAPI
-from helpers import finish_programs, start_program
-from processes import HANG
+from processes import HANG, finish_programs, start_program
 from service_requests import calls, check_refused
 
 from thor2_jax.service import pipeline, preparation

@@ -13,12 +13,13 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import encode_image, untrained_run
+from image_files import encode_image
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
 from service_requests import check_refused
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2

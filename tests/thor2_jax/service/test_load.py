@@ -13,8 +13,8 @@ from typing import Any
 import httpx
 import pytest
 import schemathesis
-from helpers import slow
 from processes import HANG, wait_until
+from slow_tier import slow
 
 from .conftest import assert_conforms
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 import uvicorn
-from helpers import Command, assert_refused, finish_programs, start_program
+from commands import Command
+from processes import finish_programs, start_program
+from refusals import assert_refused
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.errors import InputError

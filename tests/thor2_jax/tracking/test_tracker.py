@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from helpers import assert_same_answers, untrained_run
+from small_runs import assert_same_answers, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance

@@ -11,10 +11,10 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import assert_refused
 from PIL import Image
 from playwright.sync_api import Browser, expect
 from recording_files import table_frame
+from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError

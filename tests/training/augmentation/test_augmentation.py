@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import assert_refused, full_image
+from refusals import assert_refused
+from rendered_objects import full_image
 from scipy.ndimage import binary_dilation, distance_transform_cdt
 
 from thor2_jax.frames.frames import backproject

@@ -1,7 +1,7 @@
 """Augmentation of orientation: the axes, and what a reoriented cloud keeps."""
 
 import numpy as np
-from helpers import random_clouds
+from small_clouds import random_clouds
 
 import thor2_jax as thor2
 from training.augmentation.orientation import _random_axes, reorient

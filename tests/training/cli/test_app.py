@@ -14,8 +14,11 @@ from typing import Any
 
 import pytest
 import rich.progress
-from helpers import Command, assert_refused, run_thor2, untrained_run, write_frame
+from commands import Command, run_thor2
+from image_files import write_frame
 from processes import HANG
+from refusals import assert_refused
+from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
