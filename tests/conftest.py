@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from processes import UNOPTIMIZED, end_descendants_with_this_process
+from processes import HANG, UNOPTIMIZED, end_descendants_with_this_process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -134,8 +134,9 @@ def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """Headless Chromium, for the tests of the pages."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=1000 * HANG)
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("chromium is not installed (apt-get install chromium)")

@@ -39,8 +39,6 @@ from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
 
-expect.set_options(timeout=1000 * HANG)
-
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
@@ -200,7 +198,7 @@ def assert_conforms(document: Any, path: str, method: str, examples: int) -> Non
     @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
     @hypothesis.given(case=document[path][method].as_strategy())
     def call(case: schemathesis.Case) -> None:
-        case.call_and_validate(checks=CHECKS)
+        case.call_and_validate(checks=CHECKS, timeout=HANG)
 
     call()
 
