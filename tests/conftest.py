@@ -120,6 +120,15 @@ def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def x64(strict_dtype_promotion: None) -> Iterator[None]:
+    """Compute in float64; constants of the engine stay float32 and are promoted."""
+    import jax
+
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
     """Let tests without the browser call asyncio.run: the event loop of Playwright counts as running until it ends."""

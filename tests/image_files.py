@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 import thor2_jax as thor2
@@ -63,6 +63,18 @@ def small_frame(seed: int = 0) -> thor2.RGBDFrame:
     depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
     color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)
     return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
+
+
+def frame_of_squares(
+    squares: Mapping[int, tuple[int, int, ArrayLike]], side: int = 40, shape: tuple[int, int] = (120, 160)
+) -> thor2.RGBDFrame:
+    """Return a frame with squares 0.7 m away, before a wall: label -> row, column, colour."""
+    color, labels = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+    depth = np.full(shape, 900, np.uint16)
+    for label, (row, column, rgb) in squares.items():
+        here = slice(row, row + side), slice(column, column + side)
+        color[here], labels[here], depth[here] = rgb, label, 700
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 79.5, 59.5))
 
 
 def patches() -> NDArray[np.uint8]:

@@ -56,8 +56,7 @@ def test_invalid_values_are_rejected_by_name(record: type, name: str, value: obj
     ],
 )
 def test_released_convention_fixes_the_widths_and_borders(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        DescriptorConfig.released(**change)
+    assert_refused(message, DescriptorConfig.released, **change)
 
 
 def test_relaxed_configs_are_hashable_and_differ() -> None:

@@ -7,9 +7,9 @@ import stat
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from thor2_jax import files
-from thor2_jax.errors import InputError
 from thor2_jax.files import (
     atomic_directory,
     atomic_write,
@@ -58,12 +58,10 @@ def test_a_new_or_empty_directory_is_accepted(tmp_path: Path) -> None:
 def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     for name in ("partial", ".lock", "marker"):
         (tmp_path / name).touch()
-        with pytest.raises(InputError, match=f"out: {tmp_path} already contains"):
-            check_output_directory(tmp_path)
+        assert_refused(f"out: {tmp_path} already contains", check_output_directory, tmp_path)
         if name != "marker":
             check_output_directory(tmp_path, "marker", ("partial",))
-    with pytest.raises(InputError, match=f"out: {tmp_path} already contains marker"):
-        check_output_directory(tmp_path, "other", ("partial",))
+    assert_refused(f"out: {tmp_path} already contains marker", check_output_directory, tmp_path, "other", ("partial",))
     check_output_directory(tmp_path, "marker")
 
 
@@ -76,11 +74,9 @@ def test_files_broken_links_and_unwritable_directories_are_refused(
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to(tmp_path / "absent")
     for name in ("file", "file/below", "link"):
-        with pytest.raises(InputError, match=f"out: {tmp_path / name} "):
-            check_output_directory(tmp_path / name, "marker")
+        assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
     monkeypatch.setattr("tempfile.TemporaryFile", fail)
-    with pytest.raises(InputError, match=f"out: {tmp_path / 'new' / 'deep'} .*Read-only"):
-        check_output_directory(tmp_path / "new" / "deep")
+    assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*Read-only", check_output_directory, tmp_path / "new" / "deep")
 
 
 def test_digests_are_those_of_earlier_versions() -> None:

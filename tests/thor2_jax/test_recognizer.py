@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from image_files import patches, tilted
+from refusals import assert_refused
 from scipy.stats import gmean
 from small_runs import assert_same_answers, class_probabilities, untrained_run
 
@@ -80,8 +81,7 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
             assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
             assert dataclasses.replace(answer, name=named.name, reason=None) == named
     for value in (-0.1, 1.5, float("nan")):
-        with pytest.raises(thor2.InputError, match=f"unknown_below is {value}"):
-            Recognizer(run, value)
+        assert_refused(f"unknown_below is {value}", Recognizer, run, value)
 
 
 def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:
@@ -118,8 +118,7 @@ def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> No
 
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     shape_only = Recognizer(dataclasses.replace(run, classifiers={"tops": run.classifiers["tops"]}))
-    with pytest.raises(thor2.InputError, match="'tops2'.*expected one or more of tops$"):
-        shape_only.recognize(tilted(patches()), classifiers=THOR2)
+    assert_refused("'tops2'.*expected one or more of tops$", shape_only.recognize, tilted(patches()), classifiers=THOR2)
     answers = shape_only.recognize(tilted(patches()))
     assert {a.classifier for a in answers if a.reason is None} == {"tops"}
     with pytest.raises(thor2.InputError, match="shape"):
