@@ -128,7 +128,7 @@ def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory, elsewhere = tmp_path / "views", tmp_path / "elsewhere"
-    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/0.npz"):
+    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz"):
         write_below(directory / name)
     write_below(elsewhere / "0.npz")
     (directory / "link").symlink_to(elsewhere)
@@ -141,6 +141,9 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     remove_written(directory)
     remove_written(tmp_path / "missing")
     assert not directory.exists()
+    directory.symlink_to(elsewhere)
+    remove_written(directory, r"0\.npz")
+    assert directory.is_symlink() and elsewhere.is_dir() and not list(elsewhere.iterdir())
 
 
 def write_below(path: Path) -> None:

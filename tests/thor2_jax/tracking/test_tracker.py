@@ -83,9 +83,7 @@ def test_views_with_poses_are_described_as_one_cloud() -> None:
     recognizer = ToyRecognizer()
     tracker = Tracker(recognizer)
     tracker.update(frame_of_squares({1: (10, 60, SURE_A)}), np.eye(4))
-    (answer,) = tracker.update(
-        frame_of_squares({1: (10, 60, UNSURE_B)}), moved
-    )  # it now lies 2 cm further right
+    (answer,) = tracker.update(frame_of_squares({1: (10, 60, UNSURE_B)}), moved)  # it now lies 2 cm further right
     first, second, both = recognizer.described
     assert np.ptp(second.points[:, 0]) == pytest.approx(np.ptp(first.points[:, 0]), abs=1e-6)
     assert np.ptp(both.points[:, 0]) == pytest.approx(np.ptp(first.points[:, 0]) + 0.02, abs=0.004)
