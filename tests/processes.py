@@ -1,4 +1,4 @@
-"""Processes that tests start end with the process of the tests, even if that is killed."""
+"""Processes and programs that tests start; they end with the process of the tests, even if that is killed."""
 
 import os
 import socket

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from image_files import write_frame_files
 from numpy.typing import NDArray
 
@@ -14,8 +15,6 @@ from training.rendering.view_sphere import Camera, RenderedView
 
 def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 100, 50)) -> Path:
     """Write a mesh of a box of one colour."""
-    import trimesh
-
     box = trimesh.creation.box(sides)
     box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,8 +24,6 @@ def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 1
 
 def write_meshes(directory: Path, names: Sequence[str]) -> Path:
     """Write built-in objects to PLY files with vertex colours."""
-    import trimesh
-
     directory.mkdir(exist_ok=True)
     objects = builtin_objects()
     for name in names:

@@ -8,12 +8,14 @@ import pytest
 from image_files import patches, tilted
 from refusals import assert_refused
 from scipy.stats import gmean
-from small_runs import assert_same_answers, class_probabilities, untrained_run
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG, assert_same_answers, class_probabilities, small_embedding, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model import classifier
-from thor2_jax.model.inference import Inference, answers
+from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import THOR2, Recognizer
 
@@ -123,6 +125,16 @@ def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     assert {a.classifier for a in answers if a.reason is None} == {"tops"}
     with pytest.raises(thor2.InputError, match="shape"):
         shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
+
+
+def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
+    """The run has another one."""
+    config, embedding = dataclasses.replace(SMALL_CONFIG, sigma_1=0.03), small_embedding()
+    model = Recognizer(dataclasses.replace(untrained_run(CLASSES, ("tops",), config), embedding=embedding)).model
+    clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
+    inference = infer(model, describe_looks(clouds, model.run.network, config), clouds)
+    expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
+    np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])
