@@ -21,7 +21,7 @@ from thor2_jax.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting import loop
-from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, find_run_directories
 from training.protocol import Protocol
 from training.train_run import train_run
 from training.views.normalized_views import MemoryViews
@@ -212,6 +212,13 @@ def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert not (out / "run.json").exists()
     train(out)
     assert names(out) == FINISHED
+
+
+def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
+    accuracies = {1: 0.5, 2: 0.75, 3: 0.25}
+    rows = [EpochMetrics(epoch, 1.0, 1.0, 1.0, accuracy) for epoch, accuracy in accuracies.items()]
+    outcome = module._outcome([{"classifier": "tops", **dataclasses.asdict(row)} for row in rows], {"tops": 2})
+    assert outcome["held_out_accuracy"] == {"tops": 0.75} and outcome["kept_epochs"] == {"tops": 2}
 
 
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
