@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
 from commands import files_of
@@ -99,6 +100,8 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     (tmp_path / "run" / "kept").write_text("x")
     assert_refused(f"out: {tmp_path / 'run'} already contains kept", train, tmp_path / "run")
     assert_refused(r"classifiers is \('shape',\)", train, tmp_path / "new", ("shape",))
+    monkeypatch.setattr(jax, "device_count", lambda: 3)
+    assert_refused("batch_size is 8; .*multiple of the 3 devices", train, tmp_path / "new")
     assert [p.name for p in tmp_path.rglob("*")] == ["run", "kept"]
 
 
