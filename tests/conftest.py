@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from processes import UNOPTIMIZED, end_descendants_with_this_process
+from processes import HANG, UNOPTIMIZED, end_descendants_with_this_process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -120,6 +120,15 @@ def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def x64(strict_dtype_promotion: None) -> Iterator[None]:
+    """Compute in float64; constants of the engine stay float32 and are promoted."""
+    import jax
+
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
     """Let tests without the browser call asyncio.run: the event loop of Playwright counts as running until it ends."""
@@ -134,8 +143,9 @@ def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """Headless Chromium, for the tests of the pages."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=1000 * HANG)
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("chromium is not installed (apt-get install chromium)")
@@ -144,7 +154,7 @@ def browser() -> "Iterator[Browser]":
 
 
 def _run_command(capfd: pytest.CaptureFixture[str], status: int, arguments: tuple[object, ...]) -> tuple[str, str]:
-    from helpers import run_thor2
+    from commands import run_thor2
 
     capfd.readouterr()
     assert run_thor2(*arguments) == status
@@ -180,15 +190,15 @@ def small_classifiers() -> Iterator[None]:
 
     Other processes have to be given the layers, since they do not see the change.
     """
-    import helpers
+    import small_runs
 
     from thor2_jax import networks
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "HIDDEN", (32, 16))
-        helpers._drawn.cache_clear()
+        small_runs._drawn.cache_clear()
         yield
-    helpers._drawn.cache_clear()
+    small_runs._drawn.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,8 @@
-"""Processes that tests start end with the process of the tests, even if that is killed."""
+"""Processes and programs that tests start; they end with the process of the tests, even if that is killed."""
 
 import os
+import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -72,3 +74,36 @@ def call_pickled(content: bytes) -> Any:
     """Call a function with arguments, both pickled by cloudpickle, in the process that a test started."""
     function, arguments = cloudpickle.loads(content)
     return function(*arguments)
+
+
+def free_port() -> int:
+    """Return a TCP port that no process listens on."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return int(free.getsockname()[1])
+
+
+def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess.Popen[str]:
+    """Start a Python program on the CPU, which JAX divides into some devices."""
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish_programs(*processes: subprocess.Popen[str]) -> list[str]:
+    """Wait for programs, assert that none failed, and return what each wrote to standard output."""
+    outputs = []
+    try:
+        for process in processes:
+            out, err = process.communicate(timeout=HANG)
+            assert process.returncode == 0, err[-3000:]
+            outputs.append(out)
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    return outputs

@@ -8,7 +8,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers import random_clouds, small_frame, untrained_run, write_frame_files
+from image_files import small_frame, write_frame_files
+from small_clouds import random_clouds
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers import small_frame, untrained_run, write_frame_files
+from image_files import small_frame, write_frame_files
+from refusals import assert_refused
+from small_runs import untrained_run
 
 from benchmarks import cameras
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
 from training.augmentation.simulated_cameras import CHOOSE
 from training.evaluation.answers import FrameAnswers, InstancePrediction
@@ -35,8 +36,7 @@ def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
     frames = cameras.labelled_frames(given, cameras.LOOK_ALIKES)
     assert [item.identifier for item in frames] == ["video/0", "video/1", "hots/mix_1", "hots/mix_0"]
     assert [item.truth for item in frames] == [{1: "mug"}] * 2 + [{4: "book"}] * 2
-    with pytest.raises(InputError, match="video/1"):
-        cameras.labelled_frames([tmp_path / "video", tmp_path / "video" / "1"])
+    assert_refused("video/1", cameras.labelled_frames, [tmp_path / "video", tmp_path / "video" / "1"])
 
 
 def answer(truth: str, name: str | None, confidence: float = 0.6) -> InstancePrediction:
@@ -93,10 +93,8 @@ def test_several_runs_have_a_deviation() -> None:
     assert results["original"]["accuracy"] == {"mean": 0.5, "std": pytest.approx(np.sqrt(0.5)), "runs": 2}
     assert results["original"]["steadiness"]["runs"] == 0
     assert "0.500 +- 0.707" in cameras.show(results)
-    with pytest.raises(InputError, match="TOPS2"):
-        cameras.measure([ToyRun("x"), ToyRun("y")], {"original": [frame]}, "TOPS2")
-    with pytest.raises(InputError, match="frames"):
-        cameras.measure([ToyRun("x")], {"original": [FrameAnswers("f", {}, 1.0, [])]})
+    assert_refused("TOPS2", cameras.measure, [ToyRun("x"), ToyRun("y")], {"original": [frame]}, "TOPS2")
+    assert_refused("frames", cameras.measure, [ToyRun("x")], {"original": [FrameAnswers("f", {}, 1.0, [])]})
 
 
 @pytest.mark.slow

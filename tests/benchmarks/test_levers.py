@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import write_meshes, write_scene
 from processes import UNOPTIMIZED
+from rendered_objects import write_meshes, write_scene
 
 from benchmarks import levers
 from benchmarks.levers import LEVERS, Lever

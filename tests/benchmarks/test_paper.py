@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import write_meshes, write_scene
 from processes import UNOPTIMIZED
+from rendered_objects import write_meshes, write_scene
 from safetensors.numpy import save_file
 
 from benchmarks import paper

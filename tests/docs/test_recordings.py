@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import Command, json_lines, run_thor2
 from doc_pages import ROOT, shell_commands
-from helpers import Command, json_lines, run_thor2, untrained_run
+from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run

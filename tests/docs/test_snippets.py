@@ -16,9 +16,12 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
+from commands import run_thor2
 from doc_pages import PAGES, ROOT
-from helpers import patches, random_clouds, run_thor2, tilted, untrained_run, write_frame_files
+from image_files import patches, tilted, write_frame_files
 from recording_files import table_frame
+from small_clouds import random_clouds
+from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax import capacity

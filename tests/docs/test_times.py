@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import trimesh
 from doc_pages import ROOT, shell_commands
-from helpers import write_meshes, write_scene
+from rendered_objects import write_meshes, write_scene
 
 import thor2_jax as thor2
 

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 from processes import wait_until
 from recording_files import COLOR, DEPTH, START, camera_info, image, table_frame
+from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
-from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recordings.bag_writer import DETECTION_ARRAY, detection_types, ros_message
 from thor2_jax.segmentation.segmenters import segment
@@ -71,8 +71,7 @@ def test_messages_become_detections(conversion: Any, step: int) -> None:
 def test_a_service_that_does_not_segment(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     client = LocalClient()
     monkeypatch.setattr(client, "recognize_frame", lambda **_: ([], None))
-    with pytest.raises(InputError, match="does not segment"):
-        conversion.detect(client, FRAME)
+    assert_refused("does not segment", conversion.detect, client, FRAME)
 
 
 class Node:

@@ -10,9 +10,12 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from commands import Command, frame_options, run_thor2
 from flax import nnx
-from helpers import Command, frame_options, run_thor2, small_frame, untrained_run, write_box, write_frame_files
+from image_files import small_frame, write_frame_files
 from processes import HANG
+from rendered_objects import write_box
+from small_runs import untrained_run
 
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline

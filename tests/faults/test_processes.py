@@ -4,7 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import Interrupted, brick_and_stick, files_of, stop_when
+from commands import files_of
+from failures import Interrupted, stop_when
+from refusals import assert_refused
+from small_clouds import brick_and_stick
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -51,8 +54,7 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
         if stage == "describe" and not done:
             done.append(train(out))
 
-    with pytest.raises(thor2.InputError, match="already contains"):
-        train(out, progress=quicker)
+    assert_refused("already contains", train, out, progress=quicker)
     assert load_run(out).record == done[0].record
 
     other, begun = tmp_path / "other", []

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import untrained_run
 from matplotlib.figure import Figure
 from PIL import Image
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2

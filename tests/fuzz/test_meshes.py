@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import encode_image
 from hypothesis import given
 from hypothesis import strategies as st
+from image_files import encode_image
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 

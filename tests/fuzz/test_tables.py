@@ -12,9 +12,9 @@ from unittest import mock
 import numpy as np
 import pytest
 from dataset_files import band, write_bop, write_folder, write_ocid, write_uwis
-from helpers import untrained_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2

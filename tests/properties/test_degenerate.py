@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from helpers import DEGENERATE
+from small_clouds import DEGENERATE
 
 import colornet
 import thor2_jax as thor2

@@ -2,14 +2,14 @@
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow
+from slow_tier import slow
 
 import colornet
 import thor2_jax as thor2
@@ -27,13 +27,6 @@ CONFIGS = {
 }
 COUNT, CAPACITY = 44, 48
 Loss = Callable[..., jax.Array]
-
-
-@pytest.fixture
-def x64() -> Iterator[None]:
-    """Compute in float64; constants of the engine stay float32 and are promoted."""
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        yield
 
 
 def in_cells(seed: int) -> np.ndarray:

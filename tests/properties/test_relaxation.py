@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow
+from slow_tier import slow
 
 import colornet
 import thor2_jax as thor2

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from helpers import finish_programs, start_program
 from hypothesis import given
+from processes import finish_programs, start_program
 
 import colornet
 import thor2_jax as thor2
@@ -30,7 +30,8 @@ from pathlib import Path
 import numpy as np
 from flax import nnx
 sys.path.append(sys.argv[1])
-from helpers import SMALL_CONFIG, brick_and_stick
+from small_clouds import brick_and_stick
+from small_runs import SMALL_CONFIG
 import colornet, thor2_jax as thor2
 from training.fitting.loop import FitOptions
 from training.train_run import train_run

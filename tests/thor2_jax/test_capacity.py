@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 import pytest
+from refusals import assert_refused
 
-from thor2_jax import InputError
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 
 
@@ -21,5 +21,4 @@ def test_buckets_double() -> None:
 
 @pytest.mark.parametrize(("pick", "name", "n"), [(point_bucket, "n_points", 8193), (batch_bucket, "n_clouds", 257)])
 def test_sizes_beyond_the_largest_bucket_are_refused(pick: Callable[[int], int], name: str, n: int) -> None:
-    with pytest.raises(InputError, match=rf"^{name} is {n}\b.*\b{n - 1}\b"):
-        pick(n)
+    assert_refused(rf"^{name} is {n}\b.*\b{n - 1}\b", pick, n)

@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 import pytest
-from helpers import input_error
+from refusals import assert_refused
 
 from thor2_jax import DescriptorConfig, InputError, Relaxation
 
@@ -44,8 +44,7 @@ INVALID = [
 
 @pytest.mark.parametrize(("record", "name", "value"), INVALID, ids=lambda value: str(value)[:40])
 def test_invalid_values_are_rejected_by_name(record: type, name: str, value: object) -> None:
-    with input_error(f"{record.__name__}.{name}", repr(value)):
-        record(**{name: value})
+    assert_refused(rf"{record.__name__}\.{name}.*{re.escape(repr(value))}", record, **{name: value})
 
 
 @pytest.mark.parametrize(
@@ -57,8 +56,7 @@ def test_invalid_values_are_rejected_by_name(record: type, name: str, value: obj
     ],
 )
 def test_released_convention_fixes_the_widths_and_borders(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        DescriptorConfig.released(**change)
+    assert_refused(message, DescriptorConfig.released, **change)
 
 
 def test_relaxed_configs_are_hashable_and_differ() -> None:

@@ -1,13 +1,12 @@
 """Messages for packages that are missing."""
 
 import pytest
-from helpers import input_error
 
-from thor2_jax.errors import needs_extra
+from thor2_jax.errors import InputError, needs_extra
 
 
 def test_only_foreign_packages_need_an_extra() -> None:
-    with input_error("serve needs FastAPI", "fastapi"), needs_extra("serve", "FastAPI", "serve"):
+    with pytest.raises(InputError, match="serve needs FastAPI.*fastapi"), needs_extra("serve", "FastAPI", "serve"):
         raise ModuleNotFoundError("No module named 'fastapi'", name="fastapi")
     with pytest.raises(ModuleNotFoundError), needs_extra("serve", "FastAPI", "serve"):
         raise ModuleNotFoundError("No module named 'thor2_jax.none'", name="thor2_jax.none")

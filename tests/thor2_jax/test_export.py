@@ -8,7 +8,8 @@ from pathlib import Path
 import jax.export
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, class_probabilities, untrained_embedding_run
+from refusals import assert_refused
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
@@ -91,5 +92,4 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     ],
 )
 def test_invalid_sizes_and_platforms_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
-    with pytest.raises(thor2.InputError, match=expected):
-        export_recognizer(run, **{"n_points": 512, "n_clouds": 1, **options})
+    assert_refused(expected, export_recognizer, run, **{"n_points": 512, "n_clouds": 1, **options})

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from processes import HANG
+from refusals import assert_refused
 
 from thor2_jax import files
-from thor2_jax.errors import InputError
 from thor2_jax.files import (
     atomic_directory,
     atomic_write,
@@ -62,12 +62,10 @@ def test_a_new_or_empty_directory_is_accepted(tmp_path: Path) -> None:
 def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     for name in ("partial", ".lock", "marker"):
         (tmp_path / name).touch()
-        with pytest.raises(InputError, match=f"out: {tmp_path} already contains"):
-            check_output_directory(tmp_path)
+        assert_refused(f"out: {tmp_path} already contains", check_output_directory, tmp_path)
         if name != "marker":
             check_output_directory(tmp_path, "marker", ("partial",))
-    with pytest.raises(InputError, match=f"out: {tmp_path} already contains marker"):
-        check_output_directory(tmp_path, "other", ("partial",))
+    assert_refused(f"out: {tmp_path} already contains marker", check_output_directory, tmp_path, "other", ("partial",))
     check_output_directory(tmp_path, "marker")
 
 
@@ -80,11 +78,9 @@ def test_files_broken_links_and_unwritable_directories_are_refused(
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to(tmp_path / "absent")
     for name in ("file", "file/below", "link"):
-        with pytest.raises(InputError, match=f"out: {tmp_path / name} "):
-            check_output_directory(tmp_path / name, "marker")
+        assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
     monkeypatch.setattr("tempfile.TemporaryFile", fail)
-    with pytest.raises(InputError, match=f"out: {tmp_path / 'new' / 'deep'} .*Read-only"):
-        check_output_directory(tmp_path / "new" / "deep")
+    assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*Read-only", check_output_directory, tmp_path / "new" / "deep")
 
 
 def test_digests_are_those_of_earlier_versions() -> None:
@@ -149,7 +145,7 @@ def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> No
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory, elsewhere = tmp_path / "views", tmp_path / "elsewhere"
-    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/0.npz"):
+    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz"):
         write_below(directory / name)
     write_below(elsewhere / "0.npz")
     (directory / "link").symlink_to(elsewhere)
@@ -162,6 +158,9 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     remove_written(directory)
     remove_written(tmp_path / "missing")
     assert not directory.exists()
+    directory.symlink_to(elsewhere)
+    remove_written(directory, r"0\.npz")
+    assert directory.is_symlink() and elsewhere.is_dir() and not list(elsewhere.iterdir())
 
 
 def write_below(path: Path) -> None:

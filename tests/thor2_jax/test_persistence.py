@@ -1,7 +1,6 @@
 """Diagrams of functions on lines against gudhi, images against persim, gradients against differences of both."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import gudhi
@@ -9,16 +8,11 @@ import jax
 import numpy as np
 import persim
 import pytest
-from helpers import slow
+from refusals import assert_refused
+from slow_tier import slow
 
 import thor2_jax as thor2
 from thor2_jax import persistence
-
-
-@pytest.fixture
-def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield
 
 
 def gudhi_pairs(heights: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
@@ -170,8 +164,7 @@ def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> 
     ],
 )
 def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
-    with pytest.raises(thor2.InputError, match=f"^{name} is [^\n]*$"):
-        persistence.sublevel_diagrams(heights, edges)
+    assert_refused(f"^{name} is [^\n]*$", persistence.sublevel_diagrams, heights, edges)
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,17 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import assert_same_answers, class_probabilities, patches, tilted, untrained_run
+from image_files import patches, tilted
+from refusals import assert_refused
 from scipy.stats import gmean
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG, assert_same_answers, class_probabilities, small_embedding, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model import classifier
-from thor2_jax.model.inference import Inference, answers
+from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import THOR2, Recognizer
 
@@ -79,8 +83,7 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
             assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
             assert dataclasses.replace(answer, name=named.name, reason=None) == named
     for value in (-0.1, 1.5, float("nan")):
-        with pytest.raises(thor2.InputError, match=f"unknown_below is {value}"):
-            Recognizer(run, value)
+        assert_refused(f"unknown_below is {value}", Recognizer, run, value)
 
 
 def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:
@@ -117,12 +120,21 @@ def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> No
 
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     shape_only = Recognizer(dataclasses.replace(run, classifiers={"tops": run.classifiers["tops"]}))
-    with pytest.raises(thor2.InputError, match="'tops2'.*expected one or more of tops$"):
-        shape_only.recognize(tilted(patches()), classifiers=THOR2)
+    assert_refused("'tops2'.*expected one or more of tops$", shape_only.recognize, tilted(patches()), classifiers=THOR2)
     answers = shape_only.recognize(tilted(patches()))
     assert {a.classifier for a in answers if a.reason is None} == {"tops"}
     with pytest.raises(thor2.InputError, match="shape"):
         shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
+
+
+def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
+    """The run has another one."""
+    config, embedding = dataclasses.replace(SMALL_CONFIG, sigma_1=0.03), small_embedding()
+    model = Recognizer(dataclasses.replace(untrained_run(CLASSES, ("tops",), config), embedding=embedding)).model
+    clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
+    inference = infer(model, describe_looks(clouds, model.run.network, config), clouds)
+    expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
+    np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import SMALL_CONFIG, random_clouds
 from sklearn.base import clone
 from sklearn.utils import estimator_checks
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2

@@ -3,12 +3,14 @@
 import dataclasses
 import importlib
 import pkgutil
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import input_error, random_clouds
+from refusals import assert_refused
+from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -92,7 +94,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
-        ({"capacity": 2}, ["at most 2, the capacity", "clouds[0]", "3"]),
+        ({"capacity": 2}, ["clouds[0]", "3", "at most 2, the capacity"]),
         ({"capacity": 0}, ["capacity is 0"]),
         ({"capacity": 8.0}, ["capacity is 8.0"]),
         ({"clouds": [(np.zeros((8193, 3)), np.zeros((8193, 3)))]}, ["clouds[0]", "8193", "8192"]),
@@ -107,8 +109,8 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
-    with input_error(*expected):
-        thor2.PointClouds.pack(**{"clouds": [(POINTS, COLORS)], **arguments})
+    given = {"clouds": [(POINTS, COLORS)], **arguments}
+    assert_refused(".*".join(map(re.escape, expected)), thor2.PointClouds.pack, **given)
 
 
 def test_layout_of_the_flat_descriptors() -> None:

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import random_classifier, write_box
 from matplotlib.figure import Figure
 from PIL import Image
+from rendered_objects import write_box
+from small_runs import random_classifier
 
 from thor2_jax import figures
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References

@@ -8,7 +8,10 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, Interrupted, assert_refused, brick_and_stick, stop_when
+from failures import Interrupted, stop_when
+from refusals import assert_refused
+from small_clouds import brick_and_stick
+from small_runs import SMALL_CONFIG
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError

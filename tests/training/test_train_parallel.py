@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import finish_programs, free_port, json_lines, start_program
+from commands import json_lines
+from processes import finish_programs, free_port, start_program
 
 _PROGRAM = """
 import sys

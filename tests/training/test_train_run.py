@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
-from helpers import Interrupted, assert_refused, brick_and_stick, files_of, full_disk, random_clouds, stop_when
+from commands import files_of
+from failures import Interrupted, full_disk, stop_when
 from PIL import Image
+from refusals import assert_refused
+from small_clouds import brick_and_stick, random_clouds
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -18,7 +22,7 @@ from thor2_jax.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting import loop
-from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, find_run_directories
 from training.protocol import Protocol
 from training.train_run import train_run
 from training.views.normalized_views import MemoryViews
@@ -96,6 +100,8 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     (tmp_path / "run" / "kept").write_text("x")
     assert_refused(f"out: {tmp_path / 'run'} already contains kept", train, tmp_path / "run")
     assert_refused(r"classifiers is \('shape',\)", train, tmp_path / "new", ("shape",))
+    monkeypatch.setattr(jax, "device_count", lambda: 3)
+    assert_refused("batch_size is 8; .*multiple of the 3 devices", train, tmp_path / "new")
     assert [p.name for p in tmp_path.rglob("*")] == ["run", "kept"]
 
 
@@ -209,6 +215,13 @@ def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert not (out / "run.json").exists()
     train(out)
     assert names(out) == FINISHED
+
+
+def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
+    accuracies = {1: 0.5, 2: 0.75, 3: 0.25}
+    rows = [EpochMetrics(epoch, 1.0, 1.0, 1.0, accuracy) for epoch, accuracy in accuracies.items()]
+    outcome = module._outcome([{"classifier": "tops", **dataclasses.asdict(row)} for row in rows], {"tops": 2})
+    assert outcome["held_out_accuracy"] == {"tops": 0.75} and outcome["kept_epochs"] == {"tops": 2}
 
 
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Tables of training views, by classifiers with random weights."""
 
 import numpy as np
-from helpers import assert_refused, untrained_run
+from refusals import assert_refused
+from small_runs import untrained_run
 
 from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects

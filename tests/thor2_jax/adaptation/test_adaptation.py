@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import class_probabilities, slow, untrained_embedding_run, untrained_run
+from image_files import frame_of_squares
+from refusals import assert_refused
 from scipy.stats import entropy as scipy_entropy
+from slow_tier import slow
+from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.adaptation.estimate import (
@@ -58,8 +61,7 @@ def test_a_transform_follows_its_formula() -> None:
 
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
 def test_a_damaged_transform_is_refused(stored: object) -> None:
-    with pytest.raises(thor2.InputError, match="color_transform"):
-        Recognizer(dataclasses.replace(run(), record={"color_transform": stored}))
+    assert_refused("color_transform", Recognizer, dataclasses.replace(run(), record={"color_transform": stored}))
 
 
 def test_entropy_counts_what_the_classes_lack() -> None:
@@ -116,23 +118,18 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
 def test_too_few_instances_are_refused_with_their_number() -> None:
     unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
-    with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
-        estimate_transform(few, none_is_known)
+    assert_refused(f"9 usable instances; expected at least {MIN_INSTANCES}", estimate_transform, few, none_is_known)
 
 
 def test_instances_are_spread_evenly() -> None:
     assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
-def frame(seed: int, size: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:
+def frame(seed: int, shape: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:
     """Return a frame of five squares of one colour each."""
-    rng = np.random.default_rng(seed)
-    color, labels = np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
-    depth = np.full(size, 900, np.uint16)
-    for label in range(1, 6):
-        here = slice(10 + 15 * (label % 3), 50 + 15 * (label % 3)), slice(30 * label - 28, 30 * label - 3)
-        color[here], labels[here], depth[here] = rng.integers(0, 256, 3), label, 700
-    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 79.5, 59.5))
+    colors = np.random.default_rng(seed).integers(0, 256, (5, 3))
+    squares = {k: (10 + 15 * (k % 3), 30 * k - 28, colors[k - 1]) for k in range(1, 6)}
+    return frame_of_squares(squares, 25, shape)
 
 
 def test_an_adapted_recognizer_sees_corrected_colors() -> None:
@@ -151,8 +148,7 @@ def test_frames_of_another_size_or_too_few_change_nothing() -> None:
     recognizer = Recognizer(run())
     with pytest.raises(thor2.InputError, match=r"frames\[1\] has 160 x 110 pixels; expected 160 x 120"):
         recognizer.adapt([frame(0), frame(1, (110, 160)), frame(2)])
-    with pytest.raises(thor2.InputError, match="5 usable instances"):
-        recognizer.adapt([frame(0)])
+    assert_refused("5 usable instances", recognizer.adapt, [frame(0)])
     assert recognizer.model.color_transform is None
 
 

@@ -5,9 +5,9 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from helpers import DEGENERATE
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from small_clouds import DEGENERATE
 
 from thor2_jax.descriptor.bounding_box import _minimum_area_angle, argmax, minimal_box, support_points
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import random_clouds
+from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2

@@ -9,29 +9,22 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, aligned_cloud, slow
-from scipy.spatial.transform import Rotation
+from refusals import assert_refused
+from slow_tier import slow
+from small_clouds import aligned_cloud, random_clouds
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor import describe
+from thor2_jax.types import Cloud
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
-Cloud = tuple[np.ndarray, np.ndarray]
-
-
-def camera_cloud(seed: int, n: int = 900) -> Cloud:
-    """Return an asymmetric cloud in front of the camera, in metres, and its colours."""
-    rng = np.random.default_rng(seed)
-    points = rng.random((n, 3)) * [0.2, 0.11, 0.05]
-    points = points[points[:, 0] / 0.2 + points[:, 1] / 0.11 < 1.5]
-    points = points @ Rotation.random(random_state=seed).as_matrix().T + [0.02, -0.05, 0.5]
-    return points.astype(np.float32), rng.integers(0, 256, points.shape, dtype=np.uint8)
 
 
 def test_describe_equals_its_steps() -> None:
-    clouds = thor2.PointClouds.pack([camera_cloud(k) for k in range(3)])
+    clouds = thor2.PointClouds.pack(random_clouds(0, [900] * 3))
     whole = thor2.describe(clouds, NETWORK, CLOSED)
     aligned = thor2.align(clouds, CLOSED)
     for by_steps in (
@@ -72,10 +65,8 @@ def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
             (one, r"points \[512, 3\]"),
             (batches, r"points \[1, 1, 512, 3\]"),
         ):
-            with pytest.raises(thor2.InputError, match=words):
-                function(clouds, NETWORK, CLOSED)
-    with pytest.raises(thor2.InputError, match="clouds is list"):
-        thor2.diagrams([], CLOSED)
+            assert_refused(words, function, clouds, NETWORK, CLOSED)
+    assert_refused("clouds is list", thor2.diagrams, [], CLOSED)
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
@@ -131,18 +122,15 @@ def test_results_of_chunks_are_those_of_the_whole_batch(count: int) -> None:
     np.testing.assert_array_equal(results["points"], clouds.points)
 
 
-def stream(count: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        n = int(rng.integers(1, 300))
-        yield rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), dtype=np.uint8)
+def stream(count: int) -> list[Cloud]:
+    return random_clouds(0, np.random.default_rng(0).integers(1, 300, count))
 
 
 @pytest.mark.parametrize("count", [8, *slow(1, 4, 9)])
 def test_a_stream_against_one_batch(count: int) -> None:
     batches = list(describe.describe_stream(stream(count), NETWORK, CLOSED, capacity=512, batch=4))
     assert [len(p.overflow) for p in batches] == [4] * (count // 4) + ([count % 4] if count % 4 else [])
-    whole = thor2.describe(thor2.PointClouds.pack(list(stream(count)), 512), NETWORK, CLOSED)
+    whole = thor2.describe(thor2.PointClouds.pack(stream(count), 512), NETWORK, CLOSED)
     np.testing.assert_allclose(np.concatenate([p.tops2 for p in batches]), whole.tops2, atol=1e-5)
     np.testing.assert_array_equal(np.concatenate([p.overflow for p in batches]), whole.overflow)
 
@@ -150,7 +138,7 @@ def test_a_stream_against_one_batch(count: int) -> None:
 def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
     read = 0
 
-    def counted() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def counted() -> Iterator[Cloud]:
         nonlocal read
         for cloud in stream(40):
             read += 1
@@ -164,8 +152,6 @@ def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
 
 
 def test_bad_input_of_a_stream() -> None:
-    with pytest.raises(thor2.InputError, match="batch is 0"):
-        describe.describe_stream(stream(2), NETWORK, CLOSED, batch=0)
+    assert_refused("batch is 0", describe.describe_stream, stream(2), NETWORK, CLOSED, batch=0)
     bad = [*stream(2), (np.full((3, 3), np.nan), np.zeros((3, 3), np.uint8))]
-    with pytest.raises(thor2.InputError, match="2"):
-        list(describe.describe_stream(bad, NETWORK, CLOSED, capacity=512, batch=4))
+    assert_refused("2", list, describe.describe_stream(bad, NETWORK, CLOSED, capacity=512, batch=4))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 import colornet
 import thor2_jax as thor2
@@ -102,10 +103,8 @@ def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
 
 @pytest.mark.parametrize("count", [0, 3, 5])
 def test_other_counts_are_refused(count: int) -> None:
-    with pytest.raises(thor2.InputError, match=f"count is {count}"):
-        aligned_looks(PACKED, CONFIG, count)
-    with pytest.raises(thor2.InputError, match=f"count is {count}"):
-        describe_looks(PACKED, NETWORK, CONFIG, count)
+    assert_refused(f"count is {count}", aligned_looks, PACKED, CONFIG, count)
+    assert_refused(f"count is {count}", describe_looks, PACKED, NETWORK, CONFIG, count)
 
 
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])

@@ -1,4 +1,4 @@
-"""Diagrams of both backends against one gudhi tree for each slice; images against persim and integrated Gaussians."""
+"""Diagrams of both backends against one gudhi tree for each slice; images against persim and Gaussians."""
 
 import dataclasses
 
@@ -8,18 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import persim
 import pytest
-from scipy.special import ndtr
+from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.persistence import diagrams_of_strips, persistence_images
+from thor2_jax.testing.values import cells, pixel_masses
 
 GUDHI, CLOSED = thor2.DescriptorConfig(), thor2.DescriptorConfig(homology="closed_form")
 
 
 def plain_pairs(points: np.ndarray) -> list[np.ndarray]:
     """Return the finite H0 pairs of each slice, [k, 2] sorted: each strip is two vertices and an edge of a complex."""
-    i, j = np.floor(points[:, 2] / 0.1).astype(int), np.floor(points[:, 0] / 0.025).astype(int)
+    i, j = cells(points, GUDHI)
     slices = []
     for a in range(7):
         tree = gudhi.SimplexTree()
@@ -35,22 +36,13 @@ def plain_pairs(points: np.ndarray) -> list[np.ndarray]:
     return slices
 
 
-def random_cloud(rng: np.random.Generator, n: int) -> np.ndarray:
-    points = (rng.random((n, 3)) * rng.uniform(0.1, 1, 3) * [0.77, 0.7, 0.69]).astype(np.float32)
-    for axis, width in ((0, 0.025), (2, 0.1)):
-        border = np.round(points[:, axis] / width) * width
-        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
-    return points
-
-
 def pack(clouds: list[np.ndarray], capacity: int | None = None) -> thor2.PointClouds:
     return thor2.PointClouds.pack([(points, np.zeros(points.shape)) for points in clouds], capacity)
 
 
 @pytest.mark.parametrize("config", [GUDHI, CLOSED], ids=["gudhi", "closed_form"])
 def test_pairs_against_one_tree_per_slice(config: thor2.DescriptorConfig) -> None:
-    rng = np.random.default_rng(0)
-    clouds = [random_cloud(rng, n) for n in (0, 1, 2, 3, 50, 333, 512, 511)]
+    clouds = [aligned_cloud(k, n)[0] for k, n in enumerate((0, 1, 2, 3, 50, 333, 512, 511))]
     diagrams = thor2.diagrams(pack(clouds), config)
     assert diagrams.births.shape == diagrams.deaths.shape == diagrams.mask.shape == (8, 7, 31)
     assert diagrams.births.dtype == diagrams.deaths.dtype == jnp.float32
@@ -64,8 +56,8 @@ def test_pairs_against_one_tree_per_slice(config: thor2.DescriptorConfig) -> Non
 
 
 def test_one_callback_per_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, trees, make = np.random.default_rng(1), [], gudhi.SimplexTree
-    strips = thor2.strips(pack([random_cloud(rng, 50) for _ in range(5)]), colornet.load_default(), GUDHI)
+    trees, make = [], gudhi.SimplexTree
+    strips = thor2.strips(pack([aligned_cloud(k, 50)[0] for k in range(5)]), colornet.load_default(), GUDHI)
     monkeypatch.setattr(gudhi, "SimplexTree", lambda: trees.append(1) or make())
     jax.block_until_ready(jax.vmap(lambda each: diagrams_of_strips(each, GUDHI))(strips))
     assert len(trees) == 1
@@ -106,15 +98,6 @@ def random_pairs(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     return births, births + rng.random(n) * 0.8
 
 
-def expected_image(
-    births: np.ndarray, deaths: np.ndarray, size: int = 32, variance: float = 0.00025, exponent: float = 1.0
-) -> np.ndarray:
-    """Return the image by normal distributions in float64."""
-    edges, persistence = (np.arange(size + 1) - 1) * 0.025, deaths - births
-    across, up = (np.diff(ndtr((edges - centre[:, None]) / np.sqrt(variance))) for centre in (births, persistence))
-    return np.einsum("kp,kq,k->pq", across, up, persistence**exponent)
-
-
 @pytest.mark.parametrize("n", [1, 2, 7, 31])
 def test_against_persim(n: int) -> None:
     births, deaths = random_pairs(n, n)
@@ -129,7 +112,8 @@ def test_against_persim(n: int) -> None:
 @pytest.mark.parametrize("variance", [0.00025, 0.001])
 def test_sizes_weights_and_variances(size: int, exponent: float, variance: float) -> None:
     births, deaths = random_pairs(4, 9)
-    expected = expected_image(births, deaths, size, variance, exponent)
-    sized = dataclasses.replace(GUDHI, image_size=size)
-    image = persistence_images(diagram(births, deaths), sized, variance, exponent)
-    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), atol=TOLERANCE)
+    config = dataclasses.replace(GUDHI, image_size=size, image_variance=variance)
+    across, up = (pixel_masses(centres, config) for centres in (births, deaths - births))
+    expected = np.einsum("kp,kq,k->pq", across, up, (deaths - births) ** exponent)
+    image = persistence_images(diagram(births, deaths), config, variance, exponent)
+    np.testing.assert_allclose(image, expected, atol=TOLERANCE)

@@ -7,8 +7,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, aligned_cloud, finish_programs, free_port, start_program
 from jax.sharding import Mesh
+from processes import finish_programs, free_port, start_program
+from refusals import assert_refused
+from small_clouds import aligned_cloud
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
@@ -69,10 +72,8 @@ def test_each_device_describes_its_clouds(monkeypatch: pytest.MonkeyPatch) -> No
     turned, clouds = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)
     np.testing.assert_allclose(turned, packed.points * config.alpha)
     jax.tree.map(np.testing.assert_array_equal, clouds, packed)
-    with pytest.raises(thor2.InputError, match="shard_clouds"):
-        describe_sharded(packed, network, config)
-    with pytest.raises(thor2.InputError, match="multiple of 2"):
-        shard_clouds(packed, Mesh(np.array(jax.devices() * 2), ("batch",)))
+    assert_refused("shard_clouds", describe_sharded, packed, network, config)
+    assert_refused("multiple of 2", shard_clouds, packed, Mesh(np.array(jax.devices() * 2), ("batch",)))
 
 
 @pytest.mark.slow

@@ -5,11 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import aligned_cloud, as_8_bit
+from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import color_sets, region_sets, slices_and_strips
+from thor2_jax.testing.values import cells
 
 NETWORK = colornet.load_default()
 PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
@@ -22,18 +23,8 @@ def released_indices(points: np.ndarray, mask: np.ndarray) -> tuple[jax.Array, j
     return slices_and_strips(points[:, 0], points[:, 2], mask, RELEASED)
 
 
-def paper_rule(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.floor(points[:, 2] / 0.1).astype(int), np.floor(points[:, 0] / 0.025).astype(int)
-
-
-def released_rule(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    levels = np.round(points[:, 2], 1)
-    slices = np.searchsorted(np.unique(levels), levels)
-    return slices, np.digitize(np.round(points[:, 0], 2), np.arange(0, 0.775, 0.025), right=True)
-
-
-def expected_strips(points: np.ndarray, rgb: np.ndarray, released: bool) -> dict[str, np.ndarray]:
-    i, j = (released_rule if released else paper_rule)(points)
+def expected_strips(points: np.ndarray, rgb: np.ndarray, config: thor2.DescriptorConfig) -> dict[str, np.ndarray]:
+    released, (i, j) = config.convention == "released", cells(points, config)
     y = np.round(points[:, 1], 2) if released else points[:, 1]
     weights = NETWORK.membership(rgb).astype(np.float64)
     out = {name: np.zeros((7, 31)) for name in ("low", "high")}
@@ -64,7 +55,7 @@ def test_strips_against_numpy(
     clouds = [aligned_cloud(k, n, extent) for k, n in enumerate(sizes)]
     strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, (points, rgb) in enumerate(clouds):
-        expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
+        expected = expected_strips(points.astype(np.float64), rgb, config)
         for field in dataclasses.fields(strips):
             actual = np.asarray(getattr(strips, field.name)[b])
             np.testing.assert_allclose(actual, expected[field.name], atol=1e-5, err_msg=f"{b} {field.name}")
@@ -80,7 +71,7 @@ def test_the_released_rounding_at_every_half() -> None:
         points = np.zeros((3 * len(values), 3), np.float32)
         points[:, column] = np.maximum(np.concatenate(near), 0)
         indices = released_indices(points, np.ones(len(points), bool))
-        slices, strips = released_rule(points.astype(np.float64))
+        slices, strips = cells(points, RELEASED)
         np.testing.assert_array_equal(indices[0], slices)
         np.testing.assert_array_equal(np.minimum(indices[1], 31), strips)
 
@@ -96,6 +87,11 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     for far, number in ((1.3, 1), (1.4, 14)):
         i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
+
+
+def as_8_bit(colors: np.ndarray) -> np.ndarray:
+    """Round colours in [0, 1], float32, to the nearest of 256 levels, halves up."""
+    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 def weights(colors: np.ndarray) -> np.ndarray:

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, class_probabilities, slow, untrained_embedding_run, untrained_run
+from refusals import assert_refused
 from scipy.special import logit
+from slow_tier import slow
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
 
 import colornet
 import thor2_jax as thor2
@@ -329,10 +331,7 @@ def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
 
 def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
     for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be used: ")):
-        with pytest.raises(thor2.InputError, match=match):
-            explain(recognizer, frame, label)
-    with pytest.raises(thor2.InputError, match="no object"):
-        explain(Recognizer(untrained_run((), features=())), frame, 3)
+        assert_refused(match, explain, recognizer, frame, label)
+    assert_refused("no object", explain, Recognizer(untrained_run((), features=())), frame, 3)
     released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
-    with pytest.raises(thor2.InputError, match="convention"):
-        explain(Recognizer(untrained_run(CLASSES, config=released)), frame, 3)
+    assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), frame, 3)

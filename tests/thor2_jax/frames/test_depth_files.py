@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import Pickled
+from failures import Pickled
 from PIL import Image
 
 from thor2_jax.errors import InputError

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import deep_png, input_error
+from image_files import deep_png
 from PIL import Image
+from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import (
@@ -187,8 +188,7 @@ def test_damaged_images(files: dict[str, Path], name: str) -> None:
     flipped = raw[:45] + bytes([raw[45] ^ 0xFF]) + raw[46:]
     for content in (b"", b"not an image", raw[:20], raw[: len(raw) // 2], flipped):
         files[name].write_bytes(content)
-        with input_error(f"{name}: {files[name]} ", match=f"^{name}: "):
-            read_frame(**files)
+        assert_refused(f"^{name}: {files[name]} ", read_frame, **files)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import re
 import types
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import Pickled, input_error
+from failures import Pickled
+from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import (
@@ -184,8 +186,8 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
 )
 def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
     (tmp_path / "k").write_bytes(text.encode("latin-1"))
-    with input_error(expected, tmp_path / "k", match=r"^.{,1009}$"):
-        read_intrinsics(tmp_path / "k")
+    path = tmp_path / "k"
+    assert_refused(f"^(?=.{{,1009}}$).*{path}.*{re.escape(expected)}", read_intrinsics, path)
 
 
 def test_invalid_npy_files() -> None:

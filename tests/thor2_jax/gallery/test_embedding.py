@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import scipy.special
-from helpers import SMALL_CONFIG, random_clouds
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks

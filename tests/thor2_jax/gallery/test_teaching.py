@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import small_embedding, untrained_run
+from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from helpers import untrained_embedding_run, untrained_run
 from scipy.stats import gmean
+from small_runs import untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.fusion import (

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
-from helpers import class_probabilities, full_disk, untrained_embedding_run, untrained_run
+from failures import full_disk
+from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import colornet
 import thor2_jax as thor2

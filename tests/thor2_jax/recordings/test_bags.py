@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import recording_files as files
-from helpers import assert_refused
 from recording_files import COLOR, START, bag_writer, image, table_frame, write_recording
+from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError

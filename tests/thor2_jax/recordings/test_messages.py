@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import assert_refused, encode_image
+from image_files import encode_image
 from recording_files import compressed, compressed_depth, image
+from refusals import assert_refused
 
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import assert_refused
+from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.realsense import RealSenseCamera

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import assert_refused
 from recording_files import table_frame
+from refusals import assert_refused
 
 from thor2_jax.model.recognition import Recognition, detections_of
 from thor2_jax.recordings.rerun_file import RerunFile

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import slow
 from segmentation_scenes import Box, best_overlaps, render
+from slow_tier import slow
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.table import _refined, _trimmed, segment_table

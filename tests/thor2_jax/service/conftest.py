@@ -20,8 +20,8 @@ import pytest
 import schemathesis
 import uvicorn
 from fastapi import FastAPI
-from helpers import encode_image, patches, small_embedding, tilted, untrained_run
 from hypothesis import HealthCheck
+from image_files import encode_image, patches, tilted
 from playwright.sync_api import Browser, Page, Route, expect
 from processes import HANG, wait_until
 from schemathesis.checks import not_a_server_error
@@ -31,14 +31,13 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 from segmentation_scenes import Box, render
+from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
-
-expect.set_options(timeout=1000 * HANG)
 
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
@@ -199,7 +198,7 @@ def assert_conforms(document: Any, path: str, method: str, examples: int) -> Non
     @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
     @hypothesis.given(case=document[path][method].as_strategy())
     def call(case: schemathesis.Case) -> None:
-        case.call_and_validate(checks=CHECKS)
+        case.call_and_validate(checks=CHECKS, timeout=HANG)
 
     call()
 

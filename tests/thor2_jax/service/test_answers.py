@@ -8,8 +8,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import assert_refused, assert_same_answers, encode_image, random_clouds
+from image_files import encode_image
+from refusals import assert_refused
 from service_requests import check_refused
+from small_clouds import random_clouds
+from small_runs import assert_same_answers
 
 import colornet
 import thor2_jax as thor2

@@ -8,7 +8,8 @@ from unittest.mock import create_autospec
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, assert_same_answers, slow, small_embedding, untrained_embedding_run, untrained_run
+from slow_tier import slow
+from small_runs import SMALL_CONFIG, assert_same_answers, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax import capacity

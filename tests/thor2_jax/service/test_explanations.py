@@ -13,12 +13,13 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import encode_image, untrained_run
+from image_files import encode_image
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
 from service_requests import check_refused
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2
@@ -142,7 +143,7 @@ def test_why_is_503_until_explanations_are_compiled(
     service, is_compiled, compiled = teaching_app.state.service, threading.Event(), []
 
     def compile_explanations(_: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
-        assert is_compiled.wait(300) and not is_stopped()
+        assert is_compiled.wait(HANG) and not is_stopped()
         compiled.append((n_points, by_classifiers))
         raise InputError("the error is left to requests, which compile what is missing")
 
@@ -153,9 +154,9 @@ def test_why_is_503_until_explanations_are_compiled(
         response = ask(teaching_url, files, 3)
         check_refused(response, 503, None, "compiled")
         assert int(response.headers["retry-after"]) >= 1
-    assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=60).status_code == 200
+    assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=HANG).status_code == 200
     is_compiled.set()
-    next(iter(service._compiled.values())).result(300)
+    next(iter(service._compiled.values())).result(HANG)
     check_refused(ask(teaching_url, files, 3), 422, "instance", "is explained")
     assert compiled == service.engine.explanation_programs()
 
@@ -167,7 +168,7 @@ def test_why_returns_pictures(
     """Almost all programs of an explanation are compiled before the first one."""
     monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     service = teaching_app.state.service
-    service._compile_explanations(*service.engine.explanation_programs()).result(600)
+    service._compile_explanations(*service.engine.explanation_programs()).result(HANG)
     before = service.metrics.compilations._value.get()
     answer = ask(teaching_url, files, 3).json()
     assert service.metrics.compilations._value.get() - before < 30  # of about 290

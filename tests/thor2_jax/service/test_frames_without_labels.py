@@ -6,7 +6,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import assert_refused
+from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.client import Client

@@ -14,8 +14,9 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from failures import Pickled
 from fastapi import FastAPI
-from helpers import Pickled, deep_png, encode_image, png_file, with_checksums
+from image_files import deep_png, encode_image, png_file, with_checksums
 from PIL.PngImagePlugin import PngInfo
 from processes import HANG
 from service_requests import check_refused

@@ -1,6 +1,6 @@
 """Addresses and values of the header Host that a local server accepts."""
 
-from helpers import assert_refused
+from refusals import assert_refused
 
 from thor2_jax.service.hosts import check_host_names, is_allowed_host, listening
 

@@ -13,8 +13,8 @@ from typing import Any
 import httpx
 import pytest
 import schemathesis
-from helpers import slow
 from processes import HANG, wait_until
+from slow_tier import slow
 
 from .conftest import assert_conforms
 
@@ -86,7 +86,7 @@ def test_ready_workers_share_a_port_and_end_with_their_parent(start_server: Call
     wait_until(lambda: count("ready: ") == 2, server.log.read_text)
     assert readiness() == {"status": "ready", "ready_workers": 2, "workers": 2}
     assert send_many(server.url, files, 60, 8) == {200: 60}
-    metrics = httpx.get(f"{server.url}/metrics").text.splitlines()
+    metrics = httpx.get(f"{server.url}/metrics", timeout=HANG).text.splitlines()
     assert 'thor2_requests_total{path="/v1/recognize",status="200"} 60.0' in metrics
     assert "thor2_compilations_after_warm_up_total 0.0" in metrics
     workers = re.findall(r"Started server process \[(\d+)\]", server.log.read_text())

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import encode_image
+from image_files import encode_image
 from page_actions import FIELDS, answered, assert_fits, changed_answers, upload, wait_for_answer, wait_until
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect

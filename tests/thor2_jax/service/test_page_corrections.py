@@ -10,6 +10,7 @@ import pytest
 from page_actions import answered, assert_fits, changed_answers, upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
+from processes import HANG
 
 import thor2_jax as thor2
 from thor2_jax.segmentation.table import segment_table
@@ -114,7 +115,7 @@ def test_labels_are_required_where_the_service_does_not_segment(open_page: Open,
 def open_teaching(open_page: Open, teaching_url: str) -> Iterator[Open]:
     """Open the page of a service that has no objects enrolled; afterwards, forget what was enrolled."""
     yield lambda *arguments, **options: open_page(*arguments, url=teaching_url, **options)
-    for each in httpx.get(f"{teaching_url}/v1/objects").json()["objects"]:
+    for each in httpx.get(f"{teaching_url}/v1/objects", timeout=HANG).json()["objects"]:
         if not each["trained"]:
             httpx.delete(f"{teaching_url}/v1/objects/{each['name']}")
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 import uvicorn
-from helpers import Command, assert_refused, finish_programs, start_program
+from commands import Command
+from processes import HANG, finish_programs, start_program
+from refusals import assert_refused
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.errors import InputError
@@ -96,7 +98,7 @@ def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.Monk
     # A new process, whose fork server is that of the pool. The fork server imports modules for seconds.
     code = (
         "import signal, time; from thor2_jax.service.preparation import PreparationPool; pool = PreparationPool(1); "
-        "call = pool.submit(time.monotonic() + 60, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
+        f"call = pool.submit(time.monotonic() + {HANG}, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
         "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
     )
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]

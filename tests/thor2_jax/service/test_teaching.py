@@ -14,7 +14,9 @@ import httpx
 import numpy as np
 import pytest
 import schemathesis
-from helpers import encode_image, files_of, full_disk
+from commands import files_of
+from failures import full_disk
+from image_files import encode_image
 from processes import HANG
 from service_requests import calls, check_refused
 

@@ -11,10 +11,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from helpers import assert_refused
 from PIL import Image
 from playwright.sync_api import Browser, expect
+from processes import HANG
 from recording_files import table_frame
+from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
@@ -121,13 +122,16 @@ def test_slow_readers_get_the_latest_message() -> None:
         broadcast.publish(str(k))
     assert broadcast.wait(0, 0) == (5, "4") and broadcast.wait(5, 0) is None
     threading.Timer(0.05, broadcast.publish, ["late"]).start()
-    assert broadcast.wait(5, 5) == (6, "late")
+    assert broadcast.wait(5, HANG) == (6, "late")
 
 
 def test_server_serves_its_files_and_events_only() -> None:
     broadcast = Broadcast()
     broadcast.publish('{"a": 1}')
-    with serve_live(broadcast, port=0, allow_host=["robot.local"]) as url, httpx.Client(base_url=url) as client:
+    with (
+        serve_live(broadcast, port=0, allow_host=["robot.local"]) as url,
+        httpx.Client(base_url=url, timeout=HANG) as client,
+    ):
         for path in ("/", "/watch.js", "/watch.css", "/style.css", "/icon.svg"):
             answer = client.get(path)
             assert answer.status_code == 200 and answer.content
@@ -144,6 +148,7 @@ def test_server_serves_its_files_and_events_only() -> None:
 def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
     broadcast, page, errors = Broadcast(), browser.new_page(), []
+    page.set_default_timeout(1000 * HANG)
     view = LiveView(recognize, segment_table, broadcast)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))

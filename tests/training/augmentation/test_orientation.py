@@ -1,7 +1,7 @@
 """Augmentation of orientation: the axes, and what a reoriented cloud keeps."""
 
 import numpy as np
-from helpers import random_clouds
+from small_clouds import random_clouds
 
 import thor2_jax as thor2
 from training.augmentation.orientation import _random_axes, reorient
@@ -21,8 +21,10 @@ def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
     normal = thor2.view_normalize(clouds, thor2.DescriptorConfig())
     turned = reorient(normal, rng)
     assert len({np.asarray(cloud).tobytes() for cloud in turned.points}) == 8
-    for cloud, before in zip(np.asarray(turned.points), np.asarray(normal.points), strict=True):
+    both = [np.concatenate([each.points[:, :200], each.camera[:, None]], axis=1) for each in (turned, normal)]
+    for cloud, before in zip(*both, strict=True):
         np.testing.assert_allclose(cloud[:200].min(axis=0), 0, atol=1e-5)
-        distances = [np.linalg.norm(a[:100] - a[100:200], axis=1) for a in (cloud, before)]
+        assert cloud[200, 2] <= cloud[:200, 2].max() / 2  # the camera is on the side of -z
+        distances = [np.linalg.norm(a[:100] - a[101:], axis=1) for a in (cloud, before)]
         np.testing.assert_allclose(*distances, atol=1e-4)
     np.testing.assert_array_equal(turned.colors, normal.colors)

@@ -59,6 +59,8 @@ def test_flying_pixels() -> None:
     behind = moved[edge & (moved != 0)]
     assert len(behind) / edge.sum() == pytest.approx(0.5, abs=0.05)
     assert 0 < behind.min() and behind.max() <= 400 and behind.mean() == pytest.approx(200, abs=15)
+    fewer = sensed(view, dataclasses.replace(sensor, missing=0.5), np.random.default_rng(0)).depth
+    assert (fewer[edge] > view.depth[edge]).mean() == pytest.approx(0.25, abs=0.04)  # half of those that are left
     left = augmented_view(view, 0, sensor=sensor)
     drop = 15 * 1500 / 1099  # smallest step in depth that outlier removal detects, mm
     sides = left.depth.copy()
@@ -69,8 +71,8 @@ def test_flying_pixels() -> None:
 
 def test_smoothing_correlates_noise() -> None:
     """White noise behind a Gaussian of standard deviation s has 1 / (2 s sqrt(pi)) of its standard deviation."""
-    sensor = dataclasses.replace(NO_SENSOR, distance=(3, 3), axial=(1, 1), smooth=(2, 2))
-    view = flat_view(wall(size=200), f=1500.0)  # pixels are 1 mm wide, as in a real frame
+    sensor = dataclasses.replace(NO_SENSOR, distance=(3, 3), axial=(1, 1), smooth=(4, 4))
+    view = flat_view(wall(size=200), f=750.0)  # pixels are 2 mm wide, twice as wide as in a real frame
     depth = sensed(view, sensor, np.random.default_rng(0)).depth.astype(float)
     noise = (1.2 + 1.9 * (3 - 0.4) ** 2) / (4 * np.sqrt(np.pi))
     assert depth.min() > 1400 and depth[10:-10, 10:-10].std() == pytest.approx(np.hypot(noise, 0.289), rel=0.1)
@@ -79,8 +81,8 @@ def test_smoothing_correlates_noise() -> None:
 
 
 def test_depth_is_missing_in_patches() -> None:
-    sensor = dataclasses.replace(NO_SENSOR, patches=(0.2, 0.2), patch=(4, 4))
-    view = flat_view(wall(size=200), f=1500.0)
+    sensor = dataclasses.replace(NO_SENSOR, patches=(0.2, 0.2), patch=(8, 8))
+    view = flat_view(wall(size=200), f=750.0)
     lost = sensed(view, sensor, np.random.default_rng(0)).depth == 0
     assert lost.mean() == pytest.approx(0.2, abs=0.02)
     assert 2 < lost.sum() / (lost & ~binary_erosion(lost)).sum() < 5  # of single pixels, all would be borders

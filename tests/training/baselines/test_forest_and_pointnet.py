@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import random_clouds
 from sklearn.ensemble import RandomForestClassifier
+from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2

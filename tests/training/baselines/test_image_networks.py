@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import assert_refused, random_clouds, untrained_run
+from refusals import assert_refused
 from safetensors.numpy import load_file, save_file
+from small_clouds import random_clouds
+from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError

@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, assert_refused, random_clouds, untrained_run
+from commands import Command
+from refusals import assert_refused
 from safetensors.numpy import load, save
+from small_clouds import random_clouds
+from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2

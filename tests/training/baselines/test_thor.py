@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import random_classifier
+from small_runs import random_classifier
 
 import thor2_jax as thor2
 from thor2_jax.networks import MLP

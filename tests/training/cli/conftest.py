@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers import SMALL_CONFIG, Command, Recognize, json_lines, untrained_run
-from helpers import small_embedding as embedding_of_tests
+from commands import Command, Recognize, json_lines
+from small_runs import SMALL_CONFIG, untrained_run
+from small_runs import small_embedding as embedding_of_tests
 
 from thor2_jax.gallery import embedding, objects
 from thor2_jax.model import model as models

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, assert_refused, json_lines, run_thor2, untrained_run, write_frame
+from commands import Command, json_lines, run_thor2
+from image_files import write_frame
+from refusals import assert_refused
+from small_runs import untrained_run
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.estimate import Adaptation

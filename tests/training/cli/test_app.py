@@ -14,8 +14,11 @@ from typing import Any
 
 import pytest
 import rich.progress
-from helpers import Command, assert_refused, run_thor2, untrained_run, write_frame
+from commands import Command, run_thor2
+from image_files import write_frame
 from processes import HANG
+from refusals import assert_refused
+from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
@@ -202,18 +205,21 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
     now = [100.0]
     monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
     shown: list[tuple[str, int, int, str]] = []
-    show = numbered(lambda *values: shown.append(values), {"render": 1.0, "cached": 0.0, "fit": 4.0})
+    show = numbered(lambda *values: shown.append(values), {"render": 1.0, "cached": 0.0, "fit": 4.0, "write": 2.0})
     calls = [("render", 0, 0), ("render", 2, 10), ("cached", 1, 50), ("fit", 1, 20), ("fit thor", 1, 9), ("fit", 2, 10)]
+    calls += [("write", 0, 1), ("write", 2, 10)]
     for stage, done, seconds in calls:  # The fit is resumed after one of four epochs.
         now[0] += seconds
         show(stage, done, 4 if stage == "fit" else 2, "loss 1" if stage == "fit" else "")
     assert shown == [
-        ("stage 1 of 3: render", 0, 2, ""),
-        ("stage 1 of 3: render", 2, 2, "about 40 s left of all stages"),
-        ("stage 2 of 3: cached", 1, 2, ""),
-        ("stage 3 of 3: fit", 1, 4, "loss 1, about 30 s left of all stages"),
+        ("stage 1 of 4: render", 0, 2, ""),
+        ("stage 1 of 4: render", 2, 2, "about 60 s left of all stages"),
+        ("stage 2 of 4: cached", 1, 2, ""),
+        ("stage 3 of 4: fit", 1, 4, "loss 1, about 50 s left of all stages"),
         ("fit thor", 1, 2, ""),
-        ("stage 3 of 3: fit", 2, 4, "loss 1, about 38 s left of all stages"),
+        ("stage 3 of 4: fit", 2, 4, "loss 1, about 67 s left of all stages"),
+        ("stage 4 of 4: write", 0, 2, "about 29 s left of all stages"),
+        ("stage 4 of 4: write", 2, 2, ""),
     ]
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, files_of, frame_options, run_thor2, write_frame_files, write_meshes
+from commands import Command, files_of, frame_options, run_thor2
+from image_files import write_frame_files
+from rendered_objects import write_meshes
 
 import colornet
 from thor2_jax.files import temporary_directory

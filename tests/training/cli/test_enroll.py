@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, files_of, frame_options, full_disk, run_thor2, write_box, write_frame
+from commands import Command, files_of, frame_options, run_thor2
+from failures import full_disk
+from image_files import write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
+from rendered_objects import write_box
 
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run

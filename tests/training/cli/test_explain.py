@@ -6,7 +6,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers import Command, ParsedPage, full_disk, run_thor2, write_frame
+from commands import Command, ParsedPage, run_thor2
+from failures import full_disk
+from image_files import write_frame
 
 from thor2_jax import capacity
 from thor2_jax.errors import InputError

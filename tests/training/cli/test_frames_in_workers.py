@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_thor2, small_frame, write_frame_files, write_meshes
+from commands import run_thor2
+from image_files import small_frame, write_frame_files
 from recording_files import table_frame
+from rendered_objects import write_meshes
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, Recognize, files_of, frame_options, json_lines, run_thor2, small_frame, write_frame_files
+from commands import Command, Recognize, files_of, frame_options, json_lines, run_thor2
+from image_files import small_frame, write_frame_files
 from PIL import Image
 from recording_files import table_frame
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, Recognize, json_lines, run_thor2, write_frame_files
+from commands import Command, Recognize, json_lines, run_thor2
+from image_files import write_frame_files
 from PIL import Image
 from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_images, write_recording
 from rosbags.highlevel import AnyReader

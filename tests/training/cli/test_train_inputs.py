@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, run_thor2, write_frame
+from commands import Command, run_thor2
+from image_files import write_frame
 from PIL import Image
 
 from thor2_jax.model.run_directory import load_run

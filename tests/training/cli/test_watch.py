@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import Command, run_thor2, write_frame_files
+from commands import Command, run_thor2
+from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
 from thor2_jax.watch.live import LiveView

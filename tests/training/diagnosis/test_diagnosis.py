@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import Command, json_lines, run_thor2
 from dataset_files import write_bop
-from helpers import Command, encode_image, json_lines, run_thor2, write_box
+from image_files import encode_image
 from PIL import Image
+from rendered_objects import write_box
 
 import thor2_jax
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import SMALL_CONFIG, Interrupted, assert_refused
+from failures import Interrupted
+from refusals import assert_refused
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2

@@ -8,7 +8,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, small_disk, write_box
+from failures import small_disk
+from rendered_objects import write_box
+from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2

@@ -10,17 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import (
-    SMALL_CONFIG,
-    ParsedPage,
-    ToyDescriptors,
-    UntaughtRecognizer,
-    assert_refused,
-    json_lines,
-    small_frame,
-    untrained_embedding_run,
-)
+from commands import ParsedPage, json_lines
+from image_files import small_frame
 from PIL import Image
+from refusals import assert_refused
+from small_runs import SMALL_CONFIG, untrained_embedding_run
+from toy_recognizers import ToyDescriptors, UntaughtRecognizer
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError

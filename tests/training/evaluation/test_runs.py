@@ -1,13 +1,16 @@
 """Loading runs, and which runs can be evaluated together."""
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import assert_refused, input_error, random_clouds, untrained_run
+from refusals import assert_refused
+from small_clouds import random_clouds
+from small_runs import untrained_run
 
 import colornet
 from thor2_jax.config import DescriptorConfig
@@ -59,8 +62,7 @@ def test_incompatible_runs_are_refused(make: Maker, tmp_path: Path) -> None:
         "run.json": tmp_path,
     }
     for message, other in cases.items():
-        with input_error(message, other, match="^model: "):
-            load_runs([first, other])
+        assert_refused(f"^model: .*{other}.*{re.escape(message)}", load_runs, [first, other])
 
 
 def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> None:

@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import SMALL_CONFIG, random_clouds, untrained_embedding_run
 from scipy.special import softmax
 from sklearn.metrics import log_loss
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG, untrained_embedding_run
 
 import colornet
 import thor2_jax as thor2

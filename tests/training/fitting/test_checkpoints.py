@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_refused, small_disk
+from failures import small_disk
+from refusals import assert_refused
 
 from colornet import files
 from training.fitting.loop import Checkpoints, find_run_directories

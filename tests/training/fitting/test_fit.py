@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from helpers import assert_refused, random_clouds
+from refusals import assert_refused
+from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2

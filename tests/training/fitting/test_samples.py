@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from helpers import assert_refused
-from helpers import random_clouds as views
+from refusals import assert_refused
+from small_clouds import random_clouds as views
 
 import colornet
 import thor2_jax as thor2

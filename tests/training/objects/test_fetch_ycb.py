@@ -10,7 +10,10 @@ from threading import Thread
 
 import numpy as np
 import pytest
-from helpers import assert_refused, encode_image, free_port, run_thor2
+from commands import run_thor2
+from image_files import encode_image
+from processes import free_port
+from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from training.objects.fetch_ycb import fetch_ycb

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import assert_refused, input_error, write_box
 from PIL import Image
+from refusals import assert_refused
+from rendered_objects import write_box
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from training.objects.mesh import TexturedMesh, merge_meshes
@@ -120,8 +121,7 @@ def colored(vertices: np.ndarray) -> trimesh.Trimesh:
 
 
 def check_refused(path: Path, message: str) -> None:
-    with input_error(path.name, match=message):
-        load_mesh(path)
+    assert_refused(f"{path.name}.*{message}", load_mesh, path)
 
 
 def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
@@ -239,16 +239,15 @@ def test_names_files(tmp_path: Path) -> None:
     (tmp_path / "names.yaml").write_text("mug: 025_mug\n")
     assert read_names(tmp_path / "names.json") == read_names(tmp_path / "names.yaml") == {"mug": "025_mug"}
     for file, content, message in (
-        ("names.yaml", "", "names file "),
-        ("names.json", "{", "names file "),
+        ("names.yaml", "", "holds a NoneType"),
+        ("names.json", "{", "is damaged"),
         ("names.json", "{}", "it is empty"),
         ("names.json", '{"mug": 25}', "both strings, not 'mug': 25"),
         ("names.yaml", "25: mug", "both strings, not 25: 'mug'"),
         ("names.json", '{"mug": ""}', "both strings"),
     ):
         (tmp_path / file).write_text(content)
-        with input_error(tmp_path / file, message):
-            read_names(tmp_path / file)
+        assert_refused(f"names file {tmp_path / file}.*{message}", read_names, tmp_path / file)
     assert_refused("absent.json is missing", read_names, tmp_path / "absent.json")
 
 
@@ -270,8 +269,7 @@ def test_meshes_in_other_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(scaled.vertices, expected.vertices, atol=1e-6)
     np.testing.assert_array_equal(scaled.corner_colors, expected.corner_colors)
     assert longest_side(large) == pytest.approx(200)
-    with input_error(f"{large}: longest side 200", "--mesh-scale 0.001"):
-        load_mesh(large)
+    assert_refused(f"{large}: longest side 200.*--mesh-scale 0.001", load_mesh, large)
     assert scaled_meshes({"box": box}, 1.0) == {"box": box}
     doubled = scaled_meshes({"box": box}, 2.0)["box"]
     assert isinstance(doubled, TexturedMesh)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from commands import Command
 from dataset_files import TWO, K, band, color_and_depth, write_bop
-from helpers import Command, NamesInOrder
+from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers.bop import BOP

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from commands import Command
 from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, points_of, write_ocid
-from helpers import Command, NamesInOrder, assert_refused, input_error
 from PIL import Image
+from refusals import assert_refused
+from toy_recognizers import NamesInOrder
 
 from thor2_jax.frames.frames import backproject
 from training.evaluation.runs import Run as EvaluatedRun
@@ -55,8 +57,8 @@ def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
     Image.fromarray(labels).save(folder / "label" / f"{STEM}.png")
     (item,) = OCID(tmp_path, write_names(tmp_path))
     assert item.truth == {3: "mug", 5: "banana"}
-    with input_error(folder / "label" / f"{STEM}.png", "label 5;"):
-        OCID(tmp_path, write_names(tmp_path, {"seq36": ["mug", "bowl"]}))[0]
+    without_third = OCID(tmp_path, write_names(tmp_path, {"seq36": ["mug", "bowl"]}))
+    assert_refused(f"{folder / 'label' / STEM}.png.*label 5;", without_third.__getitem__, 0)
 
 
 def test_the_order_of_the_dataset(tmp_path: Path) -> None:
@@ -107,8 +109,8 @@ def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
 def test_a_cloud_of_another_size(tmp_path: Path) -> None:
     cloud = write_ocid(tmp_path) / "pcd" / f"{STEM}.pcd"
     cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
-    with input_error(cloud, "(1, 54)", "(6, 9)"):
-        OCID(tmp_path, write_names(tmp_path))[0]
+    dataset = OCID(tmp_path, write_names(tmp_path))
+    assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", dataset.__getitem__, 0)
 
 
 def test_the_camera_against_least_squares_of_numpy() -> None:
@@ -266,5 +268,4 @@ def test_damaged_data(tmp_path: Path) -> None:
         ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
     ):
         path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
-        with input_error(path, expected):
-            read_organized_points(path)
+        assert_refused(f"{path}.*{expected}", read_organized_points, path)

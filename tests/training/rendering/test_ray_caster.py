@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers import full_image
+from rendered_objects import full_image
 
 from thor2_jax.frames.frames import Intrinsics
 from training.objects.mesh import TexturedMesh

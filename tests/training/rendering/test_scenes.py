@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers import assert_refused
+from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects

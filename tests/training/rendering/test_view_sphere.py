@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import assert_refused
+from refusals import assert_refused
 
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 

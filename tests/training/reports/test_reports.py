@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, Interrupted, ParsedPage, assert_refused, run_thor2
+from commands import ParsedPage, run_thor2
+from failures import Interrupted
 from PIL import Image
+from refusals import assert_refused
+from small_runs import SMALL_CONFIG
 
 import colornet
 from thor2_jax.figures import plain_text

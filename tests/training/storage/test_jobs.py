@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import assert_refused
+from refusals import assert_refused
 
 from training.storage.jobs import LOCK, begin_job, check_same_job, locked
 

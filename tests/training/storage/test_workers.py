@@ -9,8 +9,8 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from helpers import assert_refused
 from processes import HANG, is_running, wait_until
+from refusals import assert_refused
 
 from training.storage import workers as worker_pools
 from training.storage.workers import IN_PROCESS, local_workers, ray_workers

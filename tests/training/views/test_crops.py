@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import assert_refused, files_of, run_thor2
+from commands import files_of, run_thor2
+from refusals import assert_refused
 from scipy.ndimage import generic_filter
 
 import thor2_jax as thor2

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from helpers import assert_refused
+from refusals import assert_refused
 from scipy.spatial import cKDTree
 
 from training.augmentation.augmentations import Augmentations

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import Command, Interrupted, assert_refused, files_of, full_disk, write_box
+from commands import Command, files_of
+from failures import Interrupted, full_disk
+from refusals import assert_refused
+from rendered_objects import write_box
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations

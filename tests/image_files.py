@@ -1,0 +1,109 @@
+"""Small frames, and files of images and frames."""
+
+import dataclasses
+import io
+import json
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+import thor2_jax as thor2
+
+
+def encode_image(pixels: np.ndarray, kind: str = "PNG", **options: object) -> bytes:
+    """Return an image file's bytes."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def png_file(chunks: Sequence[tuple[bytes, bytes, int]]) -> bytes:
+    """Return a PNG file of chunks (kind, content, checksum), which may be invalid."""
+    packed = (struct.pack(">I", len(content)) + kind + content + struct.pack(">I", c) for kind, content, c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int]]:
+    """Return PNG chunks (kind, content) with their correct checksums."""
+    return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
+
+
+def deep_png(height: int, width: int) -> bytes:
+    """Return a PNG of 16 bits per channel, which Pillow cannot write: an RGB image of zeros."""
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(1 + 6 * width) * height)
+    return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
+
+
+def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:
+    """Write a frame as `FrameFolder` reads it: its mask if it has labels, and labels.json if names are given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "color.png").write_bytes(encode_image(frame.color))
+    (folder / "depth.png").write_bytes(encode_image(frame.depth.astype(np.uint16)))
+    if frame.labels is not None:
+        (folder / "mask.png").write_bytes(encode_image(frame.labels.astype(np.uint8)))
+    k = frame.intrinsics
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
+    if names is not None:
+        (folder / "labels.json").write_text(json.dumps({"labels": {str(label): name for label, name in names.items()}}))
+    return folder
+
+
+def small_frame(seed: int = 0) -> thor2.RGBDFrame:
+    """Return a frame of 120 x 90 pixels with the instances 1 and 4, in random colours."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((90, 120), np.uint8)
+    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
+    depth = np.full(labels.shape, 900, np.uint16)
+    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
+    color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
+
+
+def frame_of_squares(
+    squares: Mapping[int, tuple[int, int, ArrayLike]], side: int = 40, shape: tuple[int, int] = (120, 160)
+) -> thor2.RGBDFrame:
+    """Return a frame with squares 0.7 m away, before a wall: label -> row, column, colour."""
+    color, labels = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+    depth = np.full(shape, 900, np.uint16)
+    for label, (row, column, rgb) in squares.items():
+        here = slice(row, row + side), slice(column, column + side)
+        color[here], labels[here], depth[here] = rgb, label, 700
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 79.5, 59.5))
+
+
+def patches() -> NDArray[np.uint8]:
+    """Return label images of three usable instances and one that is too small."""
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 3
+    labels[200:203, 10:13] = 5
+    labels[20:60, 150:250] = 7
+    labels[120:220, 100:150] = 200
+    return labels
+
+
+def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDFrame:
+    """Return a frame of a tilted plane with random colours; depth grows to the right."""
+    depth = np.broadcast_to(nearest + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = np.random.default_rng(seed).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
+
+
+FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
+
+
+def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path:
+    """Write a labelled frame with a rectangle for each object; each name has its colour and size."""
+    rng = np.random.default_rng(seed)
+    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
+    mask = np.zeros((240, 320), np.uint8)
+    for place, (label, name) in enumerate(objects.items()):
+        window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
+        mask[window] = label
+        color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
+    return write_frame_files(directory, dataclasses.replace(tilted(mask), color=color), objects)

@@ -1,0 +1,86 @@
+"""Runs and embeddings with random weights, which compile quickly, and what they answer."""
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pytest
+from flax import nnx
+from numpy.typing import NDArray
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.model.classifier import FEATURES
+from thor2_jax.model.inference import infer
+from thor2_jax.model.run_directory import TrainedRun, input_size
+from thor2_jax.networks import MLP, EmbeddingSizes
+
+SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
+"""A descriptor that compiles quickly."""
+
+
+def untrained_run(
+    classes: Sequence[str],
+    features: Sequence[str] = FEATURES,
+    config: thor2.DescriptorConfig = SMALL_CONFIG,
+    record: dict[str, object] | None = None,
+    seed: int = 0,
+) -> TrainedRun:
+    """Return a run whose classifiers have random weights, other ones for each feature."""
+    network = colornet.load_default()
+    classifiers = {
+        name: random_classifier(input_size(name, config, network.n_regions), len(classes), seed + k)
+        for k, name in enumerate(features)
+    }
+    return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+
+
+@functools.cache
+def _drawn(n_inputs: int, n_classes: int, seed: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
+
+
+def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
+    """Return a classifier with random weights."""
+    classifier: MLP = nnx.clone(_drawn(n_inputs, n_classes, seed))
+    return classifier
+
+
+def small_embedding(seed: int = 0) -> Embedding:
+    """Return an embedding with random weights, which compiles quickly."""
+    return Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4), seed=seed)
+
+
+def untrained_embedding_run(
+    classes: Sequence[str],
+    features: Sequence[str] = (),
+    config: thor2.DescriptorConfig = SMALL_CONFIG,
+    record: dict[str, object] | None = None,
+) -> TrainedRun:
+    """Return a run whose embedding, two networks with random weights, recognizes the classes; by default, it alone."""
+    run = untrained_run(classes, features, config, record)
+    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
+    first = Embedding.create(config, run.network, sizes, classes=run.classes, distractors=2)
+    return dataclasses.replace(run, embedding=dataclasses.replace(first, further=(first.create_further(1),)))
+
+
+def class_probabilities(
+    recognizer: thor2.Recognizer, oriented: LookDescriptors, classifiers: Sequence[str] | None = None
+) -> dict[str, NDArray[np.float32]]:
+    """Return classifier -> class probabilities [B, C], of all classifiers or of those named."""
+    names = tuple(recognizer.model.classifiers) if classifiers is None else classifiers
+    computed = infer(recognizer.model, oriented, classifiers=names).probabilities
+    return {name: np.asarray(values) for name, values in computed.items()}
+
+
+def assert_same_answers(
+    answers: Iterable[thor2.Recognition], expected: Iterable[thor2.Recognition], tolerance: float
+) -> None:
+    """Assert that answers are equal, up to a tolerance of the confidences."""
+    for one, other in zip(answers, expected, strict=True):
+        assert (one.label, one.name, one.classifier) == (other.label, other.name, other.classifier)
+        assert (one.reason, one.points_used) == (other.reason, other.points_used)
+        assert one.confidence == pytest.approx(other.confidence, abs=tolerance) and one.top.keys() == other.top.keys()
