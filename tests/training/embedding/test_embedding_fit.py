@@ -10,8 +10,8 @@ from unittest import mock
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 from failures import Interrupted
+from flax import nnx
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG
 
