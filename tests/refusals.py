@@ -1,4 +1,4 @@
-"""Calls that are refused with one line."""
+"""Calls that are refused."""
 
 from collections.abc import Callable
 from typing import Any

@@ -146,3 +146,12 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
+
+
+def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    render = mock.Mock(wraps=samples.render_clouds)
+    monkeypatch.setattr(samples, "render_clouds", render)
+    short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
+    train(tmp_path / "run", short)
+    assert render.call_count == 1

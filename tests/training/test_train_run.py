@@ -220,8 +220,8 @@ def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
     accuracies = {1: 0.5, 2: 0.75, 3: 0.25}
     rows = [EpochMetrics(epoch, 1.0, 1.0, 1.0, accuracy) for epoch, accuracy in accuracies.items()]
-    outcome = module._outcome([{"classifier": "tops", **dataclasses.asdict(row)} for row in rows], {"tops": 2})
-    assert outcome["held_out_accuracy"] == {"tops": 0.75} and outcome["kept_epochs"] == {"tops": 2}
+    outcome = module._outcome([{"classifier": "tops", **dataclasses.asdict(row)} for row in rows], {"tops": 1})
+    assert outcome["held_out_accuracy"] == {"tops": 0.5} and outcome["kept_epochs"] == {"tops": 1}
 
 
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

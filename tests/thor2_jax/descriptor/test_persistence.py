@@ -115,5 +115,6 @@ def test_sizes_weights_and_variances(size: int, exponent: float, variance: float
     config = dataclasses.replace(GUDHI, image_size=size, image_variance=variance)
     across, up = (pixel_masses(centres, config) for centres in (births, deaths - births))
     expected = np.einsum("kp,kq,k->pq", across, up, (deaths - births) ** exponent)
-    image = persistence_images(diagram(births, deaths), config, variance, exponent)
+    sized = dataclasses.replace(GUDHI, image_size=size)
+    image = persistence_images(diagram(births, deaths), sized, variance, exponent)
     np.testing.assert_allclose(image, expected, atol=TOLERANCE)

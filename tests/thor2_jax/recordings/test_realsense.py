@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from processes import HANG
 from refusals import assert_refused
 
 from thor2_jax.errors import InputError
@@ -80,7 +81,7 @@ def test_frames_of_the_software_device(camera: SoftwareCamera) -> None:
     colors = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(8)]
     for k, color in enumerate(colors):
         camera.give(k, Depth=np.full((HEIGHT, WIDTH), 4000 + k, np.uint16), Color=color)
-    with RealSenseCamera(camera, timeout=5.0) as opened:
+    with RealSenseCamera(camera, timeout=HANG) as opened:
         frames = opened.frames()
         recorded = next(frames)
         frame = recorded.read()

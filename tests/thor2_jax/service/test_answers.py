@@ -9,6 +9,7 @@ import httpx
 import numpy as np
 import pytest
 from image_files import encode_image
+from processes import HANG
 from refusals import assert_refused
 from service_requests import check_refused
 from small_clouds import random_clouds
@@ -28,7 +29,7 @@ def test_recognize_matches_the_library(
 ) -> None:
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    recognitions = Client(server.url).recognize(**{name: tmp_path / name for name in files})
+    recognitions = Client(server.url, timeout=HANG).recognize(**{name: tmp_path / name for name in files})
     expected = thor2.Recognizer.load(run_dir).recognize(frame)
     assert [r.label for r in recognitions] == [3, 5, 7, 200]
     assert_same_answers(recognitions, expected, 1e-5)
@@ -43,7 +44,7 @@ def test_recognize_matches_the_library(
     assert set(answer["timings"]) == {"upload", "decode", "clouds", "device", "total"}
     assert answer["timings"]["total"] >= answer["timings"]["decode"] + answer["timings"]["clouds"] > 0
     camera = {"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}
-    again = Client(server.url).recognize(**files | {"intrinsics": camera})
+    again = Client(server.url, timeout=HANG).recognize(**files | {"intrinsics": camera})
     assert [one.confidence for one in again] == [one.confidence for one in recognitions]
     images = {**files, "color": encode_image(frame.color, "JPEG")}
     text = {"intrinsics": images.pop("intrinsics").decode()}
@@ -63,7 +64,7 @@ def check_described(server: Any, inputs: list[tuple[np.ndarray, np.ndarray]]) ->
     """Compare the service's descriptors with those of the library, and return the latter."""
     config = thor2.DescriptorConfig(homology="closed_form")
     expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
-    answer = Client(server.url).describe(inputs)
+    answer = Client(server.url, timeout=HANG).describe(inputs)
     np.testing.assert_allclose(answer.tops2, expected.tops2, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(answer.overflow, expected.overflow)
     return expected
@@ -82,14 +83,14 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
     empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
-    degenerate = Client(server.url).describe([empty, one_point, far_apart])
+    degenerate = Client(server.url, timeout=HANG).describe([empty, one_point, far_apart])
     assert not degenerate.tops2[0].any() and np.isfinite(degenerate.tops2).all()
     assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
 
 
 def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
     network = colornet.load_default()
-    model = Client(server.url).model()
+    model = Client(server.url, timeout=HANG).model()
     assert model.classes == CLASSES and set(model.classifiers) == {"ce", "tops", "tops2"}
     assert model.config.n_slices == 7 and model.color_network == network.fingerprint
     assert model.knows == f"{len(CLASSES)} objects: {', '.join(CLASSES[:6])}, ..."
@@ -120,14 +121,14 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
 
 def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: Files) -> None:
     async def ask() -> Any:
-        client = AsyncClient(server.url)
+        client = AsyncClient(server.url, timeout=HANG)
         with pytest.raises(ServiceError, match="depth") as error:
             await client.recognize(**files | {"depth": b"not an image"})
         assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
         return await asyncio.gather(client.recognize(**files), client.recognize_frame(**files), client.objects())
 
     recognitions, (of_frame, labels), objects = asyncio.run(ask())
-    client = Client(server.url)
+    client = Client(server.url, timeout=HANG)
     expected = client.recognize(**files)
     for answers in (recognitions, of_frame):  # Requests that share a batch differ in the last digits.
         assert_same_answers(answers, expected, 1e-5)

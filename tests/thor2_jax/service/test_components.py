@@ -201,7 +201,8 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
 def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: dict[str, bytes], recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused, done, deadlines, timeout = [], asyncio.Event(), list[asyncio.Timeout](), asyncio.timeout
+    refused, done, timeout = [], asyncio.Event(), asyncio.timeout
+    deadlines = dict[float, asyncio.Timeout]()
 
     async def slow(*_: Any) -> Any:
         await done.wait()
@@ -213,11 +214,10 @@ def test_full_queue_is_429_and_deadline_504(
             done.set()
 
     def record(seconds: float) -> asyncio.Timeout:
-        deadlines.append(timeout(seconds))
-        return deadlines[-1]
+        return deadlines.setdefault(seconds, timeout(seconds))
 
     async def stuck(*_: Any) -> None:
-        deadlines[-1].reschedule(0)  # it passes now
+        deadlines[app.state.service.settings.deadline].reschedule(0)  # it passes now
         await asyncio.sleep(HANG)
 
     recognize.side_effect = slow

@@ -6,6 +6,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from processes import HANG
 from refusals import assert_refused
 
 import thor2_jax as thor2
@@ -34,7 +35,7 @@ def many(frame: thor2.RGBDFrame) -> np.ndarray:
 def test_a_frame_without_labels_is_segmented(
     server: Any, http: httpx.Client, scene: thor2.RGBDFrame, unlabelled: Files
 ) -> None:
-    client = Client(server.url)
+    client = Client(server.url, timeout=HANG)
     recognitions, labels = client.recognize_frame(**unlabelled)
     np.testing.assert_array_equal(labels, segment_table(scene))
     assert [r.label for r in recognitions] == [1, 2, 3]

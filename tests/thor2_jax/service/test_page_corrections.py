@@ -117,7 +117,7 @@ def open_teaching(open_page: Open, teaching_url: str) -> Iterator[Open]:
     yield lambda *arguments, **options: open_page(*arguments, url=teaching_url, **options)
     for each in httpx.get(f"{teaching_url}/v1/objects", timeout=HANG).json()["objects"]:
         if not each["trained"]:
-            httpx.delete(f"{teaching_url}/v1/objects/{each['name']}")
+            httpx.delete(f"{teaching_url}/v1/objects/{each['name']}", timeout=HANG)
 
 
 @changed_answers
@@ -165,7 +165,7 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
     expect(page.locator("#notice-text")).to_contain_text("taken back")
     name_object(page, 7, "teapot")
     expect(page.locator("#notice-text")).to_contain_text("“teapot” has 2 views")
-    httpx.delete(f"{teaching_url}/v1/objects/teapot")
+    httpx.delete(f"{teaching_url}/v1/objects/teapot", timeout=HANG)
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#notice-text")).to_contain_text("Another change")
     expect(page.get_by_role("button", name="Undo")).to_be_hidden()

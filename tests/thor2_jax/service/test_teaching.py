@@ -271,7 +271,7 @@ def test_openapi_requests_conform(method: str, path: str, http: httpx.Client) ->
 
 
 def test_the_client_teaches(http: httpx.Client, files: Files) -> None:
-    client = Client(str(http.base_url))
+    client = Client(str(http.base_url), timeout=HANG)
     record = client.enroll("client/tall ü", **files, instance=200)
     assert record.views == 1 and client.objects()[-1].name == "client/tall ü"
     with pytest.raises(ServiceError, match="extend") as error:
