@@ -75,7 +75,7 @@ def check_replaceable(path: Path) -> None:
 def temporary_directory(parent: str | Path) -> Iterator[Path]:
     """Yield a new hidden directory in `parent` and remove it at the end; what a killed process left is removed before.
 
-    Its name and a file in it, locked while it is in use, say that it is one, see `remove_leftovers`.
+    Its name and a file in it, locked while it is in use, identify it as a temporary directory, see `remove_leftovers`.
     """
     remove_leftovers(Path(parent))
     directory = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
@@ -112,15 +112,16 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 def remove_leftovers(directory: Path) -> None:
     """Remove the temporary directories that killed processes have left in a directory, if it exists.
 
-    Those of other processes, which still run, and all other files stay, whatever their names.
+    Directories in use and all other files stay, whatever their names.
     """
     for path in directory.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):  # another user's, or in use
             if not path.is_symlink() and (path / _MARKER).is_file():
                 with open(path / _MARKER, "r+b") as marker:  # network file systems lock no file that is only read
                     fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if marker.read() == _MARKER_TEXT:
-                        shutil.rmtree(path)
+                    is_left = marker.read() == _MARKER_TEXT
+                if is_left:  # removed when its file is closed: network file systems keep an open one under another name
+                    shutil.rmtree(path)
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -157,8 +157,9 @@ class Protocol:
         given = {name: value for name, value in values.items() if value is not None}
         if given.get("orientation_copies") == 0 and self.orientation_copies:
             given["mirrors"] = MIRRORS
-        if self.distractors is not None and "epochs" in given:
-            given["distractors"] = dataclasses.replace(self.distractors, epochs=given["epochs"])
+        distractors = given.get("distractors", self.distractors)
+        if distractors is not None and "epochs" in given:
+            given["distractors"] = dataclasses.replace(distractors, epochs=given["epochs"])
         of_fit = {field.name for field in dataclasses.fields(FitOptions)} & given.keys()
         fit = dataclasses.replace(self.fit, **{name: given.pop(name) for name in of_fit})
         return dataclasses.replace(self, fit=fit, **given)

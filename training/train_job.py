@@ -38,7 +38,8 @@ class TrainJob:
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
         protocol: the settings of the runs and of their views.
-        meshes: directory of meshes, or name -> mesh; their views are rendered for this run and removed afterwards.
+        meshes: directory of meshes, or name -> mesh in metres, for which `names` and `mesh_scale` are not used; their
+            views are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
@@ -114,7 +115,6 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
-        remove_leftovers(job.out)
         remove_views(job.out / VIEWS)
     return runs
 
@@ -148,9 +148,19 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     record = finished_record(job.out)
     dataset = job.protocol.render_job(_find_meshes(job)).record()
     frames = labelled.digest if labelled else None
-    requested = {"dataset": dataset, "frames": frames, "leave_out": sorted(set(job.leave_out))}
+    requested = {
+        "seed": job.protocol.fit.seed,
+        "dataset": dataset,
+        "frames": frames,
+        "leave_out": sorted(set(job.leave_out)),
+    }
     stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
-    trained = {"dataset": stored.get("job"), "frames": of_frames, "leave_out": stored.get("classes_left_out", [])}
+    trained = {
+        "seed": record["seed"],
+        "dataset": stored.get("job"),
+        "frames": of_frames,
+        "leave_out": stored.get("classes_left_out", []),
+    }
     check_same_job(job.out, trained, requested)
     if job.baselines:
         return

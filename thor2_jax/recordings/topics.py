@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import first_names
 
 __all__ = [
     "CAMERA_TYPE",
@@ -104,8 +105,7 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
 
 
 def _listed(types: Mapping[str, Any]) -> str:
-    listed = [f"{name} ({types[name]})" for name in sorted(types)]
-    return ", ".join(listed[:12] + (["..."] if len(listed) > 12 else [])) or "no topic"
+    return first_names([f"{name} ({types[name]})" for name in sorted(types)], 12) or "no topic"
 
 
 DEFAULT_MAX_GAP = 0.03

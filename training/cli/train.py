@@ -166,6 +166,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.model.classifier import check_features
     from thor2_jax.model.run_record import RUN_FILE
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
@@ -179,7 +180,7 @@ def train(
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
     protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
     if classifiers is not None:
-        protocol = protocol.replace(classifiers=options.split_names(classifiers))
+        protocol = protocol.replace(classifiers=check_features(options.split_names(classifiers), "classifiers"))
     job = TrainJob(
         out=out,
         protocol=protocol,

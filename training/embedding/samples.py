@@ -212,8 +212,10 @@ def render_clouds(objects: Mapping[int, ObjectSource], views: int, seed: int) ->
 
 
 CODE = ("augmentation", "embedding", "objects", "rendering", "views")
+"""Packages of training whose code determines the samples."""
+
 LIBRARY_CODE = (".", "descriptor", "frames")
-"""Packages of training and of the library whose code determines the samples."""
+"""Packages of the library whose code determines the samples."""
 
 
 def samples_record(
@@ -282,7 +284,7 @@ def build_samples(
     directory.mkdir(parents=True, exist_ok=True)
     chunks: dict[Path, Samples] = {}
     for file in tasks:
-        with contextlib.suppress(ValueError):  # missing or damaged
+        with contextlib.suppress(ValueError, TypeError):  # missing or damaged
             chunks[file] = Samples(**load_arrays(file))
     missing = {file: task for file, task in tasks.items() if file not in chunks}
     done = sum(len(tasks[file]) for file in chunks)
