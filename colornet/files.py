@@ -73,7 +73,7 @@ def check_replaceable(path: Path) -> None:
 
 @contextlib.contextmanager
 def temporary_directory(parent: str | Path) -> Iterator[Path]:
-    """Yield a new hidden directory in `parent` and remove it at the end; what a killed process left is removed before.
+    """Remove what killed processes left in `parent`, then yield a new hidden directory there; remove it at the end.
 
     Its name and a file in it, locked while it is in use, identify it as a temporary directory, see `remove_leftovers`.
     """
