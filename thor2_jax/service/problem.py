@@ -1,7 +1,7 @@
 """Errors of the API: an HTTP status and a JSON body that names the field concerned."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel, Field
@@ -16,7 +16,6 @@ __all__ = [
     "deadline_exceeded",
     "error_responses",
     "field_errors",
-    "parse_fields",
 ]
 
 _DESCRIPTIONS = {
@@ -73,25 +72,6 @@ def field_errors(field: str | None = None) -> Iterator[None]:
         yield
     except InputError as error:
         raise RequestError(422, field or str(error).split(maxsplit=1)[0], f"{error}.") from None
-
-
-def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-    """Call the parser of each field of a request and return their results.
-
-    Raises:
-        RequestError: with the errors of all fields; the first one determines the status.
-    """
-    values, errors = {}, []
-    for name, parse in parsers.items():
-        try:
-            values[name] = parse()
-        except RequestError as error:
-            errors.append(error)
-    if errors:
-        first, *others = errors
-        further = [FieldError(field=error.field, message=error.message) for error in others]
-        raise RequestError(first.status, first.field, first.message, *further)
-    return values
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
