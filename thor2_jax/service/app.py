@@ -298,7 +298,7 @@ def _token_check(token: str) -> Callable[..., Any]:
         credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))],
     ) -> None:
         if credentials is None or not secrets.compare_digest(credentials.credentials.encode(), token.encode()):
-            raise RequestError(401, "Authorization", "The bearer token is missing or invalid.")
+            raise RequestError(401, "Authorization")
 
     return check
 

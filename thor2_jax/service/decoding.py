@@ -164,8 +164,8 @@ def _parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
             errors.append(error)
     if errors:
         first, *others = errors
-        further = [FieldError(field=error.field, message=error.message) for error in others]
-        raise RequestError(first.status, first.field, first.message, *further)
+        first.further = [FieldError(field=error.field, message=error.message) for error in others]
+        raise first
     return values
 
 

@@ -13,7 +13,6 @@ __all__ = [
     "FieldError",
     "Problem",
     "RequestError",
-    "deadline_exceeded",
     "error_responses",
     "field_errors",
 ]
@@ -51,7 +50,9 @@ class Problem(FieldError):
 
 
 class RequestError(Exception):
-    """Error response of a request: a status and the fields of `Problem`. It can be pickled.
+    """Error response of a request: a status and the fields of `Problem`; it can be pickled.
+
+    The message is by default the description of the status.
 
     Attributes:
         retry_after: seconds after which a request with status 429 or 503 may be repeated.
@@ -59,10 +60,11 @@ class RequestError(Exception):
 
     retry_after = 1
 
-    def __init__(self, status: int, field: str | None, message: str, *further: FieldError) -> None:
-        super().__init__(status, field, message, *further)
-        self.status, self.field, self.message = status, field, escape_characters(message)
-        self.further = list(further)
+    def __init__(self, status: int, field: str | None = None, message: str | None = None) -> None:
+        super().__init__(status, field, message)
+        self.status, self.field = status, field
+        self.message = _DESCRIPTIONS[status] if message is None else escape_characters(message)
+        self.further: list[FieldError] = []
 
 
 @contextlib.contextmanager
@@ -81,8 +83,3 @@ def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         status: {"model": Problem, "description": _DESCRIPTIONS[status], **(retry if status in (429, 503) else {})}
         for status in statuses
     }
-
-
-def deadline_exceeded() -> RequestError:
-    """Return the error of a request whose deadline has passed."""
-    return RequestError(504, None, "The deadline of the request was exceeded.")
