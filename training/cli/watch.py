@@ -52,8 +52,7 @@ def watch(
         from thor2_jax.recordings.bags import Bag
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.watch.live import LiveView, paced
-        from thor2_jax.watch.server import Broadcast, serve_live
+        from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
         from training.frame_recognition import RecognizerArguments, read_source
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}

@@ -12,8 +12,7 @@ from commands import Command, run_thor2
 from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
-from thor2_jax.watch.live import LiveView
-from thor2_jax.watch.server import Broadcast
+from thor2_jax.watch.live import Broadcast, LiveView
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 
