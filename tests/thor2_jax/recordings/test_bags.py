@@ -16,7 +16,7 @@ from refusals import assert_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recordings import bags, untrusted_bags
+from thor2_jax.recordings import bags
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics, choose_topics
 
@@ -139,8 +139,8 @@ def test_decompression_has_a_limit(
     path = write_recording(tmp_path / name, FRAMES[:1], compression=compression)
     with Bag(path) as bag:
         np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
-    monkeypatch.setattr(untrusted_bags, "MAX_DECOMPRESSED", 2**16)
-    monkeypatch.setattr(untrusted_bags, "MAX_RATIO", 1)
+    monkeypatch.setattr(bags, "MAX_DECOMPRESSED", 2**16)
+    monkeypatch.setattr(bags, "MAX_RATIO", 1)
     with pytest.raises(InputError, match="more than 65536 bytes"), Bag(path) as bag:
         list(bag.frames())
 
@@ -152,7 +152,7 @@ def test_the_largest_overlap_of_chunks() -> None:
             SimpleNamespace(**dict(zip(names, chunk, strict=True)), channel_count={channel: 1})
             for *chunk, channel in chunks
         ]
-        return untrusted_bags.largest_overlap(SimpleNamespace(storage=SimpleNamespace(chunks=of_storage)), {1, 2})
+        return bags._largest_overlap(SimpleNamespace(storage=SimpleNamespace(chunks=of_storage)), {1, 2})
 
     assert overlap() == 0
     assert overlap((0, 9, 5, 1), (5, 12, 5, 2), (10, 20, 5, 1), (13, 30, 5, 1)) == 10
@@ -220,7 +220,7 @@ def test_a_computed_column_has_a_limit(tmp_path: Path, monkeypatch: pytest.Monke
         database.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, {columns})")
         database.execute("INSERT INTO messages(topic_id, timestamp) SELECT topic_id, timestamp FROM old")
     database.close()
-    monkeypatch.setattr(untrusted_bags, "MAX_DECOMPRESSED", 2**18)
+    monkeypatch.setattr(bags, "MAX_DECOMPRESSED", 2**18)
     with pytest.raises(InputError, match="too big"), Bag(path) as bag:
         list(bag.frames())
 
