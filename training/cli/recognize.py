@@ -64,8 +64,7 @@ def recognize(
     """
     from thor2_jax.files import check_output_directory, check_output_file
     from thor2_jax.model import result_files
-    from thor2_jax.recordings.bag_writer import DetectionBag
-    from thor2_jax.recordings.rerun_file import RerunFile
+    from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
     from thor2_jax.segmentation.segmenters import TABLE
     from training.frame_recognition import (
         RecognizerArguments,
