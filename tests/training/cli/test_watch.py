@@ -82,7 +82,7 @@ def test_invalid_arguments(model: Path, refused: Command, monkeypatch: pytest.Mo
     for arguments, expected in (
         ("", "no source is given"),
         ("--bag a.bag --realsense", "--bag and --realsense is given"),
-        ("--folder a --color-topic /c", "belong to --bag"),
+        ("--folder a --color-topic /c", "color_topic is /c; it belongs to --bag"),
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
         ("--folder a --segment sam", "segmenter is 'sam'"),
