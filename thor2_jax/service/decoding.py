@@ -26,7 +26,6 @@ from thor2_jax.service.problem import FieldError, RequestError, field_errors
 from thor2_jax.service.schemas import FORM, MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_POINTS, CloudsBody
 
 __all__ = [
-    "MAX_BODY",
     "check_instances",
     "decode_frame",
     "decode_json_clouds",

@@ -246,9 +246,8 @@ class Service:
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
-            error = RequestError(503, None, "Explanations are still being compiled, which takes up to some minutes.")
-            error.retry_after = WHY_RETRY_SECONDS
-            raise error
+            message = "Explanations are still being compiled, which takes up to some minutes."
+            raise RequestError(503, None, message, WHY_RETRY_SECONDS)
 
         def explained() -> WhyAnswer:
             assert prepared.frame is not None

@@ -9,13 +9,7 @@ from pydantic import BaseModel, Field
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 
-__all__ = [
-    "FieldError",
-    "Problem",
-    "RequestError",
-    "error_responses",
-    "field_errors",
-]
+__all__ = ["FieldError", "Problem", "RequestError", "error_responses", "field_errors"]
 
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
@@ -58,11 +52,9 @@ class RequestError(Exception):
         retry_after: seconds after which a request with status 429 or 503 may be repeated.
     """
 
-    retry_after = 1
-
-    def __init__(self, status: int, field: str | None = None, message: str | None = None) -> None:
+    def __init__(self, status: int, field: str | None = None, message: str | None = None, retry_after: int = 1) -> None:
         super().__init__(status, field, message)
-        self.status, self.field = status, field
+        self.status, self.field, self.retry_after = status, field, retry_after
         self.message = _DESCRIPTIONS[status] if message is None else escape_characters(message)
         self.further: list[FieldError] = []
 
