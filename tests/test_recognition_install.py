@@ -47,7 +47,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 RECOGNITION = (
     "import thor2_jax.service.server, thor2_jax.client, thor2_jax.segmentation.table, thor2_jax.export, "
-    "thor2_jax.recordings.bags, thor2_jax.recordings.bag_writer, thor2_jax.watch.live, training.frame_recognition"
+    "thor2_jax.recordings.bags, thor2_jax.recordings.detection_files, thor2_jax.watch.live, training.frame_recognition"
 )
 
 

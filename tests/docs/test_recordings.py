@@ -14,7 +14,7 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics
-from thor2_jax.watch.server import Broadcast
+from thor2_jax.watch.live import Broadcast
 from training.rendering.sample_recording import FRAMES, write_sample_recording
 
 COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] == "thor2"]

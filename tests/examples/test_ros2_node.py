@@ -18,7 +18,7 @@ from refusals import assert_refused
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.recordings.bag_writer import DETECTION_ARRAY, detection_types, ros_message
+from thor2_jax.recordings.detection_files import DETECTION_ARRAY, detection_types, ros_message
 from thor2_jax.segmentation.segmenters import segment
 
 FRAME = table_frame()

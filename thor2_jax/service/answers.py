@@ -24,7 +24,6 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
-from thor2_jax.service.settings import MAX_EXPLAINED
 
 __all__ = [
     "adaptation_answer",
@@ -102,7 +101,7 @@ def explained_frame(
         details = None
         if instance.reason is None:
             result = next(remaining)
-            if len(instances) < MAX_EXPLAINED:
+            if len(instances) < schemas.MAX_EXPLAINED:
                 confidence = calibrated_confidence(model, recognition, result.inference)
                 details = _details(instance, result, confidence, model.run.config)
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))

@@ -25,8 +25,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
+from thor2_jax.service.decoding import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.engine import CloudResult
-from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
 from thor2_jax.service.pipeline import Service
@@ -298,7 +298,7 @@ def _token_check(token: str) -> Callable[..., Any]:
         credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))],
     ) -> None:
         if credentials is None or not secrets.compare_digest(credentials.credentials.encode(), token.encode()):
-            raise RequestError(401, "Authorization", "The bearer token is missing or invalid.")
+            raise RequestError(401, "Authorization")
 
     return check
 

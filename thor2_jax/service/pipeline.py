@@ -34,7 +34,7 @@ from thor2_jax.service.preparation import (
     prepare_view,
     timed,
 )
-from thor2_jax.service.problem import RequestError, deadline_exceeded, field_errors
+from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import WhyAnswer
 from thor2_jax.service.settings import Settings
 
@@ -208,8 +208,8 @@ class Service:
                 yield request, body
         except TimeoutError:
             if "upload" in request.seconds:
-                raise deadline_exceeded() from None
-            raise RequestError(408, "body", "The body did not arrive before the deadline.") from None
+                raise RequestError(504) from None
+            raise RequestError(408, "body") from None
         finally:
             self._in_progress -= 1
             self.metrics.in_progress.dec()
@@ -246,9 +246,8 @@ class Service:
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
-            error = RequestError(503, None, "Explanations are still being compiled, which takes up to some minutes.")
-            error.retry_after = WHY_RETRY_SECONDS
-            raise error
+            message = "Explanations are still being compiled, which takes up to some minutes."
+            raise RequestError(503, None, message, WHY_RETRY_SECONDS)
 
         def explained() -> WhyAnswer:
             assert prepared.frame is not None
@@ -258,7 +257,8 @@ class Service:
         with timed(request.seconds, "explain"):
             with field_errors("instance"):
                 answer = await asyncio.wrap_future(self._explainer.submit(explained))
-        return answer.model_copy(update={"timings": request.milliseconds()})
+        answer.timings = request.milliseconds()
+        return answer
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
         """Describe the clouds of an npz or JSON body. Raises RequestError."""

@@ -26,7 +26,7 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, prepare_instance
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
-from thor2_jax.service.problem import RequestError, deadline_exceeded, field_errors
+from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.signals import signals_blocked
 
@@ -213,7 +213,7 @@ class PreparationPool:
             process.pipe.send((function, arguments))
             if not process.pipe.poll(max(deadline - time.monotonic(), MIN_SECONDS)):
                 process = self._replace(process)
-                raise deadline_exceeded()
+                raise RequestError(504)
             result, error = process.pipe.recv()
         except (EOFError, OSError):
             process = self._replace(process)

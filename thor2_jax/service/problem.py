@@ -1,7 +1,7 @@
 """Errors of the API: an HTTP status and a JSON body that names the field concerned."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel, Field
@@ -9,15 +9,7 @@ from pydantic import BaseModel, Field
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 
-__all__ = [
-    "FieldError",
-    "Problem",
-    "RequestError",
-    "deadline_exceeded",
-    "error_responses",
-    "field_errors",
-    "parse_fields",
-]
+__all__ = ["FieldError", "Problem", "RequestError", "error_responses", "field_errors"]
 
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
@@ -52,18 +44,19 @@ class Problem(FieldError):
 
 
 class RequestError(Exception):
-    """Error response of a request: a status and the fields of `Problem`. It can be pickled.
+    """Error response of a request: a status and the fields of `Problem`; it can be pickled.
+
+    The message is by default the description of the status.
 
     Attributes:
         retry_after: seconds after which a request with status 429 or 503 may be repeated.
     """
 
-    retry_after = 1
-
-    def __init__(self, status: int, field: str | None, message: str, *further: FieldError) -> None:
-        super().__init__(status, field, message, *further)
-        self.status, self.field, self.message = status, field, escape_characters(message)
-        self.further = list(further)
+    def __init__(self, status: int, field: str | None = None, message: str | None = None, retry_after: int = 1) -> None:
+        super().__init__(status, field, message)
+        self.status, self.field, self.retry_after = status, field, retry_after
+        self.message = _DESCRIPTIONS[status] if message is None else escape_characters(message)
+        self.further: list[FieldError] = []
 
 
 @contextlib.contextmanager
@@ -75,25 +68,6 @@ def field_errors(field: str | None = None) -> Iterator[None]:
         raise RequestError(422, field or str(error).split(maxsplit=1)[0], f"{error}.") from None
 
 
-def parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-    """Call the parser of each field of a request and return their results.
-
-    Raises:
-        RequestError: with the errors of all fields; the first one determines the status.
-    """
-    values, errors = {}, []
-    for name, parse in parsers.items():
-        try:
-            values[name] = parse()
-        except RequestError as error:
-            errors.append(error)
-    if errors:
-        first, *others = errors
-        further = [FieldError(field=error.field, message=error.message) for error in others]
-        raise RequestError(first.status, first.field, first.message, *further)
-    return values
-
-
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI `responses` of a route for these error statuses."""
     retry = {"headers": {"Retry-After": {"description": "Seconds.", "schema": {"type": "integer"}}}}
@@ -101,8 +75,3 @@ def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         status: {"model": Problem, "description": _DESCRIPTIONS[status], **(retry if status in (429, 503) else {})}
         for status in statuses
     }
-
-
-def deadline_exceeded() -> RequestError:
-    """Return the error of a request whose deadline has passed."""
-    return RequestError(504, None, "The deadline of the request was exceeded.")

@@ -5,7 +5,6 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.service.settings import MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_EXPLAINED
 
 __all__ = [
     "AdaptationAnswer",
@@ -13,6 +12,10 @@ __all__ = [
     "FORM",
     "FRAME_FORM",
     "ENROLMENT_FORM",
+    "MAX_CLOUDS",
+    "MAX_CLOUD_COORDINATE",
+    "MAX_EXPLAINED",
+    "MAX_POINTS",
     "NPZ",
     "UNDO_FORM",
     "Candidate",
@@ -49,6 +52,15 @@ FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels)
 
 MAX_POINTS = POINT_BUCKETS[-1]
 """Maximum number of points of a cloud."""
+
+MAX_CLOUD_COORDINATE = 100.0
+"""Largest absolute value of a coordinate of a cloud, in metres."""
+
+MAX_CLOUDS = 32
+"""Maximum number of clouds in a request."""
+
+MAX_EXPLAINED = 32
+"""Maximum number of instances of a frame that are explained."""
 
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
@@ -310,7 +322,7 @@ _FRAME: dict[str, Any] = {
 _INSTANCE = {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."}
 
 FRAME_FORM = _form(_FRAME, "labels")
-"""OpenAPI schema of the body of /v1/recognize. `forms` parses it, since FastAPI writes large files to disk."""
+"""OpenAPI schema of the body of /v1/recognize. `decoding` parses it, since FastAPI writes large files to disk."""
 
 WHY_FORM = _form({**_FRAME, "instance": _INSTANCE})
 """OpenAPI schema of the body of /v1/why."""

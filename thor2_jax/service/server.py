@@ -125,7 +125,7 @@ def _terminate_after(parent: BaseProcess) -> None:
 class TimedConnection(HttpToolsProtocol):
     """uvicorn connection that is closed if a request head arrives too slowly or is too large.
 
-    Requests with complete heads are answered before the connection is closed. Bodies are limited by `forms`.
+    Requests with complete heads are answered before the connection is closed. Bodies are limited by `decoding`.
     """
 
     _in_head = False

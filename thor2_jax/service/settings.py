@@ -1,4 +1,4 @@
-"""Settings of the service, and the limits of a request."""
+"""Settings of the service."""
 
 import dataclasses
 import importlib.util
@@ -9,19 +9,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 from thor2_jax.service.hosts import check_host_names
 
-__all__ = ["MAX_BODY", "MAX_CLOUDS", "MAX_CLOUD_COORDINATE", "MAX_EXPLAINED", "Settings", "default_segmenter"]
-
-MAX_CLOUD_COORDINATE = 100.0
-"""Largest absolute value of a coordinate of a cloud, in metres."""
-
-MAX_BODY = 16 * 2**20
-"""Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
-
-MAX_EXPLAINED = 32
-"""Maximum number of instances of a frame that are explained."""
-
-MAX_CLOUDS = 32
-"""Maximum number of clouds in a request."""
+__all__ = ["Settings", "default_segmenter"]
 
 MAX_DEADLINE = 86_400
 """Largest deadline of a request, in seconds."""

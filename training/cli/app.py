@@ -29,7 +29,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
-__all__ = ["app", "console", "enable_compilation_cache", "finish", "main", "show_help", "show_progress"]
+__all__ = ["app", "console", "enable_compilation_cache", "finish", "main", "print_note", "show_help", "show_progress"]
 
 MAX_BYTES = 2**30
 
@@ -134,6 +134,11 @@ def finish(result: str, purpose: str, *command: object, file: TextIO | None = No
     print(escape_characters(f"{result}; {purpose} with: {words}"), file=file, flush=True)
 
 
+def print_note(text: str) -> None:
+    """Print a line on standard error, beside the results of a command."""
+    print(escape_characters(text), file=sys.stderr, flush=True)
+
+
 def show_help(context: typer.Context) -> None:
     """Print the help of a group of commands if none of them is given."""
     if context.invoked_subcommand is None:
@@ -219,5 +224,5 @@ def _given_value(error: Exception) -> str:
 
 
 def _exit_with(message: str) -> NoReturn:
-    print(f"error: {escape_characters(' '.join(message.split()))}", file=sys.stderr)
+    print_note(f"error: {' '.join(message.split())}")
     raise SystemExit(2)

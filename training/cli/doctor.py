@@ -11,7 +11,7 @@ import typer
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli import options
-from training.cli.app import app, finish
+from training.cli.app import app, finish, print_note
 
 if TYPE_CHECKING:
     from training.diagnosis.checks import Diagnosis
@@ -52,7 +52,7 @@ def doctor(
             if given.color:
                 raise
             failed.append(source.name)
-            print(f"failed: {escape_characters(f'{source.name}: {error}')}", file=sys.stderr)
+            print_note(f"failed: {source.name}: {error}")
         else:
             _report(diagnosis, as_json, None if given.color else source.name)
             is_sound &= not diagnosis.findings

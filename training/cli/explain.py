@@ -1,7 +1,6 @@
 """`thor2 explain`: say why instances have their answers."""
 
 import functools
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ import typer
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli import options
-from training.cli.app import app, console, finish
+from training.cli.app import app, console, finish, print_note
 
 
 @app.command()
@@ -53,7 +52,7 @@ def explain(
             except InputError as error:
                 if instance is not None:
                     raise InputError(f"{source.name}: {error}") from None
-                print(escape_characters(f"skipped: {source.name}: {error}"), file=sys.stderr)
+                print_note(f"skipped: {source.name}: {error}")
                 continue
             write_explanation(explanation, frame, source.name, directory)
             explained, last = explained + 1, label

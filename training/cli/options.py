@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import inspect
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,8 +11,8 @@ import typer
 from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import escape_characters
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, Topics
+from training.cli.app import print_note
 
 __all__ = [
     "AnswerByOption",
@@ -187,7 +186,7 @@ class FrameOptions:
             segment = segment or (TABLE if masks else None)
             sources, notes = recorded_sources(self.open_bag, self.every)
             for note in notes:
-                print(f"note: {escape_characters(note)}", file=sys.stderr)
+                print_note(f"note: {note}")
         elif self.frames:
             sources = find_frames(self.frames, self.depth_scale)
         else:

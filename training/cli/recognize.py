@@ -16,7 +16,7 @@ from rich.table import Table
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
-from training.cli.app import app, console, finish
+from training.cli.app import app, console, finish, print_note
 
 if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
@@ -64,8 +64,7 @@ def recognize(
     """
     from thor2_jax.files import check_output_directory, check_output_file
     from thor2_jax.model import result_files
-    from thor2_jax.recordings.bag_writer import DetectionBag
-    from thor2_jax.recordings.rerun_file import RerunFile
+    from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
     from thor2_jax.segmentation.segmenters import TABLE
     from training.frame_recognition import (
         RecognizerArguments,
@@ -119,7 +118,7 @@ def recognize(
     with contextlib.ExitStack() as stack:
         if bag is not None:
             for note in stack.enter_context(bag).notes:
-                print(escape_characters(f"note: {note}"), file=sys.stderr)
+                print_note(f"note: {note}")
         recognizer = load()
         tables = result_files.ResultTables([source.name for source in sources], recognizer.classes, numbers)
         if bag is not None:
@@ -140,7 +139,7 @@ def recognize(
                     failed.append(answer.name)
                     if not (frames or recording):
                         raise InputError(str(answer.error))
-                    print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
+                    print_note(f"failed: {answer.name}: {answer.error}")
                 if as_json:
                     print(json.dumps(answer.as_json()), flush=True)
                 if answer.frame is None:
@@ -172,7 +171,7 @@ def recognize(
         raise InputError(damage + (before if empty else ""))
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
-        print(escape_characters(f"{unpaired} have no depth within {given.max_gap:g} s"), file=sys.stderr)
+        print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
     result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
     notes = sys.stderr if as_json else None
     if unknown:
@@ -181,7 +180,7 @@ def recognize(
     next_command = ("explain", *given.arguments, *segments, *options.given_options(arguments), "--out", "why")
     finish(result, "see why", *next_command, file=notes)
     if tables.n_without_number:
-        print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)
+        print_note(f"{tables.n_without_number} instances have a name that {names} does not number")
     if failed:
         total, listed = len(failed) + len(empty), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")

@@ -150,10 +150,9 @@ def train(
         raise InputError("paper and quick are given; expected one of them")
     if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    rendering = {"names": names, "azimuth-step": azimuth_step, "polar-step": polar_step}
-    for option, value in (rendering | {"mesh-scale": None if mesh_scale == 1 else mesh_scale}).items():
-        if meshes is None and value is not None:
-            raise InputError(f"{option} is {value}; expected only with --meshes: other views are not rendered")
+    scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
+    steps = {"azimuth_step": azimuth_step, "polar_step": polar_step}
+    options.check_belongs("--meshes", meshes, names=names, mesh_scale=scale, **steps)
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:

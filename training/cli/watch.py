@@ -6,15 +6,13 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import escape_characters
-from thor2_jax.recordings.topics import Topics
 from training.cli import options
-from training.cli.app import app, finish
+from training.cli.app import app, finish, print_note
 
 NOTICE_SECONDS = 1.0
 """Time that pages have to show an error before the server ends."""
@@ -49,20 +47,17 @@ def watch(
     # `main` repeats a KeyboardInterrupt that is lost in a finalizer or in a callback of JAX.
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
         from thor2_jax.frames.frames import RecordedFrame
-        from thor2_jax.recordings.bags import Bag
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.watch.live import LiveView, paced
-        from thor2_jax.watch.server import Broadcast, serve_live
+        from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
         from training.frame_recognition import RecognizerArguments, read_source
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in sources.items() if value is not None]
         if len(given) != 1:
             raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
-        topics = Topics(color_topic, depth_topic, camera_topic)
-        if bag is None and topics != Topics():
-            raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
+        topics: dict[str, Any] = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic}
+        options.check_belongs("--bag", bag, **topics)
         segmenter = load_segmenter(segment or TABLE)
         frames: Iterator[RecordedFrame]
         if folder is not None:
@@ -71,14 +66,14 @@ def watch(
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:
-            opened = stack.enter_context(Bag(bag, topics))
+            opened = stack.enter_context(options.FrameOptions(bag=bag, **topics).open_bag())
             for note in opened.notes:
-                print(escape_characters(f"note: {note}"), file=sys.stderr)
+                print_note(f"note: {note}")
             frames = paced(opened.frames())
         recognizer = RecognizerArguments(model, unknown_below, answer_by).load()
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
-        print(f"watch at {url}", file=sys.stderr, flush=True)
+        print_note(f"watch at {url}")
         view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
         try:
             for recorded in frames:

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from thor2_jax.frames.frames import Intrinsics
-from thor2_jax.recordings.bag_writer import COMPRESSED_IMAGE, MessageBag
+from thor2_jax.recordings.detection_files import COMPRESSED_IMAGE, MessageBag
 from thor2_jax.recordings.messages import ros_time
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_views

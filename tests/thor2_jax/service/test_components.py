@@ -21,12 +21,13 @@ from service_requests import calls, check_refused
 
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
+from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_BODY, Settings
+from thor2_jax.service.settings import Settings
 
 
 class Device:

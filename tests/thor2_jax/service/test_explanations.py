@@ -34,8 +34,7 @@ from thor2_jax.service import pipeline
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
-from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_EXPLAINED
+from thor2_jax.service.schemas import MAX_EXPLAINED, LabelMap
 
 Open = Callable[..., Page]
 Files = dict[str, bytes]

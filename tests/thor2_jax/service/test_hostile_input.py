@@ -21,9 +21,8 @@ from PIL.PngImagePlugin import PngInfo
 from processes import HANG
 from service_requests import check_refused
 
-from thor2_jax.service.decoding import decode_frame
+from thor2_jax.service.decoding import MAX_BODY, decode_frame
 from thor2_jax.service.problem import RequestError
-from thor2_jax.service.settings import MAX_BODY
 
 Files = dict[str, bytes]
 

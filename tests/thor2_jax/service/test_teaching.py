@@ -18,11 +18,11 @@ from commands import files_of
 from failures import full_disk
 from image_files import encode_image
 from processes import HANG
+from refusals import assert_refused
 from service_requests import calls, check_refused
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
-from thor2_jax.errors import InputError
 from thor2_jax.gallery import store
 from thor2_jax.service import pipeline
 from thor2_jax.service.app import create_app
@@ -137,16 +137,15 @@ def test_without_teach_the_service_refuses_changes(teaching_run: Path) -> None:
 def test_unusable_galleries_are_refused_at_the_start(
     http: httpx.Client, files: Files, gallery: Path, teaching_run: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match="gallery: .*index.json"):
-        InferenceEngine(Settings(teaching_run, gallery=tmp_path / "none"))
+    assert_refused("gallery: .*index.json", InferenceEngine, Settings(teaching_run, gallery=tmp_path / "none"))
     enroll(http, files, "tall")
     (gallery / "index.json").unlink()
     for teach in (False, True):
-        with pytest.raises(InputError, match="thor2 objects --reembed --model RUN --gallery"):
-            InferenceEngine(Settings(teaching_run, gallery=gallery, teach=teach))
+        settings = Settings(teaching_run, gallery=gallery, teach=teach)
+        assert_refused("thor2 objects --reembed --model RUN --gallery", InferenceEngine, settings)
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="gallery: .*gallery cannot be written.*--gallery"):
-        InferenceEngine(Settings(teaching_run, gallery=tmp_path / "file" / "gallery", teach=True))
+    settings = Settings(teaching_run, gallery=tmp_path / "file" / "gallery", teach=True)
+    assert_refused("gallery: .*gallery cannot be written.*--gallery", InferenceEngine, settings)
 
 
 BAD_FIELDS = [

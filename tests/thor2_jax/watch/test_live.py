@@ -22,9 +22,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.segmentation.table import segment_table
-from thor2_jax.watch import server
-from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced
-from thor2_jax.watch.server import Broadcast, serve_live
+from thor2_jax.watch import live
+from thor2_jax.watch.live import LONGEST_PAUSE, Broadcast, LiveView, paced, serve_live
 
 SECOND = 10**9
 
@@ -138,7 +137,7 @@ def test_server_serves_its_files_and_events_only() -> None:
             assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
         with client.stream("GET", "/events") as events:
             assert next(events.iter_lines()) == 'data: {"a": 1}'
-        for path in ("/server.py", "/%2e%2e/server.py", "//etc/passwd", "/page/index.html"):
+        for path in ("/live.py", "/%2e%2e/live.py", "//etc/passwd", "/page/index.html"):
             assert client.get(path).status_code == 404
         for host, status in (("attacker.example:80", 403), ("localhost:80", 200), ("robot.local:80", 200)):
             assert client.get("/", headers={"Host": host}).status_code == status
@@ -146,7 +145,7 @@ def test_server_serves_its_files_and_events_only() -> None:
 
 
 def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
+    monkeypatch.setattr(live, "KEEP_ALIVE", 0.05)
     broadcast, page, errors = Broadcast(), browser.new_page(), []
     page.set_default_timeout(1000 * HANG)
     view = LiveView(recognize, segment_table, broadcast)

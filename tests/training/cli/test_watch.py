@@ -12,8 +12,7 @@ from commands import Command, run_thor2
 from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
-from thor2_jax.watch.live import LiveView
-from thor2_jax.watch.server import Broadcast
+from thor2_jax.watch.live import Broadcast, LiveView
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 
@@ -83,7 +82,7 @@ def test_invalid_arguments(model: Path, refused: Command, monkeypatch: pytest.Mo
     for arguments, expected in (
         ("", "no source is given"),
         ("--bag a.bag --realsense", "--bag and --realsense is given"),
-        ("--folder a --color-topic /c", "belong to --bag"),
+        ("--folder a --color-topic /c", "color_topic is /c; it belongs to --bag"),
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
         ("--folder a --segment sam", "segmenter is 'sam'"),

@@ -1,7 +1,8 @@
-"""Bags that are written: detections of a recording, for ROS 2, RViz and Foxglove (extra `bags`).
+"""Files with the detections of frames: bags for ROS 2, RViz and Foxglove (extra `bags`), and for Rerun (extra `rerun`).
 
-with DetectionBag(Path("answers.mcap")) as bag:
+with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) as file:
     bag.write(frame, detections, stamp=stamp, frame_id="camera_color_optical_frame")
+    file.write(frame, detections, name="000001")
 """
 
 import contextlib
@@ -16,9 +17,9 @@ from typing import Any, Self
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.files import errors_name, temporary_directory
+from thor2_jax.files import check_output_file, errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.overlay import annotate
+from thor2_jax.frames.overlay import annotate, answer_paints
 from thor2_jax.model.recognition import Detection
 from thor2_jax.recordings.messages import detection_array, ros_time
 
@@ -30,6 +31,7 @@ __all__ = [
     "VISION_MSGS",
     "DetectionBag",
     "MessageBag",
+    "RerunFile",
     "detection_types",
     "ros_message",
 ]
@@ -55,6 +57,12 @@ VISION_MSGS = {
 """Definitions of the messages of vision_msgs 4 (ROS 2 Humble and later) that rosbags does not ship."""
 
 _JPEG_QUALITY = 85
+
+
+def _check_folder(path: Path) -> None:
+    """Raise OSError if a file cannot be created in the folder of `path`."""
+    with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
+        pass
 
 
 def detection_types() -> Any:
@@ -97,8 +105,7 @@ class MessageBag:
             )
         if path.exists() or path.is_symlink():
             raise InputError(f"{self.argument} is {path}, which exists; choose another name")
-        with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
-            pass
+        _check_folder(path)
         with needs_extra(f"{self.argument} is {path}, which", "rosbags", "bags"):
             self._types = detection_types()
         self._path, self._topics, self._n_messages = path, topics, 0
@@ -183,3 +190,111 @@ def ros_message(value: Any) -> Any:
         return value
     is_sequence = not value or isinstance(value[0], Mapping)
     return [ros_message(each) for each in value] if is_sequence else np.array(value, np.float64)
+
+
+_APPLICATION = "thor2"
+
+_MAX_CLASS = 2**16 - 1
+"""Largest label number of a segmentation image of Rerun."""
+
+
+class RerunFile:
+    """An .rrd file that is being written.
+
+    It has the colour and depth images, the labels and the boxes of the instances below `camera`, and the positions of
+    the objects in `objects`. It appears when the context ends, also with an exception, if at least one frame was
+    written, and then replaces an older one.
+
+    Attributes:
+        path: the file.
+        n_frames: frames written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Check that `path` can be written.
+
+        Raises:
+            InputError: its suffix is not .rrd, it is a recording of another program, or rerun-sdk is missing.
+            OSError: its folder does not exist or cannot be written.
+        """
+        if path.suffix != ".rrd" or path.is_dir():
+            raise InputError(f"rerun is {path}; expected a file with the suffix .rrd")
+        _check_folder(path)
+        check_output_file("rerun", path, _is_own)
+        with needs_extra(f"rerun is {path}, which", "rerun-sdk", "rerun"):
+            import rerun
+        self._rerun: Any = rerun
+        self.path, self.n_frames, self._folder = path, 0, contextlib.ExitStack()
+
+    def __enter__(self) -> "RerunFile":
+        """Create a temporary file beside `path`."""
+        parent = self.path.absolute().parent
+        with errors_name(self.path):
+            self._temporary = self._folder.enter_context(temporary_directory(parent)) / self.path.name
+        self._recording = self._rerun.RecordingStream(_APPLICATION)
+        self._recording.save(self._temporary)
+        # Camera coordinates, as those of OpenCV: x right, y down, z forward.
+        self._recording.log("/", self._rerun.ViewCoordinates.RDF, static=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file and move it to `path`, or remove it if it is empty."""
+        with self._folder, errors_name(self.path):
+            self._recording.flush()
+            self._recording.disconnect()
+            if self.n_frames:
+                self._temporary.chmod(0o644)
+                self._temporary.replace(self.path)
+
+    def write(self, frame: RGBDFrame, detections: Sequence[Detection], *, name: str, stamp: int | None = None) -> None:
+        """Write a frame with labels and its detections.
+
+        Lens distortion is not written: Rerun's camera has none.
+
+        Args:
+            frame: the frame.
+            detections: of the frame.
+            name: its name.
+            stamp: its time, nanoseconds; None if it is unknown.
+        """
+        rerun, log = self._rerun, self._recording.log
+        self._recording.set_time("frame", sequence=self.n_frames)
+        if stamp is not None:
+            self._recording.set_time("time", timestamp=np.datetime64(stamp, "ns"))
+        camera = frame.intrinsics
+        height, width = frame.depth.shape
+        pinhole = rerun.Pinhole(
+            focal_length=(camera.fx, camera.fy), principal_point=(camera.cx, camera.cy), width=width, height=height
+        )
+        log("camera", pinhole)
+        log("camera/name", rerun.TextDocument(name))
+        log("camera/color", rerun.Image(frame.color).compress(jpeg_quality=_JPEG_QUALITY))
+        log("camera/depth", rerun.DepthImage(frame.depth_m, meter=1.0))
+        if frame.label_image.max() <= _MAX_CLASS:
+            log("camera/labels", rerun.SegmentationImage(frame.label_image.astype(np.uint16)))
+        labels = [_label(one) for one in detections]
+        colors = answer_paints([one.recognition for one in detections])
+        boxes = np.array([one.box for one in detections], np.float32).reshape(-1, 4)
+        log("camera/boxes", rerun.Boxes2D(mins=boxes[:, :2], sizes=boxes[:, 2:], labels=labels, colors=colors))
+        placed = [(one.position, i) for i, one in enumerate(detections) if one.position is not None]
+        points = rerun.Points3D(
+            np.array([position for position, _ in placed], np.float32).reshape(-1, 3),
+            labels=[labels[i] for _, i in placed],
+            colors=[colors[i] for _, i in placed],
+            radii=0.01,
+        )
+        log("objects", points)
+        self.n_frames += 1
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is a recording of this software: its head names the application."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return head.startswith(b"RRF") and _APPLICATION.encode() in head
+
+
+def _label(detection: Detection) -> str:
+    answer = detection.recognition
+    confidence = "" if answer.confidence is None else f" {answer.confidence:.2f}"
+    return f"{answer.name or 'unknown'}{confidence}"

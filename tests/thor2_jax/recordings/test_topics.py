@@ -1,11 +1,28 @@
-"""Pairs of colour and depth images by the nearest time stamp."""
+"""Choice of topics, and pairs of colour and depth images by the nearest time stamp."""
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from thor2_jax.recordings.topics import LONGEST_WAIT, PairCounts, StampedImage, nearest_pairs
+from thor2_jax.recordings.topics import LONGEST_WAIT, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 MS = 10**6
+
+
+def test_choice_of_topics() -> None:
+    kinds = {"/c": "color", "/c/compressed": "color", "/d": "depth", "/aligned/d": "depth", "/camera_info": "camera"}
+    types = dict.fromkeys([*kinds, "/empty"], "sensor_msgs/msg/Image")
+    assert choose_topics(Topics(), kinds, types) == Topics("/c", "/aligned/d", "/camera_info")
+    assert choose_topics(Topics(), kinds, types, needs_camera=False) == Topics("/c", "/aligned/d")
+    assert choose_topics(Topics("/c/compressed", "d"), kinds, types).depth == "/d"
+    for wanted, message in (
+        (Topics("/x"), "expected one of"),
+        (Topics("/d"), "expected 8-bit colour"),
+        (Topics("/empty"), "without messages"),
+        (Topics(camera="/c"), "CameraInfo"),
+    ):
+        assert_refused(message, choose_topics, wanted, kinds, types)
+    assert_refused("no topic holds", choose_topics, Topics(), {}, {})
 
 
 def pairs_of(images: list[StampedImage], tolerance: int) -> tuple[list[tuple[int, int]], PairCounts]:

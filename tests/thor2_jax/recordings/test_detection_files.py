@@ -10,7 +10,7 @@ from recording_files import table_frame
 from refusals import assert_refused
 
 from thor2_jax.model.recognition import Recognition, detections_of
-from thor2_jax.recordings.rerun_file import RerunFile
+from thor2_jax.recordings.detection_files import RerunFile
 from thor2_jax.segmentation.segmenters import segmented
 
 ANSWERS = [Recognition(1, "mug", 0.9), Recognition(2, reason="unknown: 0.1", confidence=0.1)]
