@@ -120,6 +120,7 @@ def check_belongs(owner: str, is_given: object, **values: object) -> None:
 def check_alone(option: str, given: object, **values: object) -> None:
     """Raise InputError if `option` is given together with one that it excludes."""
     for name, value in values.items():
+        value = ", ".join(map(str, value)) if isinstance(value, list) else value
         if value and given:
             raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
 
