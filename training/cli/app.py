@@ -25,7 +25,7 @@ from rich import progress
 from rich.console import Console
 
 from thor2_jax import __version__
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
@@ -194,8 +194,7 @@ def main() -> None:
             raise
         _exit_with(str(error))
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _exit_with(f"{where}{error.strerror or error}")
+        _exit_with(reason_of(error))
     finally:
         sys.unraisablehook = report
     raise SystemExit(status)
