@@ -114,6 +114,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Recognize objects on cluttered tables in RGB-D frames, trained on synthetic views only (THOR2 in JAX).",
 )
+# A closed stream is None, and its file descriptor would go to the next file that is opened.
+sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
 # Without a terminal, rich would truncate tables at 80 columns. Names of objects may look like markup.
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 

@@ -34,6 +34,11 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
 
 
+def test_closed_streams_are_no_error() -> None:
+    command = "import os, sys; os.close(1); os.close(2); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    assert run_python(command, "-m", "training.cli", "doctor", "--help").returncode == 0
+
+
 def test_a_usage_error_is_one_line(refused: Command) -> None:
     for command, expected in (
         ("recognize", "--help"),
