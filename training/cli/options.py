@@ -154,7 +154,8 @@ class FrameOptions:
     @property
     def arguments(self) -> list[str]:
         """The arguments that give the same frames to another command."""
-        return [*map(str, self.frames or ()), *given_options(self, without="frames")]
+        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in self.frames or ()]
+        return [*frames, *given_options(self, without="frames")]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""
