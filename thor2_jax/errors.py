@@ -24,6 +24,8 @@ class InputError(ValueError):
 
 def reason_of(error: BaseException) -> str:
     """Return why an exception was raised, in one line: its message, which may be from another package, or its type."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return " ".join(str(error).split()) or type(error).__name__
 
 

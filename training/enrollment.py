@@ -58,7 +58,7 @@ def enroll_objects(
         OSError: a file cannot be written; the gallery is as before, and no run directory is created.
     """
     model = model.resolve()
-    is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
+    is_new = _is_empty(model)
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
     added: dict[str, GalleryObject] = {}
@@ -88,4 +88,11 @@ def enroll_objects(
             added[each] = enrolled_views(objects.embedding, next(views), kind)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
+        if is_new and not _is_empty(model):
+            raise InputError(f"model: {model} was created by another command meanwhile; repeat this one to add to it")
     return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects, skipped
+
+
+def _is_empty(directory: Path) -> bool:
+    """Return whether a directory is empty or does not exist."""
+    return not directory.exists() or (directory.is_dir() and not any(directory.iterdir()))

@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
@@ -75,7 +75,7 @@ def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
     try:
         return source.read()
     except OSError as error:
-        raise InputError(f"{error.filename}: {error.strerror or error}") from None
+        raise InputError(reason_of(error)) from None
 
 
 def recognize_frames(

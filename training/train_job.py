@@ -209,6 +209,8 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
     if missing:
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
+    if not classes:
+        raise InputError(f"leave_out has {', '.join(known)}, all objects; expected at least one that is trained")
     if job.protocol.distractors is not None:
         job.protocol.distractors.check(classes)
     if labelled is None:

@@ -1,8 +1,8 @@
-"""Messages for packages that are missing."""
+"""Messages for packages that are missing, and reasons of exceptions."""
 
 import pytest
 
-from thor2_jax.errors import InputError, needs_extra
+from thor2_jax.errors import InputError, needs_extra, reason_of
 
 
 def test_only_foreign_packages_need_an_extra() -> None:
@@ -10,3 +10,9 @@ def test_only_foreign_packages_need_an_extra() -> None:
         raise ModuleNotFoundError("No module named 'fastapi'", name="fastapi")
     with pytest.raises(ModuleNotFoundError), needs_extra("serve", "FastAPI", "serve"):
         raise ModuleNotFoundError("No module named 'thor2_jax.none'", name="thor2_jax.none")
+
+
+def test_the_reason_of_an_error_of_the_system_names_its_file() -> None:
+    assert reason_of(FileNotFoundError(2, "No such file", "a.png")) == "a.png: No such file"
+    assert reason_of(OSError(28, "No space left")) == "No space left"
+    assert reason_of(OSError("two\nlines")) == "two lines" and reason_of(ValueError()) == "ValueError"

@@ -145,7 +145,9 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
 
 
 def unit_question(frame: RGBDFrame) -> str:
-    """Ask whether the unit of a frame's depth is right."""
+    """Ask whether the unit of a frame's depth is right, or why it has none."""
+    if not (frame.depth_m > 0).any():
+        return "no pixel has depth: is the depth image of this frame, and does the camera deliver depth?"
     if frame.depth.dtype.kind == "f":
         return "is depth, in floating point, in metres?"
     return f"is depth_scale right? It is {frame.intrinsics.depth_scale:g} units per metre"

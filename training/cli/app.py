@@ -25,7 +25,7 @@ from rich import progress
 from rich.console import Console
 
 from thor2_jax import __version__
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
@@ -114,6 +114,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Recognize objects on cluttered tables in RGB-D frames, trained on synthetic views only (THOR2 in JAX).",
 )
+# A closed stream is None, and its file descriptor would go to the next file that is opened.
+sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
 # Without a terminal, rich would truncate tables at 80 columns. Names of objects may look like markup.
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
@@ -199,8 +201,7 @@ def main() -> None:
             raise
         _exit_with(str(error))
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _exit_with(f"{where}{error.strerror or error}")
+        _exit_with(reason_of(error))
     finally:
         sys.unraisablehook = report
     raise SystemExit(status)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, finish, print_note
@@ -52,7 +52,7 @@ def doctor(
             if given.color:
                 raise
             failed.append(source.name)
-            print_note(f"failed: {source.name}: {error}")
+            print_note(f"failed: {source.name}: {reason_of(error)}")
         else:
             _report(diagnosis, as_json, None if given.color else source.name)
             is_sound &= not diagnosis.findings

@@ -119,6 +119,7 @@ def check_belongs(owner: str, is_given: object, **values: object) -> None:
 def check_alone(option: str, given: object, **values: object) -> None:
     """Raise InputError if `option` is given together with one that it excludes."""
     for name, value in values.items():
+        value = ", ".join(map(str, value)) if isinstance(value, list) else value
         if value and given:
             raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
 
@@ -152,7 +153,8 @@ class FrameOptions:
     @property
     def arguments(self) -> list[str]:
         """The arguments that give the same frames to another command."""
-        return [*map(str, self.frames or ()), *given_options(self, without="frames")]
+        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in self.frames or ()]
+        return [*frames, *given_options(self, without="frames")]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""

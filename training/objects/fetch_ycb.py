@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import httpx
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.files import temporary_directory
+from thor2_jax.files import check_output_directory, temporary_directory
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress, locked
 
@@ -63,6 +63,8 @@ def fetch_ycb(
         given = f"has {wrong[0]!r}" if wrong else "is empty"
         raise InputError(f"objects {given}; expected names of YCB objects, such as 003_cracker_box")
     directory = Path(directory)
+    if not directory.is_dir():
+        check_output_directory(directory)
     directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
     with locked(directory):

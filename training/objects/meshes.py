@@ -1,5 +1,6 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,9 @@ __all__ = [
     "read_names",
     "scaled_meshes",
 ]
+
+# Otherwise what trimesh logs about a damaged file, also with a traceback, is printed on standard error.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 

@@ -141,6 +141,7 @@ def test_depth_in_another_unit_is_asked_about() -> None:
         assert not wrong.has_usable_depth
         assert "is depth_scale right? It is 1" in (instance_cloud(wrong, 2).reason or "")
     assert "in metres?" in (instance_cloud(frame(millimetres.astype(np.float32)), 1).reason or "")
+    assert "no pixel has depth" in (instance_cloud(frame(np.zeros_like(millimetres)), 1).reason or "")
     millimetres[30:38, 30:38] = 0  # the other instance has depth
     reason = instance_cloud(frame(millimetres), 2).reason
     assert reason is not None and "depth_scale" not in reason

@@ -34,6 +34,11 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
 
 
+def test_closed_streams_are_no_error() -> None:
+    command = "import os, sys; os.close(1); os.close(2); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    assert run_python(command, "-m", "training.cli", "doctor", "--help").returncode == 0
+
+
 def test_a_usage_error_is_one_line(refused: Command) -> None:
     for command, expected in (
         ("recognize", "--help"),
@@ -62,6 +67,7 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
     for given, expected in (
         (("--bag", "absent.mcap"), "absent.mcap"),
         (("--bag", "b", "--color", "c.png"), "color is c.png and bag is b"),
+        (("frames", "a b", "--bag", "b"), "frames is frames, a b and bag is b"),
         (("frames", "--every", 2), "every is 2; it belongs to --bag"),
         (("absent",), "absent"),
         (("--color", "c.png"), "--depth"),
@@ -70,11 +76,11 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
 
 
 def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:
-    given = FrameOptions(frames=[Path("a b"), Path("c")], depth_scale=100.0, max_gap=0.5)
+    given = FrameOptions(frames=[Path("a b"), Path("-c")], depth_scale=100.0, max_gap=0.5)
     finish("done", "see why", "explain", *given.arguments)
     line = capsys.readouterr().out
     assert line.startswith("done; see why with: thor2 explain ") and line.count("\n") == 1
-    assert shlex.split(line)[-6:] == ["a b", "c", "--depth-scale", "100.0", "--max-gap", "0.5"]
+    assert shlex.split(line)[-6:] == ["a b", "./-c", "--depth-scale", "100.0", "--max-gap", "0.5"]
 
 
 def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:

@@ -13,12 +13,15 @@ from failures import full_disk
 from image_files import write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
+from refusals import assert_refused
 from rendered_objects import write_box
 
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 from training.cli import evaluate
+from training.enrollment import enroll_objects
+from training.readers.frames import FrameFolder, find_frames
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
@@ -236,6 +239,15 @@ def test_too_few_points_are_refused(tmp_path: Path, refused: Command) -> None:
     for given in (["--frames", frame], ["new", *one_frame(frame, 1)]):
         assert "points" in refused("enroll", *given, "--model", tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path, tmp_path: Path) -> None:
+    def create(*_: object) -> None:
+        shutil.copytree(model, tmp_path / "other", dirs_exist_ok=True)
+
+    folder = FrameFolder(find_frames([frames]))
+    assert_refused("created by another", enroll_objects, tmp_path / "other", folder, progress=create)
+    assert files_of(tmp_path / "other") == files_of(model)
 
 
 def test_a_full_disk_leaves_no_run_behind(

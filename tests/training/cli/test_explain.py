@@ -106,6 +106,12 @@ def test_the_next_command_has_an_instance_that_was_explained(
     assert " --instance 1 " in printed("explain", "--model", model, frame, "--out", tmp_path / "out")
 
 
+def test_frames_without_instances_are_named(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = write_frame(tmp_path / "nothing", {})
+    assert run_thor2("explain", "--model", model, empty, "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err.startswith("skipped: nothing: ")
+
+
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
     command = ("explain", "--model", model, frame, "--out", out)

@@ -94,6 +94,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--meshes meshes --classifiers shape", "shape"),
         ("--meshes meshes --epochs 0", "epochs"),
         ("--meshes meshes --leave-out nobody", "leave_out has 'nobody'"),
+        ("--meshes meshes --leave-out brick,box", "leave_out has box, brick, all"),
         ("--meshes meshes --embedding 9 --distractors meshes", "also a class"),
         ("--meshes meshes --out full", "full"),
         ("--dataset absent", "absent"),

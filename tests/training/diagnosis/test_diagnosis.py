@@ -305,6 +305,10 @@ def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], pr
     out, err = capfd.readouterr()
     assert [report["frame"] for report in json_lines(out)] == ["tools"]
     assert "failed: breakfast: " in err and "error: 1 of 2 frames" in err
+    color = frame_files(tmp_path / "frames" / "breakfast").color
+    color.mkdir()
+    assert run_thor2(*command) == 2
+    assert f"failed: breakfast: {color}: Is a directory\n" in capfd.readouterr().err
 
 
 def test_scenes_of_bop(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -141,6 +141,9 @@ def test_files_of_the_user_stay(server: Server, tmp_path: Path) -> None:
     (tmp_path / f".{NAME}.tgz").unlink()
     (tmp_path / NAME).mkdir()
     assert_refused("exists without", fetch_ycb, [NAME], tmp_path, url=server.url)
+    (tmp_path / "file").touch()
+    for directory in (tmp_path / "file", tmp_path / "file" / "meshes"):
+        assert_refused(f"out: {directory} is not a directory", fetch_ycb, [NAME], directory, url=server.url)
 
 
 def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
 import json
+import logging
 import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -158,6 +160,15 @@ def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing")
     os.mkfifo(material)
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing or unreadable")
+
+
+def test_a_ply_without_its_texture_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    text = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
+    (tmp_path / "quad.ply").write_bytes(text.replace(b"1.0\n", b"1.0\ncomment TextureFile absent.png\n", 1))
+    # pytest's own handlers keep the logging module from printing.
+    with mock.patch.object(logging.getLogger(), "handlers", []):
+        check_refused(tmp_path / "quad.ply", "'absent.png' is missing")
+    assert capfd.readouterr().err == ""
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
