@@ -76,7 +76,8 @@ def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
             (batches, r"points \[1, 1, 512, 3\]"),
         ):
             assert_refused(words, function, clouds, NETWORK, CLOSED)
-    assert_refused("clouds is list", thor2.diagrams, [], CLOSED)
+    for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
+        assert_refused("clouds is list", without_network, [], CLOSED)
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
