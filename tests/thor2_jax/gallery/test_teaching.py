@@ -182,6 +182,7 @@ def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embeddi
     for frames, words in (
         ([frame(RED), CLUTTER], r"frames\[1\].*3 instances"),
         ([(CLUTTER, 9)], "instance is 9"),
+        ([[CLUTTER, 9]], "instance is 9"),
         ([small], "cannot be used"),
         ([], "views is empty"),
     ):
