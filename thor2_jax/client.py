@@ -36,7 +36,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.types import Descriptors
+from thor2_jax.types import Descriptors, check_cloud
 
 __all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]
 
@@ -158,10 +158,11 @@ class Client(_Connection):
             depth: 16-bit PNG, by default in millimetres.
             labels: PNG of instance numbers, or an array [H, W] of them up to 65,535; None lets the service segment the
                 frame.
-            intrinsics: file in a format of docs/frames.md, or a mapping in one of them, or `Intrinsics`; pixels.
+            intrinsics: file in a format of docs/frames.md, or what `Intrinsics.of` takes: a mapping, a matrix, a ROS
+                message or `Intrinsics`; pixels.
 
         Raises:
-            InputError: `labels` is an array of another kind.
+            InputError: `labels` is an array of another kind, or `intrinsics` is invalid.
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
@@ -179,24 +180,25 @@ class Client(_Connection):
         return self._send("POST", "/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
 
     def describe(self, clouds: Sequence[tuple[Any, Any]]) -> Descriptors:
-        """Compute the descriptors of clouds, pairs (xyz [n, 3] in metres, rgb [n, 3] uint8).
+        """Compute the descriptors of clouds, pairs (xyz, rgb) as `PointClouds.pack` takes them; colours have 8 bits.
 
         Returns:
             Descriptors of the B clouds, as `thor2_jax.describe` returns them; the fields are NumPy arrays.
 
         Raises:
-            InputError: `clouds` is empty.
+            InputError: `clouds` is empty, or a cloud is invalid; the message gives its index.
             ServiceError: the service returned an error.
             OSError: the service cannot be reached.
         """
         if not clouds:
             raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
+        points, colors = zip(*(check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)), strict=True)
         body = io.BytesIO()
         np.savez_compressed(
             body,
-            points=np.concatenate([np.asarray(xyz, np.float32).reshape(-1, 3) for xyz, _ in clouds]),
-            colors=np.concatenate([np.asarray(rgb, np.uint8).reshape(-1, 3) for _, rgb in clouds]),
-            sizes=np.array([len(xyz) for xyz, _ in clouds]),
+            points=np.concatenate(points),
+            colors=np.rint(255 * np.concatenate(colors)).astype(np.uint8),
+            sizes=np.array([len(xyz) for xyz in points]),
         )
         headers = {"Content-Type": "application/octet-stream"}
         return self._send("POST", "/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
@@ -303,10 +305,10 @@ def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, i
     files = {"color": _read(color), "depth": _read(depth)}
     if labels is not None:
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
-    if isinstance(intrinsics, Intrinsics):
-        intrinsics = dataclasses.asdict(intrinsics)
-    is_mapping = isinstance(intrinsics, Mapping)
-    files["intrinsics"] = json.dumps(dict(intrinsics)).encode() if is_mapping else _read(intrinsics)
+    if not isinstance(intrinsics, File):
+        values = dataclasses.asdict(Intrinsics.of(intrinsics))
+        intrinsics = json.dumps(values, default=np.generic.item).encode()
+    files["intrinsics"] = _read(intrinsics)
     return files
 
 

@@ -71,6 +71,8 @@ def _check_points(points: ArrayLike, colors: ArrayLike) -> tuple[NDArray[Any], N
         raise InputError(f"points is {list(xyz.shape)}; expected [n, 3], for example a cloud of PointClouds.unpack")
     if rgb.shape != xyz.shape:
         raise InputError(f"colors is {list(rgb.shape)}; expected {list(xyz.shape)}, the shape of points")
+    if rgb.dtype != np.uint8 and not np.issubdtype(rgb.dtype, np.floating):
+        raise InputError(f"colors is {rgb.dtype}; expected uint8, or floating in [0, 1]")
     return xyz, np.clip(rgb / 255 if rgb.dtype == np.uint8 else rgb, 0, 1)
 
 
@@ -121,7 +123,7 @@ def cloud(
         The drawn points.
 
     Raises:
-        InputError: the shapes do not fit.
+        InputError: the shapes do not fit, or `colors` has another type.
     """
     xyz, rgb = _check_points(points, colors)
     drawn = _scatter(ax, xyz[:, :2], -xyz[:, 2], rgb, values, scale, size)
@@ -158,7 +160,7 @@ def slices(
         The drawn points.
 
     Raises:
-        InputError: the shapes do not fit.
+        InputError: the shapes do not fit, or `colors` has another type.
     """
     xyz, rgb = _check_points(points, colors)
     drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], rgb, values, scale, size)

@@ -186,7 +186,7 @@ class Recognizer:
         """
         views = []
         for number, item in enumerate(frames):
-            frame, label = item if isinstance(item, tuple) else (item, None)
+            frame, label = item if isinstance(item, tuple | list) else (item, None)
             with with_context(f"frames[{number}]"):
                 views.append(self.model.corrected(instance_view(frame, label, self.run.config.sigma_s)))
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)

@@ -21,7 +21,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_stream
 from thor2_jax.errors import InputError
-from thor2_jax.types import as_array, check_cloud
+from thor2_jax.types import as_array, check_capacity, check_cloud
 
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 
@@ -104,9 +104,7 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         network = self.network
         if not (network is None or isinstance(network, ColorNetwork)):
             raise InputError(f"network is {network!r}; expected a ColorNetwork, or None for the packaged one")
-        capacity = self.capacity
-        if not (capacity is None or (type(capacity) is int and capacity > 0)):
-            raise InputError(f"capacity is {capacity!r}; expected a positive integer, or None for the point buckets")
+        check_capacity(self.capacity)
         return config, colornet.load_default() if network is None else network
 
     def _clouds(self, X: Sequence[Any]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

@@ -23,7 +23,18 @@ from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 
-__all__ = ["Cloud", "Descriptors", "Diagrams", "Parameters", "PointClouds", "Strips", "as_array", "check_cloud"]
+__all__ = [
+    "Cloud",
+    "Descriptors",
+    "Diagrams",
+    "Parameters",
+    "PointClouds",
+    "Strips",
+    "as_array",
+    "check_batch",
+    "check_capacity",
+    "check_cloud",
+]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 """One point cloud of any size: xyz [n, 3] and sRGB [n, 3]."""
@@ -115,8 +126,7 @@ def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int]
 
 
 def _padded_size(sizes: list[int], capacity: int | None) -> int:
-    if not (capacity is None or (type(capacity) is int and capacity > 0)):
-        raise InputError(f"capacity is {capacity!r}; expected a positive integer")
+    check_capacity(capacity)
     largest, limit = max(sizes), capacity or POINT_BUCKETS[-1]
     if largest > limit:
         raise InputError(
@@ -140,6 +150,19 @@ def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
     """Convert to float32. Values that are too large become infinite without a warning; the caller rejects them."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
+
+
+def check_capacity(capacity: Any) -> None:
+    """Raise InputError unless a padded number of points is None or a positive integer, also of NumPy."""
+    if not (capacity is None or (isinstance(capacity, int | np.integer) and capacity is not True and capacity > 0)):
+        raise InputError(f"capacity is {capacity!r}; expected a positive integer, or None for the point buckets")
+
+
+def check_batch(clouds: PointClouds) -> None:
+    """Raise InputError unless the clouds are a batch."""
+    if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
+        actual = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
+        raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
 def as_array(values: ArrayLike, name: str) -> NDArray[Any]:

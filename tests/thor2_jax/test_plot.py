@@ -38,6 +38,7 @@ def test_cloud_is_seen_by_the_camera(ax) -> None:
     plot.cloud(ax, POINTS, COLORS)  # A second cloud does not turn the axis back.
     assert ax.yaxis_inverted()
     draw(ax)
+    assert_refused("colors is int64", plot.cloud, ax, POINTS, COLORS.astype(np.int64))
 
 
 def test_values_replace_the_colors(ax) -> None:

@@ -125,7 +125,9 @@ def test_bad_input_is_refused(message: str) -> None:
             getattr(thor2.Tops2Transformer(config=SMALL_CONFIG), method)(INVALID[message])
 
 
-@pytest.mark.parametrize(("name", "value"), [("config", "paper"), ("capacity", 0), ("capacity", 2.5), ("network", 3)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("config", "paper"), ("capacity", 0), ("capacity", 2.5), ("capacity", True), ("network", 3)]
+)
 def test_bad_parameters_are_named(name: str, value: object) -> None:
     with pytest.raises(thor2.InputError, match=f"^{name} is {value!r}"):
         thor2.Tops2Transformer(**{name: value}).fit([(XYZ, RGB)])
@@ -133,7 +135,7 @@ def test_bad_parameters_are_named(name: str, value: object) -> None:
 
 def test_clouds_past_the_capacity_are_refused() -> None:
     with pytest.raises(thor2.InputError, match="larger capacity"):
-        thor2.Tops2Transformer(capacity=2).fit([(XYZ, RGB)])
+        thor2.Tops2Transformer(capacity=np.array([2])[0]).fit([(XYZ, RGB)])  # as a grid search over an array gives it
 
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)

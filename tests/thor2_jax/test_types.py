@@ -95,6 +95,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
         ({"capacity": 2}, ["clouds[0]", "3", "at most 2, the capacity"]),
+        ({"capacity": np.int64(2)}, ["at most 2, the capacity"]),
         ({"capacity": 0}, ["capacity is 0"]),
         ({"capacity": 8.0}, ["capacity is 8.0"]),
         ({"clouds": [(np.zeros((8193, 3)), np.zeros((8193, 3)))]}, ["clouds[0]", "8193", "8192"]),

@@ -160,12 +160,12 @@ def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:
 def _minimum_area_angle(xy: jax.Array) -> jax.Array:
     """Return the angle of the minimum-area rectangle of `xy` [2, M], within about an eighth turn, radians."""
     step = np.pi / 2 / COARSE_ANGLES
-    best = jnp.zeros(())
+    best = jnp.zeros((), xy.dtype)
     # The angles are symmetric about 0 and exclude eighth turns: if an axis of the frame changes its sign, the result
     # only changes its sign. Results a quarter turn apart would exchange two axes.
     offsets = (np.arange(COARSE_ANGLES) - COARSE_ANGLES // 2) * step
     for _ in range(3):
-        angles = best + jnp.asarray(offsets, jnp.float32)
+        angles = best + jnp.asarray(offsets, xy.dtype)
         best = angles[jnp.argmin(_rectangle_areas(xy, angles))]
         offsets, step = np.linspace(-step, step, 9), step / 4
     return best

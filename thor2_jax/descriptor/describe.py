@@ -30,7 +30,7 @@ from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_stri
 from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips
+from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch
 
 __all__ = [
     "chunk_size",
@@ -116,12 +116,6 @@ def _concatenate(results: Sequence[T]) -> T:
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 
-def _check_batch(clouds: PointClouds) -> None:
-    if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
-        actual = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
-        raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
-
-
 # Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.
 _color_sets = jax.jit(color_sets)
 
@@ -161,7 +155,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         network: the colour network, of which only the regions are used.
         config: static.
     """
-    _check_batch(aligned)
+    check_batch(aligned)
     return strips_by_sets(aligned, region_sets(network), config)
 
 
@@ -174,7 +168,7 @@ def describe_strips(
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours are not used."""
-    _check_batch(aligned)
+    check_batch(aligned)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
     return _diagrams(strips_by_sets(aligned, one_set, config), config)
 
@@ -223,7 +217,7 @@ def describe(
     Raises:
         InputError: `clouds` is not a batch of clouds.
     """
-    _check_batch(clouds)
+    check_batch(clouds)
     if len(clouds.mask) > chunk_size(clouds):
         return _describe_in_chunks(clouds, network, config, parameters)
     return describe_aligned(align(clouds, config, parameters), network, config, parameters)

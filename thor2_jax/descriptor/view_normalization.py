@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, rotate
 from thor2_jax.errors import InputError
-from thor2_jax.types import Parameters, PointClouds
+from thor2_jax.types import Parameters, PointClouds, check_batch
 
 __all__ = ["Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
@@ -119,6 +119,9 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
 
     Returns:
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
+
+    Raises:
+        InputError: `clouds` is not a batch of clouds.
     """
     sigma_s, _ = _sigma_s_and_alpha(config, parameters)
     return _normalized_and_turned(clouds, sigma_s, jnp.zeros_like(sigma_s))
@@ -148,7 +151,11 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 
     Returns:
         Aligned clouds in scaled units, in the first octant.
+
+    Raises:
+        InputError: `normal` is not a batch of clouds.
     """
+    check_batch(normal)
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
 
 
@@ -161,6 +168,7 @@ def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: Arra
 
 
 def _normalized_and_turned(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> PointClouds:
+    check_batch(clouds)
     points, camera = _align(clouds, sigma_s, alpha)
     return dataclasses.replace(clouds, points=points, camera=camera)  # compiled, it would copy the other fields
 
@@ -176,7 +184,10 @@ def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[j
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing."""
+    """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing.
+
+    Raises InputError as both.
+    """
     return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 
 

@@ -109,7 +109,9 @@ class ClassUnion:
         nothing: Values = np.zeros((len(scores), len(self.names)))
         trained = nothing if probabilities is None else self.of_classifiers(probabilities)
         c = trained.max(axis=1, keepdims=True, initial=0)
-        enrolled = (1 - c).clip(0) * score_odds(self.of_gallery(scores))
+        # Without a score, an object still comes before a class that neither has views nor an output.
+        odds = np.maximum(score_odds(scores), np.finfo(np.float32).tiny)
+        enrolled = (1 - c).clip(0) * self.of_gallery(odds)
         shares, m = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
         largest = shares.max(axis=1, keepdims=True, initial=0)
         value = np.where(largest > c, (c + m) / (1 + m), c)

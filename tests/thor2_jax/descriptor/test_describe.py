@@ -34,6 +34,16 @@ def test_describe_equals_its_steps() -> None:
         np.testing.assert_array_equal(whole.tops2, by_steps.tops2)
 
 
+def test_describe_with_jax_enable_x64() -> None:
+    config = thor2.DescriptorConfig(homology="closed_form")
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        clouds = thor2.PointClouds.pack(random_clouds(1, [60]), capacity=64)
+        tops2 = thor2.describe(clouds, colornet.load_default(), config).tops2
+    expected = thor2.describe(clouds, colornet.load_default(), config).tops2
+    assert tops2.dtype == np.float32
+    np.testing.assert_allclose(tops2, expected, atol=1e-4)
+
+
 def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Values and gradients equal those of a small batch, with callbacks and with a last, smaller chunk."""
     monkeypatch.setattr(describe, "MAX_CHUNK_CLOUDS", 2)
@@ -66,7 +76,8 @@ def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
             (batches, r"points \[1, 1, 512, 3\]"),
         ):
             assert_refused(words, function, clouds, NETWORK, CLOSED)
-    assert_refused("clouds is list", thor2.diagrams, [], CLOSED)
+    for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
+        assert_refused("clouds is list", without_network, [], CLOSED)
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:

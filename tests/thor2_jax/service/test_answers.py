@@ -1,6 +1,7 @@
 """Answers of a running service to valid requests, compared with the library on the same run."""
 
 import asyncio
+import io
 import socket
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from small_runs import assert_same_answers
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
+from thor2_jax.frames.intrinsics import parse_intrinsics
 
 from .conftest import CLASSES
 
@@ -152,6 +154,23 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
         assert_refused(
             r"labels has .* from 0 to 65535", Client(url).recognize, color=b"", depth=b"", labels=labels, intrinsics=b""
         )
+
+
+def test_the_client_sends_colours_and_intrinsics_of_any_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: dict[str, Any] = {}
+    monkeypatch.setattr(Client, "_send", lambda self, method, path, parse, **body: sent.update(body))
+    client = Client("http://robot.local")
+    rgb = np.arange(256, dtype=np.uint8)[:255].reshape(-1, 3)
+    for colors in (rgb, rgb / 255, (rgb / np.float32(255)).tolist()):
+        client.describe([(np.zeros(rgb.shape), colors)])
+        np.testing.assert_array_equal(np.load(io.BytesIO(sent["content"]))["colors"], rgb)
+    assert_refused(r"clouds\[1\]: rgb", client.describe, [(np.zeros(rgb.shape), rgb), (np.zeros((1, 3)), rgb)])
+    matrix = np.array([[500, 0, 320], [0, 510, 240], [0, 0, 1]], np.float32)
+    expected = thor2.Intrinsics.of(matrix)
+    for given in (matrix, matrix.tolist(), {"K": matrix}, thor2.Intrinsics(*matrix[[0, 1, 0, 1], [0, 1, 2, 2]])):
+        client.recognize(color=b"", depth=b"", intrinsics=given)
+        assert parse_intrinsics(sent["files"]["intrinsics"]) == expected
+    assert_refused("intrinsics", client.recognize, color=b"", depth=b"", intrinsics={"fx": 1})
 
 
 @pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
