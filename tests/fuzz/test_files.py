@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from image_files import encode_image, png_file, with_checksums
 from refusals import assert_refused
 
-from thor2_jax.errors import InputError
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
 from thor2_jax.testing import damaged
@@ -195,16 +194,8 @@ def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attem
     header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
     path = tmp_path / "bomb.png"
     path.write_bytes(png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))))
-    with pytest.raises(InputError, match=rf"bomb\.png .*({size[0] * size[1]}|{size[0]} x {size[1]}) pixels"):
-        attempt(lambda: read_color(path), ())
-
-
-def test_text_that_would_fill_memory(attempt: Any, tmp_path: Path) -> None:
-    parts = chunks(encode_image(COLOR))
-    bomb = (b"zTXt", b"key\0\0" + zlib.compress(bytes(2**26), 9))
-    path = tmp_path / "bomb.png"
-    path.write_bytes(png_file(with_checksums(parts[0], bomb, *parts[1:])))
-    attempt(lambda: read_color(path))
+    pixels = rf"bomb\.png .*({size[0] * size[1]}|{size[0]} x {size[1]}) pixels"
+    assert_refused(pixels, attempt, lambda: read_color(path), ())
 
 
 @pytest.mark.parametrize("kind", ["BMP", "GIF", "PPM", "EPS"])
