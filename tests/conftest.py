@@ -33,16 +33,6 @@ EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 
 settings.register_profile("default", deadline=None)  # no test may depend on the speed of the machine
 settings.load_profile("default")
-for folder, numbers in EXAMPLES.items():
-    for tier, number in zip(("quick", "thorough"), numbers, strict=True):
-        settings.register_profile(
-            f"{folder}-{tier}",
-            max_examples=number,
-            deadline=None,
-            derandomize=True,
-            database=None,
-            suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-        )
 
 STRICT = ("descriptor", "golden", "properties")
 """Directories whose tests allow no implicit dtype promotion; Flax, which other tests use, relies on it."""
@@ -83,7 +73,15 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
     """Load the profile of a directory: tests keep the settings that are active while their file is imported."""
     folder = collector.path.parent.name if isinstance(collector, pytest.Module) else ""
     if folder in EXAMPLES:
-        settings.load_profile(f"{folder}-{'thorough' if collector.config.getoption('thorough') else 'quick'}")
+        settings.register_profile(
+            folder,
+            max_examples=EXAMPLES[folder][collector.config.getoption("thorough")],
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+        )
+        settings.load_profile(folder)
 
 
 def pytest_collection_finish() -> None:

@@ -10,14 +10,14 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
+from .conftest import batches
+
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
 
 
 @pytest.mark.slow
-@given(
-    aligned=laws.packed(laws.aligned_clouds(CONFIG), 4, 512), clouds=laws.packed(laws.decided_clouds(CONFIG), 4, 512)
-)
+@given(aligned=batches(laws.aligned_clouds(CONFIG)), clouds=batches(laws.decided_clouds(CONFIG)))
 def test_batch_sizes(aligned: thor2.PointClouds, clouds: thor2.PointClouds) -> None:
     laws.assert_batch_size_invariant(lambda c: thor2.describe_aligned(c, NETWORK, CONFIG), aligned, CONFIG)
     drift = laws.alignment_drift(clouds, CONFIG)
