@@ -2,8 +2,10 @@
 
 import asyncio
 import gc
+import json
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -180,6 +182,27 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return line
 
     return run
+
+
+@pytest.fixture
+def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
+    """The messages that `thor2 watch` publishes; it is interrupted when it waits for Ctrl-C."""
+    from thor2_jax.watch.server import Broadcast
+
+    published: list[dict[str, Any]] = []
+    publish = Broadcast.publish
+
+    def record(self: Broadcast, text: str) -> None:
+        published.append(json.loads(text))
+        publish(self, text)
+        if published[-1]["state"] == "ended":
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Broadcast, "publish", record)
+    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job starts with it ignored
+    yield published
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.fixture(scope="module")

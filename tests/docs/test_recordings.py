@@ -1,7 +1,5 @@
 """The commands of docs/recordings.md run on the sample recording; the run's weights are random."""
 
-import json
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,6 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics
-from thor2_jax.watch.server import Broadcast
 from training.rendering.sample_recording import FRAMES, write_sample_recording
 
 COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] == "thor2"]
@@ -54,20 +51,7 @@ def test_recordings_are_recognized(printed: Command) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 3])
-def test_recordings_and_folders_are_watched(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    published: list[dict[str, Any]] = []
-
-    def record(self: Broadcast, text: str) -> None:
-        published.append(json.loads(text))
-        if published[-1]["state"] == "ended":
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Broadcast, "publish", record)
-    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        assert run_thor2(*COMMANDS[number][1:], "--port", "0") == 0
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    live = [one for one in published if one["state"] == "live"]
+def test_recordings_and_folders_are_watched(number: int, messages: list[dict[str, Any]]) -> None:
+    assert run_thor2(*COMMANDS[number][1:], "--port", "0") == 0
+    live = [one for one in messages if one["state"] == "live"]
     assert live and all(one["objects"] and not one["error"] for one in live)
