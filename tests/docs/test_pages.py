@@ -137,7 +137,7 @@ def test_questions_find_their_page_first(browser: Browser, tmp_path: Path) -> No
     page, first = browser.new_page(), {}
     page.set_default_timeout(1000 * HANG)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever).start()
+        threading.Thread(target=server.serve_forever, daemon=True).start()  # ends with a failing test
         site = f"http://127.0.0.1:{server.server_port}/"
         for question in QUESTIONS:
             page.goto(f"{site}index.html?q={question}")

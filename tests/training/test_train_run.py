@@ -10,11 +10,11 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from commands import files_of
 from failures import Interrupted, full_disk, stop_when
 from PIL import Image
 from refusals import assert_refused
 from small_clouds import brick_and_stick, random_clouds
+from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
