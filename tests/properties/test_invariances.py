@@ -1,4 +1,7 @@
-"""What must not change a descriptor: every law over both backends, plainly, under jit and vmap, in two buckets."""
+"""What must not change descriptors and clouds of a frame.
+
+Laws of descriptors hold over both backends, plainly, under jit and vmap, in two buckets.
+"""
 
 import dataclasses
 from typing import Any
@@ -11,6 +14,8 @@ from hypothesis import strategies as st
 import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import instance_clouds
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
@@ -67,3 +72,13 @@ def test_metric_scale(pipeline: Any, data: st.DataObject, exponent: int, sigma_s
 def test_object_unity(pipeline: Any, data: st.DataObject, m: int) -> None:
     aligned = pipeline.draw(data, laws.aligned_clouds(CONFIG, reach=1.3))
     laws.assert_object_unity(pipeline.describe_aligned, aligned, CONFIG, m)
+
+
+@given(frame=laws.frames(), seed=laws.seeds())
+def test_label_numbers_are_names(frame: RGBDFrame, seed: int) -> None:
+    laws.assert_labels_are_names(instance_clouds, frame, seed)
+
+
+@given(frame=laws.frames())
+def test_units_of_depth(frame: RGBDFrame) -> None:
+    laws.assert_depth_units_agree(instance_clouds, frame)
