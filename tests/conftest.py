@@ -25,6 +25,9 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
 # Tracing allocates many objects that stay, so that older generations are practically never collected.
 gc.set_threshold(100_000, 1000, 1000)
+# Programs that tests start import the packages of this checkout and the modules of this directory.
+PATHS = [str(Path(__file__).parents[1]), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, PATHS))
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -35,7 +35,7 @@ training.cli.main()
 def run_without(*arguments: object, before: str = "") -> subprocess.CompletedProcess[str]:
     """Run the command line in a process in which the packages of training cannot be imported."""
     program = PROGRAM.format(packages=TRAINING_PACKAGES, arguments=[*map(str, arguments)], before=before)
-    return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")

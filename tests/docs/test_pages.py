@@ -94,10 +94,9 @@ def printed(notebook: Any) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_notebook_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_runs(name: str) -> None:
     notebook = read(name)
     stored = printed(notebook)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     NotebookClient(notebook, timeout=HANG, kernel_name="python3", resources={"metadata": {"path": str(ROOT)}}).execute()
     assert printed(notebook) == stored
 
@@ -131,7 +130,7 @@ QUESTIONS = {
 def test_questions_find_their_page_first(browser: Browser, tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="mkdocs is not installed (extra docs)")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
-    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=HANG)
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
     page, first = browser.new_page(), {}

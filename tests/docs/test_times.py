@@ -59,7 +59,7 @@ def test_renew_times(tmp_path: Path) -> None:
             shutil.rmtree(tmp_path / words[words.index("--out") + 1], ignore_errors=True)
         start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         command = [sys.executable, "-m", "training.cli", *(word.replace("$samples", samples) for word in words)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": "", "THOR2_CACHE": str(tmp_path / "cache")}
+        environment = {**os.environ, "XLA_FLAGS": "", "THOR2_CACHE": str(tmp_path / "cache")}
         subprocess.run(command, cwd=tmp_path, env=environment, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

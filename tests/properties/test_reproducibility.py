@@ -1,7 +1,5 @@
 """Equal seeds give equal bytes on one machine; other batch sizes and buckets give equal values up to rounding."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from processes import finish_programs, start_program
@@ -25,11 +23,10 @@ def test_batch_sizes(aligned: thor2.PointClouds, clouds: thor2.PointClouds) -> N
 
 
 PROGRAM = """
-import hashlib, sys, tempfile
+import hashlib, tempfile
 from pathlib import Path
 import numpy as np
 from flax import nnx
-sys.path.append(sys.argv[1])
 from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
 import colornet, thor2_jax as thor2
@@ -55,6 +52,5 @@ print(hasher.hexdigest())
 
 @pytest.mark.slow
 def test_two_processes_give_equal_descriptors_and_weights() -> None:
-    tests = Path(__file__).parents[1]
-    first, second = finish_programs(start_program(PROGRAM, tests), start_program(PROGRAM, tests))
+    first, second = finish_programs(start_program(PROGRAM), start_program(PROGRAM))
     assert first == second and len(first.strip()) == 64
