@@ -14,7 +14,7 @@ from typing import Any
 import nbformat
 import pytest
 import typer
-from doc_pages import PAGES, ROOT, shell_commands
+from doc_pages import PAGES, ROOT, thor2_commands
 from nbclient import NotebookClient
 from playwright.sync_api import Browser
 from processes import HANG
@@ -22,13 +22,7 @@ from processes import HANG
 from training.cli import app
 
 PLACEHOLDER = "..."
-COMMANDS = [
-    (page, words[number + 1 :])
-    for page in PAGES
-    for words in shell_commands(page)
-    for number, word in enumerate(words)
-    if word.rpartition("/")[2] == "thor2"
-]
+COMMANDS = [(page, words) for page in PAGES for words in thor2_commands(page)]
 """Page and arguments of every command."""
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from commands import Command, json_lines, run_thor2
-from doc_pages import ROOT, shell_commands
+from doc_pages import ROOT, thor2_commands
 from small_runs import untrained_run
 
 import thor2_jax as thor2
@@ -14,7 +14,7 @@ from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics
 from training.rendering.sample_recording import FRAMES, write_sample_recording
 
-COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] == "thor2"]
+COMMANDS = thor2_commands("docs/recordings.md")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_the_recording_shows_four_objects_apart() -> None:
 def test_recordings_are_recognized(printed: Command) -> None:
     for words, count in zip(COMMANDS[:2], (FRAMES, 2), strict=True):
         assert not Path("answers.mcap").exists()
-        lines = json_lines(printed(*words[1:]))
+        lines = json_lines(printed(*words))
         assert len(lines) == count and all(len(line["instances"]) >= 4 for line in lines)
     assert Path("answers.mcap").is_file()
 
@@ -52,6 +52,6 @@ def test_recordings_are_recognized(printed: Command) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 3])
 def test_recordings_and_folders_are_watched(number: int, messages: list[dict[str, Any]]) -> None:
-    assert run_thor2(*COMMANDS[number][1:], "--port", "0") == 0
+    assert run_thor2(*COMMANDS[number], "--port", "0") == 0
     live = [one for one in messages if one["state"] == "live"]
     assert live and all(one["objects"] and not one["error"] for one in live)

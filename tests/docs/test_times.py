@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from doc_pages import ROOT, shell_commands
+from doc_pages import ROOT, thor2_commands
 from rendered_objects import write_meshes, write_scene
 
 import thor2_jax as thor2
@@ -30,10 +30,10 @@ def timed_commands() -> dict[str, list[str]]:
     """Return the arguments of the commands that end, by what the table calls them."""
     commands = {}
     for page in PAGES:
-        for words in shell_commands(page):
-            if words[0].endswith("thor2") and words[1] not in UNTIMED:
-                called = " ".join(["thor2", *words[1:]])
-                commands[called if len(called) < 90 else called.partition(" --color")[0] + " ..."] = words[1:]
+        for words in thor2_commands(page):
+            if words[0] not in UNTIMED:
+                called = " ".join(["thor2", *words])
+                commands[called if len(called) < 90 else called.partition(" --color")[0] + " ..."] = words
     return commands
 
 
