@@ -2,8 +2,10 @@
 
 import asyncio
 import gc
+import json
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +25,9 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
 # Tracing allocates many objects that stay, so that older generations are practically never collected.
 gc.set_threshold(100_000, 1000, 1000)
+# Programs that tests start import the packages of this checkout and the modules of this directory.
+PATHS = [str(Path(__file__).parents[1]), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, PATHS))
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -33,16 +38,6 @@ EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 
 settings.register_profile("default", deadline=None)  # no test may depend on the speed of the machine
 settings.load_profile("default")
-for folder, numbers in EXAMPLES.items():
-    for tier, number in zip(("quick", "thorough"), numbers, strict=True):
-        settings.register_profile(
-            f"{folder}-{tier}",
-            max_examples=number,
-            deadline=None,
-            derandomize=True,
-            database=None,
-            suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-        )
 
 STRICT = ("descriptor", "golden", "properties")
 """Directories whose tests allow no implicit dtype promotion; Flax, which other tests use, relies on it."""
@@ -83,7 +78,15 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
     """Load the profile of a directory: tests keep the settings that are active while their file is imported."""
     folder = collector.path.parent.name if isinstance(collector, pytest.Module) else ""
     if folder in EXAMPLES:
-        settings.load_profile(f"{folder}-{'thorough' if collector.config.getoption('thorough') else 'quick'}")
+        settings.register_profile(
+            folder,
+            max_examples=EXAMPLES[folder][collector.config.getoption("thorough")],
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+        )
+        settings.load_profile(folder)
 
 
 def pytest_collection_finish() -> None:
@@ -182,6 +185,27 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return line
 
     return run
+
+
+@pytest.fixture
+def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
+    """The messages that `thor2 watch` publishes; it is interrupted when it waits for Ctrl-C."""
+    from thor2_jax.watch.server import Broadcast
+
+    published: list[dict[str, Any]] = []
+    publish = Broadcast.publish
+
+    def record(self: Broadcast, text: str) -> None:
+        published.append(json.loads(text))
+        publish(self, text)
+        if published[-1]["state"] == "ended":
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Broadcast, "publish", record)
+    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job starts with it ignored
+    yield published
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from image_files import write_frame_files
 from PIL import Image
 
-from thor2_jax.frames.frames import Intrinsics, backproject
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 
 SHAPE = (6, 9)
 K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
@@ -134,9 +135,6 @@ def write_uwis(root: Path, video: str, stem: str, poses: str, seed: int = 0) -> 
 
 
 def write_folder(folder: Path, labels: Any, seed: int = 0) -> Path:
-    folder.mkdir(parents=True)
-    for kind, image in zip(("color", "depth", "mask"), images(seed), strict=True):
-        Image.fromarray(image).save(folder / f"{kind}.png")
-    (folder / "intrinsics.json").write_text('{"fx": 600, "fy": 601, "cx": 4, "cy": 3, "width": 9, "height": 6}')
+    write_frame_files(folder, RGBDFrame(*images(seed), Intrinsics(600.0, 601.0, 4.0, 3.0)))
     (folder / "labels.json").write_text(json.dumps(labels))
     return folder

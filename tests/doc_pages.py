@@ -8,10 +8,15 @@ ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md")))]
 
 
-def shell_commands(page: str) -> list[list[str]]:
-    """Return the words of each command in the shell blocks of a page, without comments and redirections."""
+def thor2_commands(page: str) -> list[list[str]]:
+    """Return the arguments of each `thor2` in the shell blocks of a page, without comments and redirections."""
     text = (ROOT / page).read_text(encoding="utf-8")
     blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
     parts = [part for block in blocks for part in re.split(r"&&|\||\n", block.replace("\\\n", " "))]
     commands = [shlex.split(part.partition(" >")[0], comments=True) for part in parts]
-    return [words for words in commands if words]
+    return [
+        words[number + 1 :]
+        for words in commands
+        for number, word in enumerate(words)
+        if word.rpartition("/")[2] == "thor2"
+    ]

@@ -86,7 +86,6 @@ def free_port() -> int:
 def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess.Popen[str]:
     """Start a Python program on the CPU, which JAX divides into some devices."""
     environment = os.environ | {
-        "PYTHONPATH": str(Path(__file__).parents[1]),
         "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}",
         "JAX_PLATFORMS": "cpu",
     }

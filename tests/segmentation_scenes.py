@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.segmentation import overlaps
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.rendering.ray_caster import Hits, RayCaster, pixel_rays
 
@@ -95,12 +96,6 @@ def render(
 
 def best_overlaps(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> NDArray[np.float64]:
     """Return for each true instance 1, 2, ... the largest intersection over union with a label."""
-    return np.array(
-        [
-            max(
-                ((labels == k) & (truth == number)).sum() / ((labels == k) | (truth == number)).sum()
-                for k in [*np.unique(labels[labels > 0]), -1]
-            )
-            for number in range(1, truth.max() + 1)
-        ]
-    )
+    common = overlaps(labels, truth)
+    union = common.sum(axis=1)[:, None] + common.sum(axis=0) - common
+    return np.asarray((common / union)[1:, 1:].max(axis=1, initial=0))

@@ -1,6 +1,5 @@
 """Nothing that tests start outlives them."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -21,9 +20,8 @@ sys.stdin.read()
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes in /proc")
 def test_a_server_ends_with_the_tests_that_started_it() -> None:
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, "-c", PROGRAM]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as tests:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as tests:
         assert tests.stdout is not None
         server = int(tests.stdout.readline())
         tests.send_signal(signal.SIGKILL)

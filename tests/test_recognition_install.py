@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 from image_files import small_frame, write_frame_files
+from refusals import assert_refused
 from small_clouds import random_clouds
 from small_runs import untrained_run
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
 from training.cli.app import TRAINING_PACKAGES
 
@@ -35,7 +35,7 @@ training.cli.main()
 def run_without(*arguments: object, before: str = "") -> subprocess.CompletedProcess[str]:
     """Run the command line in a process in which the packages of training cannot be imported."""
     program = PROGRAM.format(packages=TRAINING_PACKAGES, arguments=[*map(str, arguments)], before=before)
-    return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +74,8 @@ def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
 def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     clouds = thor2.PointClouds.pack(random_clouds(0, [9]))
     monkeypatch.setitem(sys.modules, "gudhi", None)
-    with pytest.raises(InputError, match="homology is .*closed_form"):
-        thor2.describe(clouds, colornet.load_default(), thor2.DescriptorConfig(homology="gudhi", n_slices=2))
+    config = thor2.DescriptorConfig(homology="gudhi", n_slices=2)
+    assert_refused("homology is .*closed_form", thor2.describe, clouds, colornet.load_default(), config)
 
 
 def names(requirements: list[str]) -> dict[str, str]:

@@ -11,16 +11,16 @@ from PIL import Image
 import colornet
 from colornet.draw import draw_network, draw_similarity
 
+NETWORK = colornet.load_default()
+
 
 @pytest.mark.parametrize("draw", [draw_network, draw_similarity])
-def test_every_region_shows_its_mean_color(
-    network: colornet.ColorNetwork, tmp_path: Path, draw: Callable[[colornet.ColorNetwork, Path], None]
-) -> None:
-    draw(network, tmp_path / "picture.png")
+def test_every_region_shows_its_mean_color(tmp_path: Path, draw: Callable[[colornet.ColorNetwork, Path], None]) -> None:
+    draw(NETWORK, tmp_path / "picture.png")
     assert os.listdir(tmp_path) == ["picture.png"]
     pixels = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).reshape(-1, 3)
     assert len(pixels) >= 1000**2
     shown, counts = np.unique(pixels, axis=0, return_counts=True)
-    for region, mean in enumerate(network.mean_rgb):
+    for region, mean in enumerate(NETWORK.mean_rgb):
         near = counts[np.abs(shown - mean).max(axis=-1) <= 1]
         assert near.sum() > 100, f"region {region}"

@@ -14,46 +14,45 @@ import pytest
 import colornet
 from colornet.files import read_arrays, read_file, write_arrays
 
+NETWORK = colornet.load_default()
+CONTENTS = {field.name: getattr(NETWORK, field.name) for field in dataclasses.fields(NETWORK)}
+
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
 
 
-def contents(network: colornet.ColorNetwork) -> dict[str, Any]:
-    return {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
-
-
-def test_round_trip(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
-    network.save(path)
+    NETWORK.save(path)
     again = colornet.load(str(path))
-    for name, value in contents(network).items():
+    for name, value in CONTENTS.items():
         np.testing.assert_array_equal(getattr(again, name), value, strict=True)
-    assert again.fingerprint == network.fingerprint
+    assert again.fingerprint == NETWORK.fingerprint
     colornet.save(again, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
     assert sorted(os.listdir(tmp_path)) == ["again.npz", "network.npz"]
 
 
-def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
-    arrays = {name: np.array(value) for name, value in contents(network).items() if isinstance(value, np.ndarray)}
-    copy = dataclasses.replace(network, **arrays)
+def test_arrays_are_read_only_copies() -> None:
+    arrays = {name: np.array(value) for name, value in CONTENTS.items() if isinstance(value, np.ndarray)}
+    copy = dataclasses.replace(NETWORK, **arrays)
     for name, array in arrays.items():
         array[0] = 0
         with pytest.raises(ValueError, match="read-only"):
             getattr(copy, name)[0] = 0
-    assert copy.fingerprint == network.fingerprint
+    assert copy.fingerprint == NETWORK.fingerprint
 
 
-def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> None:
-    assert network.fingerprint == FINGERPRINT
-    again = dataclasses.replace(network)
-    assert again is not network and again == network and hash(again) == hash(network) and network != "network"
-    changed = {name: np.array(getattr(network, name)) for name in ("mean_rgb", "edge_weights", "similarity")}
+def test_fingerprint_distinguishes_networks() -> None:
+    assert NETWORK.fingerprint == FINGERPRINT
+    again = dataclasses.replace(NETWORK)
+    assert again is not NETWORK and again == NETWORK and hash(again) == hash(NETWORK) and NETWORK != "network"
+    changed = {name: np.array(getattr(NETWORK, name)) for name in ("mean_rgb", "edge_weights", "similarity")}
     for values in changed.values():
         values.flat[-1] += 1e-6
-    changed |= {"cyclic": ~network.cyclic, "edges": network.edges[:, ::-1], "n_raw_nodes": 24}
-    changed["region_bits"] = np.roll(network.region_bits, 1)
-    others = [network, *(dataclasses.replace(network, **{name: value}) for name, value in changed.items())]
+    changed |= {"cyclic": ~NETWORK.cyclic, "edges": NETWORK.edges[:, ::-1], "n_raw_nodes": 24}
+    changed["region_bits"] = np.roll(NETWORK.region_bits, 1)
+    others = [NETWORK, *(dataclasses.replace(NETWORK, **{name: value}) for name, value in changed.items())]
     assert len({other.fingerprint for other in others}) == len(set(others)) == 8
 
 
@@ -76,24 +75,22 @@ def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> N
         ({"similarity": np.full((22, 22), np.nan)}, "similarity has a value"),
     ],
 )
-def test_inconsistent_contents_are_rejected(
-    network: colornet.ColorNetwork, tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+def test_inconsistent_contents_are_rejected(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError) as direct:
-        dataclasses.replace(network, **change)
+        dataclasses.replace(NETWORK, **change)
     assert str(direct.value).startswith(message)
     path = tmp_path / "network.npz"
-    write_arrays(path, {name: np.asarray(value) for name, value in {**contents(network), **change}.items()})
+    write_arrays(path, {name: np.asarray(value) for name, value in {**CONTENTS, **change}.items()})
     with pytest.raises(ValueError) as loaded:
         colornet.load(path)
     assert str(loaded.value).startswith(str(path)) and str(loaded.value).endswith(str(direct.value))
 
 
-def test_damaged_and_foreign_files_raise_one_line(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+def test_damaged_and_foreign_files_raise_one_line(tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
-    network.save(path)
+    NETWORK.save(path)
     good, array = path.read_bytes(), io.BytesIO()
-    np.save(array, network.similarity)
+    np.save(array, NETWORK.similarity)
     for content in (b"", b"not a network\n" * 9, good[: len(good) // 2], good[:-1], array.getvalue()):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"^{path} is damaged.*$"):
@@ -136,7 +133,6 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path: Path) -> None
 
 def test_loading_imports_neither_kmapper_nor_other_packages() -> None:
     script = "import colornet, sys; colornet.load_default().membership; print(*sys.modules)"
-    root = Path(colornet.__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert not loaded & {"kmapper", "sklearn", "colour", "matplotlib", "jax", "thor2_jax", "training"}

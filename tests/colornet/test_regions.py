@@ -10,6 +10,8 @@ from colornet.lab import MEAN_WHITE, hyab, to_lab
 
 from .test_color_math import reference_hyab, reference_lab
 
+NETWORK = colornet.load_default()
+
 
 def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     length = np.full((n, n), np.inf)
@@ -20,17 +22,17 @@ def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64
     return length
 
 
-def test_similarity_of_the_packaged_network(network: colornet.ColorNetwork) -> None:
+def test_similarity_of_the_packaged_network() -> None:
     """Recompute means, their CIELAB, edge weights, paths and similarity from the colours."""
     colors = grid_colors().astype(np.float64)
-    member = (network.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
+    member = (NETWORK.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
     means = (member.T @ colors) / member.sum(axis=0)[:, None]
-    np.testing.assert_allclose(network.mean_rgb, means, rtol=1e-13)
+    np.testing.assert_allclose(NETWORK.mean_rgb, means, rtol=1e-13)
     lab = reference_lab(means, MEAN_WHITE)
-    weights = np.array([reference_hyab(lab[i], lab[j]) for i, j in network.edges])
-    np.testing.assert_allclose(network.edge_weights, weights, rtol=1e-11)
-    expected = 1 / (1 + floyd_warshall(22, network.edges, weights))
-    np.testing.assert_allclose(network.similarity, expected, rtol=1e-11)
+    weights = np.array([reference_hyab(lab[i], lab[j]) for i, j in NETWORK.edges])
+    np.testing.assert_allclose(NETWORK.edge_weights, weights, rtol=1e-11)
+    expected = 1 / (1 + floyd_warshall(22, NETWORK.edges, weights))
+    np.testing.assert_allclose(NETWORK.similarity, expected, rtol=1e-11)
 
 
 def test_similarity_of_random_graphs() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import nbformat
 import pytest
 import typer
-from doc_pages import PAGES, ROOT, shell_commands
+from doc_pages import PAGES, ROOT, thor2_commands
 from nbclient import NotebookClient
 from playwright.sync_api import Browser
 from processes import HANG
@@ -22,13 +22,7 @@ from processes import HANG
 from training.cli import app
 
 PLACEHOLDER = "..."
-COMMANDS = [
-    (page, words[number + 1 :])
-    for page in PAGES
-    for words in shell_commands(page)
-    for number, word in enumerate(words)
-    if word.rpartition("/")[2] == "thor2"
-]
+COMMANDS = [(page, words) for page in PAGES for words in thor2_commands(page)]
 """Page and arguments of every command."""
 
 
@@ -94,10 +88,9 @@ def printed(notebook: Any) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_notebook_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_runs(name: str) -> None:
     notebook = read(name)
     stored = printed(notebook)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     NotebookClient(notebook, timeout=HANG, kernel_name="python3", resources={"metadata": {"path": str(ROOT)}}).execute()
     assert printed(notebook) == stored
 
@@ -131,13 +124,13 @@ QUESTIONS = {
 def test_questions_find_their_page_first(browser: Browser, tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="mkdocs is not installed (extra docs)")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
-    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=HANG)
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
     page, first = browser.new_page(), {}
     page.set_default_timeout(1000 * HANG)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever).start()
+        threading.Thread(target=server.serve_forever, daemon=True).start()  # ends with a failing test
         site = f"http://127.0.0.1:{server.server_port}/"
         for question in QUESTIONS:
             page.goto(f"{site}index.html?q={question}")

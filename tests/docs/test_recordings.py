@@ -1,23 +1,20 @@
 """The commands of docs/recordings.md run on the sample recording; the run's weights are random."""
 
-import json
-import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import Command, json_lines, run_thor2
-from doc_pages import ROOT, shell_commands
+from doc_pages import ROOT, thor2_commands
 from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics
-from thor2_jax.watch.live import Broadcast
 from training.rendering.sample_recording import FRAMES, write_sample_recording
 
-COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] == "thor2"]
+COMMANDS = thor2_commands("docs/recordings.md")
 
 
 @pytest.fixture(scope="module")
@@ -47,27 +44,14 @@ def test_the_recording_shows_four_objects_apart() -> None:
 def test_recordings_are_recognized(printed: Command) -> None:
     for words, count in zip(COMMANDS[:2], (FRAMES, 2), strict=True):
         assert not Path("answers.mcap").exists()
-        lines = json_lines(printed(*words[1:]))
+        lines = json_lines(printed(*words))
         assert len(lines) == count and all(len(line["instances"]) >= 4 for line in lines)
     assert Path("answers.mcap").is_file()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 3])
-def test_recordings_and_folders_are_watched(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    published: list[dict[str, Any]] = []
-
-    def record(self: Broadcast, text: str) -> None:
-        published.append(json.loads(text))
-        if published[-1]["state"] == "ended":
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Broadcast, "publish", record)
-    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        assert run_thor2(*COMMANDS[number][1:], "--port", "0") == 0
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    live = [one for one in published if one["state"] == "live"]
+def test_recordings_and_folders_are_watched(number: int, messages: list[dict[str, Any]]) -> None:
+    assert run_thor2(*COMMANDS[number], "--port", "0") == 0
+    live = [one for one in messages if one["state"] == "live"]
     assert live and all(one["objects"] and not one["error"] for one in live)

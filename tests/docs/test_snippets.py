@@ -7,7 +7,6 @@ take these arguments.
 import doctest
 import json
 import re
-import shlex
 import sys
 import types
 from pathlib import Path
@@ -17,7 +16,7 @@ from unittest.mock import MagicMock, create_autospec
 import numpy as np
 import pytest
 from commands import run_thor2
-from doc_pages import PAGES, ROOT
+from doc_pages import PAGES, ROOT, thor2_commands
 from image_files import patches, tilted, write_frame_files
 from recording_files import table_frame
 from small_clouds import random_clouds
@@ -93,9 +92,9 @@ def test_landing_page_and_first_tutorial(run: Path, capsys: pytest.CaptureFixtur
     run_blocks("docs/index.md", 0)
     assert len(capsys.readouterr().out.splitlines()) == 5
     page = "docs/tutorials/first-table.md"
-    (command,) = re.findall(r"thor2 (recognize .*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+    (words,) = [words for words in thor2_commands(page) if words[0] == "recognize"]
     samples = str(Path(thor2.__path__[0], "service/page/samples"))
-    assert run_thor2(*shlex.split(command.replace("$samples", samples).replace("\\\n", " "))) == 0
+    assert run_thor2(*(word.replace("$samples", samples) for word in words)) == 0
     answers = json.loads(Path("answer/recognition.json").read_text())
     names = run_blocks(page, 0)["names"]
     assert len(names) == 5 and str(min(names)) in json.dumps(answers)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from doc_pages import ROOT, shell_commands
+from doc_pages import ROOT, thor2_commands
 from rendered_objects import write_meshes, write_scene
 
 import thor2_jax as thor2
@@ -30,10 +30,10 @@ def timed_commands() -> dict[str, list[str]]:
     """Return the arguments of the commands that end, by what the table calls them."""
     commands = {}
     for page in PAGES:
-        for words in shell_commands(page):
-            if words[0].endswith("thor2") and words[1] not in UNTIMED:
-                called = " ".join(["thor2", *words[1:]])
-                commands[called if len(called) < 90 else called.partition(" --color")[0] + " ..."] = words[1:]
+        for words in thor2_commands(page):
+            if words[0] not in UNTIMED:
+                called = " ".join(["thor2", *words])
+                commands[called if len(called) < 90 else called.partition(" --color")[0] + " ..."] = words
     return commands
 
 
@@ -59,7 +59,7 @@ def test_renew_times(tmp_path: Path) -> None:
             shutil.rmtree(tmp_path / words[words.index("--out") + 1], ignore_errors=True)
         start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         command = [sys.executable, "-m", "training.cli", *(word.replace("$samples", samples) for word in words)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": "", "THOR2_CACHE": str(tmp_path / "cache")}
+        environment = {**os.environ, "XLA_FLAGS": "", "THOR2_CACHE": str(tmp_path / "cache")}
         subprocess.run(command, cwd=tmp_path, env=environment, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -58,6 +58,12 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path): (folder / path).read_bytes() for path in paths if not any(p[0] == "." for p in path.parts)}
 
 
+def finish(*command: object) -> dict[str, bytes]:
+    """Run a command, which must succeed, and return the files of its last argument."""
+    assert run_thor2(*command) == 0
+    return files(Path(str(command[-1])))
+
+
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Directory of two boxes with vertex colors."""
@@ -88,9 +94,8 @@ STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
 
 
 def test_render(meshes: Path, refused: Command, tmp_path: Path) -> None:
-    command, whole, out = ("render", "--meshes", meshes, *STEPS, "--out"), tmp_path / "whole", tmp_path / "views"
-    assert run_thor2(*command, whole) == 0
-    expected = files(whole)
+    command, out = ("render", "--meshes", meshes, *STEPS, "--out"), tmp_path / "views"
+    expected = finish(*command, tmp_path / "whole")
     for place in (f"before {MANIFEST}", "before 0001-0000.safetensors"):
         kill(place, *command, out)
         written = files(out)
@@ -101,8 +106,8 @@ def test_render(meshes: Path, refused: Command, tmp_path: Path) -> None:
         assert written.items() <= expected.items()
         assert str(out / MANIFEST) in refused("train", "--dataset", out, "--out", tmp_path / "run")
     assert f"out: {out} was written with variations null" in refused(*command, out, "--seed", 1, "--sensor")
-    assert run_thor2(*command, out) == 0
-    assert files(out) == expected and files(out).keys() | {".lock"} == {path.name for path in out.iterdir()}
+    assert finish(*command, out) == expected
+    assert expected.keys() | {".lock"} == {path.name for path in out.iterdir()}
 
 
 def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
@@ -115,8 +120,7 @@ def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
 def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> None:
     options = (*STEPS, "--paper", "--batch-size", 16, "--classifiers", "ce", "--baselines", "forest", "--epochs", 2)
     command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
-    assert run_thor2(*command, whole) == 0
-    expected, run = files(whole), load_run(whole)
+    expected, run = finish(*command, whole), load_run(whole)
     kept = "checkpoints/fold-0/ce/1.safetensors"
     for place in (kept, "curves.png", "run.json", "baselines/forest.safetensors", ".thor2-*/views"):
         kill(f"{'after' if place == kept else 'before'} {place}", *command, out)
@@ -129,10 +133,9 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
             assert f"{out} is not a run directory" in refused("evaluate", "frames", frames, "--model", out)
         if "checkpoints/begun.json" in written:
             assert f"{out} was written with epochs 2, not 3" in refused(*command, out, "--epochs", 3, at_once=False)
-    assert run_thor2(*command, out) == 0
+    written = finish(*command, out)
     assert equal_models(load_run(out), run)
     assert not list(out.glob(".*")) and not (out / "views").exists()
-    written = files(out)
     assert written.keys() == expected.keys()
     different = {name for name in written if written[name] != expected[name]}  # these two hold measured times
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
@@ -153,9 +156,8 @@ def without_times(contents: dict[str, bytes]) -> dict[str, Any]:
 
 def test_evaluate(frames: Path, model: Path, refused: Command, tmp_path: Path) -> None:
     command = "evaluate", "frames", frames, "--model", model, "--out"
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    assert run_thor2(*command, whole) == 0
-    expected = without_times(files(whole))
+    out, whole = tmp_path / "out", finish(*command, tmp_path / "whole")
+    expected = without_times(whole)
     kill("before frames/1.jpg", *command, out)
     written = without_times(files(out))
     kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
@@ -163,18 +165,16 @@ def test_evaluate(frames: Path, model: Path, refused: Command, tmp_path: Path) -
     assert all(written[name] == expected[name] for name in kept)
     error = refused("evaluate", "frames", frames / "one", *command[3:], out)
     assert f"out: {out} was written with dataset.path " in error
-    assert run_thor2(*command, out) == 0
-    assert without_times(files(out)) == expected and files(out).keys() == files(whole).keys()
+    resumed = finish(*command, out)
+    assert without_times(resumed) == expected and resumed.keys() == whole.keys()
 
 
 def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
     images = frame_options(frames / "one")
-    command, whole, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "whole", tmp_path / "out"
-    assert run_thor2(*command, whole) == 0
+    command, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "out"
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
-    assert run_thor2(*command, out) == 0
-    assert files(out) == files(whole)
+    assert finish(*command, out) == finish(*command, tmp_path / "whole")
 
 
 def test_enroll(meshes: Path, tmp_path: Path) -> None:

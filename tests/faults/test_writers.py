@@ -1,7 +1,10 @@
 """All writers on a disk that becomes full at any step: no file is partial or lost."""
 
+import builtins
 import dataclasses
 import errno
+import io
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,69 @@ from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.loop import EpochMetrics, append_metrics, read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
+
+class Disk:
+    """Count the write operations under a directory, and fail from the n-th on, like a full disk.
+
+    Opening for writing, writing, creating a directory and renaming each count once. Removing never fails.
+    """
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.folder, self.count, self.fail_at = str(folder), 0, 0
+        for module in (builtins, io):
+            patch.setattr(module, "open", self._opening(module.open))
+        for name in ("mkdir", "rename", "replace"):
+            patch.setattr(os, name, self._failing(getattr(os, name)))
+        patch.setattr(os, "open", self._failing(os.open, lambda flags, *_: flags & os.O_CREAT))
+
+    def step(self, path: Any) -> None:
+        if isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.folder):
+            self.count += 1
+            if self.fail_at and self.count >= self.fail_at:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
+
+    def _failing(self, function: Callable[..., Any], writes: Any = lambda *_: True) -> Callable[..., Any]:
+        def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
+            if writes(*rest):
+                self.step(path)
+            return function(path, *rest, **more)
+
+        return wrapper
+
+    def _opening(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
+            if not set(mode) & set("wxa+") or not isinstance(path, (str, os.PathLike)):
+                return function(path, mode, *rest, **more)
+            self.step(path)
+            stream = function(path, mode, *rest, **more)
+            self._failing_writes(stream, path)
+            return stream
+
+        return wrapper
+
+    def _failing_writes(self, stream: Any, path: Any) -> None:
+        write = stream.write
+
+        def failing_write(content: Any) -> Any:
+            try:
+                self.step(path)
+            except OSError:
+                write(content[: len(content) // 2])  # the part that still fits
+                raise
+            return write(content)
+
+        stream.write = failing_write
+
+    def fail_from(self, step: int) -> None:
+        """Restart the count; fail from a step on, or never if it is 0."""
+        self.count, self.fail_at = 0, step
+
+
+@pytest.fixture
+def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(tmp_path, monkeypatch)
+
+
 NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)
 
@@ -38,7 +104,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_files_are_written_atomically(name: str, tmp_path: Path, disk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_written_atomically(name: str, tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Figure, "savefig", lambda _, file, **options: Image.fromarray(PHOTO).save(file, "PNG"))
     path = tmp_path / name
     path.write_bytes(b"old")
@@ -54,7 +120,7 @@ def test_files_are_written_atomically(name: str, tmp_path: Path, disk: Any, monk
     assert step > 2 and path.read_bytes() != b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_run_directory_is_written_atomically(tmp_path: Path, disk: Any) -> None:
+def test_a_run_directory_is_written_atomically(tmp_path: Path, disk: Disk) -> None:
     run = untrained_run(("a", "b"), ("ce",))
     save_run(run, tmp_path / "whole")
     steps = disk.count
@@ -68,7 +134,7 @@ def test_a_run_directory_is_written_atomically(tmp_path: Path, disk: Any) -> Non
     assert load_run(tmp_path / "run").classes == ("a", "b")
 
 
-def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
+def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Disk) -> None:
     path, job = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
     answers = [FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, []) for k in range(3)]
     AnswerFile(path, job).append(answers[0])
@@ -89,7 +155,7 @@ def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     assert len(AnswerFile(path, job).frames) == 3
 
 
-def test_metrics_on_a_full_disk(tmp_path: Path, disk: Any) -> None:
+def test_metrics_on_a_full_disk(tmp_path: Path, disk: Disk) -> None:
     """An epoch that is cut off is discarded when the training resumes."""
     metrics = EpochMetrics(*[0.5] * len(dataclasses.fields(EpochMetrics)))
     for step in (1, 2):

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from image_files import encode_image, png_file, with_checksums
 from refusals import assert_refused
 
-from thor2_jax.errors import InputError
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
 from thor2_jax.testing import damaged
@@ -129,14 +128,18 @@ for kind in ("ascii", "binary"):
     READERS[f"{kind}.pcd"] = cloud, read_organized_points, are_points
 
 
+def check(path: Path, content: bytes, attempt: Any) -> None:
+    """Read a file with some content, which is refused or gives a valid result."""
+    _, read, is_valid = READERS[path.name]
+    path.write_bytes(content)
+    result = attempt(lambda: read(path))
+    assert result is None or is_valid(result)
+
+
 @pytest.mark.parametrize("name", READERS)
 @given(data=st.data())
 def test_damaged_files(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
-    content, read, is_valid = READERS[name]
-    path = tmp_path / name
-    path.write_bytes(data.draw(damaged(content)))
-    result = attempt(lambda: read(path))
-    assert result is None or is_valid(result)
+    check(tmp_path / name, data.draw(damaged(READERS[name][0])), attempt)
 
 
 YAML_BOMB = "\n".join(
@@ -174,18 +177,14 @@ def chunks(content: bytes) -> list[tuple[bytes, bytes]]:
 @pytest.mark.parametrize("name", [name for name in READERS if name.endswith("png")])
 @given(data=st.data())
 def test_damaged_png_chunks_with_valid_checksums(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
-    content, read, is_valid = READERS[name]
-    parts = chunks(content)
+    parts = chunks(READERS[name][0])
     k = data.draw(st.integers(0, len(parts) - 1))
     kind, body = parts[k]
     if kind == b"IDAT" and data.draw(st.booleans()):
         body = zlib.compress(data.draw(damaged(zlib.decompress(body))))
     elif body:
         body = data.draw(damaged(body, 1))
-    path = tmp_path / name
-    path.write_bytes(png_file(with_checksums(*parts[:k], (kind, body), *parts[k + 1 :])))
-    image = attempt(lambda: read(path))
-    assert image is None or is_valid(image)
+    check(tmp_path / name, png_file(with_checksums(*parts[:k], (kind, body), *parts[k + 1 :])), attempt)
 
 
 @pytest.mark.parametrize("size", [(65_000, 65_000), (2**31 - 1, 2**31 - 1), (13_000, 13_000), (170_000_000, 1)])
@@ -195,16 +194,8 @@ def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attem
     header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
     path = tmp_path / "bomb.png"
     path.write_bytes(png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))))
-    with pytest.raises(InputError, match=rf"bomb\.png .*({size[0] * size[1]}|{size[0]} x {size[1]}) pixels"):
-        attempt(lambda: read_color(path), ())
-
-
-def test_text_that_would_fill_memory(attempt: Any, tmp_path: Path) -> None:
-    parts = chunks(encode_image(COLOR))
-    bomb = (b"zTXt", b"key\0\0" + zlib.compress(bytes(2**26), 9))
-    path = tmp_path / "bomb.png"
-    path.write_bytes(png_file(with_checksums(parts[0], bomb, *parts[1:])))
-    attempt(lambda: read_color(path))
+    pixels = rf"bomb\.png .*({size[0] * size[1]}|{size[0]} x {size[1]}) pixels"
+    assert_refused(pixels, attempt, lambda: read_color(path), ())
 
 
 @pytest.mark.parametrize("kind", ["BMP", "GIF", "PPM", "EPS"])
@@ -219,7 +210,7 @@ def test_bad_readers_are_failures(attempt: Any, reader_process: Any, monkeypatch
     def refuse() -> None:
         raise OSError("two\nlines")
 
-    with pytest.raises(AssertionError):
+    with pytest.raises(AssertionError, match="two"):
         attempt(refuse)
     monkeypatch.setattr(reader_process, "memory", 2**25)
     with pytest.raises(AssertionError, match="the reader takes"):

@@ -7,13 +7,18 @@ from typing import Any
 
 import jax
 import pytest
+from hypothesis import strategies as st
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax import testing as laws
 
 NETWORK = colornet.load_default()
-SIZE = 4
-"""Number of clouds in a batch; under vmap, two batches of two."""
+
+
+def batches(clouds: Any, capacity: int = 512) -> Any:
+    """Generate batches of four clouds; under vmap, two batches of two."""
+    return laws.packed(clouds, 4, capacity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,16 +29,17 @@ class Pipeline:
     mode: str
     capacity: int
 
-    def _call(self, function: Any, *arguments: Any) -> Any:
-        return _compiled(function, self.config, self.mode)(*arguments)
+    def draw(self, data: st.DataObject, clouds: Any) -> thor2.PointClouds:
+        return data.draw(batches(clouds, self.capacity))
 
-    def describe(self, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None) -> thor2.Descriptors:
-        return self._call(thor2.describe, clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
-
-    def describe_aligned(
-        self, aligned: thor2.PointClouds, parameters: thor2.Parameters | None = None
+    def _call(
+        self, function: Any, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None
     ) -> thor2.Descriptors:
-        return self._call(thor2.describe_aligned, aligned, parameters or thor2.Parameters.of(NETWORK, self.config))
+        call = _compiled(function, self.config, self.mode)
+        return call(clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
+
+    describe = functools.partialmethod(_call, thor2.describe)
+    describe_aligned = functools.partialmethod(_call, thor2.describe_aligned)
 
 
 @functools.cache

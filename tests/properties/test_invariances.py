@@ -1,4 +1,7 @@
-"""What must not change a descriptor: every law over both backends, plainly, under jit and vmap, in two buckets."""
+"""What must not change descriptors and clouds of a frame.
+
+Laws of descriptors hold over both backends, plainly, under jit and vmap, in two buckets.
+"""
 
 import dataclasses
 from typing import Any
@@ -11,20 +14,17 @@ from hypothesis import strategies as st
 import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import instance_clouds
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
-SIZE = 4
-
-
-def draw(data: st.DataObject, clouds: Any, capacity: int) -> thor2.PointClouds:
-    return data.draw(laws.packed(clouds, SIZE, capacity))
 
 
 @given(data=st.data(), seed=laws.seeds())
 def test_order_padding_and_duplicates(pipeline: Any, data: st.DataObject, seed: int) -> None:
-    aligned = draw(data, laws.aligned_clouds(CONFIG, max_points=256), pipeline.capacity)
-    clouds = draw(data, laws.decided_clouds(CONFIG, max_points=256), pipeline.capacity)
+    aligned = pipeline.draw(data, laws.aligned_clouds(CONFIG, max_points=256))
+    clouds = pipeline.draw(data, laws.decided_clouds(CONFIG, max_points=256))
     for describe, batch, drift in (
         (pipeline.describe_aligned, aligned, None),
         (pipeline.describe, clouds, laws.alignment_drift(clouds, CONFIG)),
@@ -36,22 +36,22 @@ def test_order_padding_and_duplicates(pipeline: Any, data: st.DataObject, seed: 
 
 @given(data=st.data(), seed=laws.seeds())
 def test_company_and_colours_of_the_same_regions(pipeline: Any, data: st.DataObject, seed: int) -> None:
-    clouds, others = (draw(data, laws.camera_clouds(), pipeline.capacity) for _ in range(2))
+    clouds, others = (pipeline.draw(data, laws.camera_clouds()) for _ in range(2))
     laws.assert_company_invariant(pipeline.describe, clouds, others)
     laws.assert_same_regions_alike(pipeline.describe, clouds, NETWORK, seed)
-    aligned = (draw(data, laws.aligned_clouds(CONFIG, reach=1.5), pipeline.capacity) for _ in range(2))
+    aligned = (pipeline.draw(data, laws.aligned_clouds(CONFIG, reach=1.5)) for _ in range(2))
     laws.assert_company_invariant(pipeline.describe_aligned, *aligned)
 
 
 @given(data=st.data(), steps=st.tuples(*[st.integers(-2048, 2048)] * 3))
 def test_translation(pipeline: Any, data: st.DataObject, steps: tuple[int, int, int]) -> None:
-    clouds = draw(data, laws.lattice_clouds(), pipeline.capacity)
+    clouds = pipeline.draw(data, laws.lattice_clouds())
     laws.assert_translation_invariant(pipeline.describe, clouds, np.array(steps) / 2048)
 
 
 @given(data=st.data(), rotation=laws.rotations(), shift=st.tuples(*[st.floats(-1, 1)] * 3))
 def test_rigid_motion(pipeline: Any, data: st.DataObject, rotation: np.ndarray, shift: tuple[float, ...]) -> None:
-    clouds = draw(data, laws.decided_clouds(CONFIG), pipeline.capacity)
+    clouds = pipeline.draw(data, laws.decided_clouds(CONFIG))
     away = dataclasses.replace(clouds, points=jnp.asarray(np.asarray(clouds.points) @ rotation.T + shift, jnp.float32))
     drift = max(laws.alignment_drift(placed, CONFIG) for placed in (clouds, away))
     laws.assert_rigid_motion_invariant(pipeline.describe, clouds, rotation, shift, CONFIG, drift)
@@ -64,11 +64,21 @@ def test_metric_scale(pipeline: Any, data: st.DataObject, exponent: int, sigma_s
     def describe_at(clouds: thor2.PointClouds, sigma_s: float) -> thor2.Descriptors:
         return pipeline.describe(clouds, dataclasses.replace(parameters, sigma_s=jnp.float32(sigma_s)))
 
-    clouds = draw(data, laws.camera_clouds(), pipeline.capacity)
+    clouds = pipeline.draw(data, laws.camera_clouds())
     laws.assert_scale_invariant(describe_at, clouds, sigma_s, exponent)
 
 
 @given(data=st.data(), m=st.integers(0, 7))
 def test_object_unity(pipeline: Any, data: st.DataObject, m: int) -> None:
-    aligned = draw(data, laws.aligned_clouds(CONFIG, reach=1.3), pipeline.capacity)
+    aligned = pipeline.draw(data, laws.aligned_clouds(CONFIG, reach=1.3))
     laws.assert_object_unity(pipeline.describe_aligned, aligned, CONFIG, m)
+
+
+@given(frame=laws.frames(), seed=laws.seeds())
+def test_label_numbers_are_names(frame: RGBDFrame, seed: int) -> None:
+    laws.assert_labels_are_names(instance_clouds, frame, seed)
+
+
+@given(frame=laws.frames())
+def test_units_of_depth(frame: RGBDFrame) -> None:
+    laws.assert_depth_units_agree(instance_clouds, frame)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from slow_tier import slow
+from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
@@ -25,19 +26,6 @@ shares_of = jax.jit(lambda colors, temperature: soft_regions(colors, SETS, tempe
 def relaxed(factor: float) -> thor2.DescriptorConfig:
     temperatures = {name: factor * value for name, value in dataclasses.asdict(thor2.Relaxation()).items()}
     return dataclasses.replace(HARD, relaxation=thor2.Relaxation(**temperatures))
-
-
-def cloud_in_cells(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points at least a fifth of a width from every border, but for some on the two planes that aligned clouds touch.
-
-    Few strips, so that there are many points in some, and heights far apart in neighbouring ones.
-    """
-    rng = np.random.default_rng(seed)
-    cells = rng.integers(0, rng.integers(1, [32, 2, 8]), (count, 3))
-    points = (cells + rng.uniform(0.2, 0.8, (count, 3))) * [0.025, 0.5, 0.1]
-    points[rng.random(count) < 0.1, 0] = 0
-    points[rng.random(count) < 0.1, 2] = 0
-    return points.astype(np.float32), rng.integers(0, 256, (count, 3), dtype=np.uint8)
 
 
 def test_points_outside_the_hard_slices_are_left_out() -> None:
@@ -115,7 +103,7 @@ def test_a_strip_that_is_left_vanishes_without_a_jump() -> None:
 
 
 def test_both_backends_agree() -> None:
-    clouds = thor2.PointClouds.pack([cloud_in_cells(k, n) for k, n in enumerate((200, 0, 1, 37))], 208)
+    clouds = thor2.PointClouds.pack([aligned_cloud(k, n, (0.2, 1.0, 0.3)) for k, n in enumerate((200, 0, 1, 37))], 208)
     first, second = (
         thor2.describe_aligned(clouds, NETWORK, dataclasses.replace(relaxed(1), homology=name))
         for name in ("closed_form", "gudhi")

@@ -1,7 +1,5 @@
 """Equal seeds give equal bytes on one machine; other batch sizes and buckets give equal values up to rounding."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from processes import finish_programs, start_program
@@ -10,14 +8,14 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
+from .conftest import batches
+
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
 
 
 @pytest.mark.slow
-@given(
-    aligned=laws.packed(laws.aligned_clouds(CONFIG), 4, 512), clouds=laws.packed(laws.decided_clouds(CONFIG), 4, 512)
-)
+@given(aligned=batches(laws.aligned_clouds(CONFIG)), clouds=batches(laws.decided_clouds(CONFIG)))
 def test_batch_sizes(aligned: thor2.PointClouds, clouds: thor2.PointClouds) -> None:
     laws.assert_batch_size_invariant(lambda c: thor2.describe_aligned(c, NETWORK, CONFIG), aligned, CONFIG)
     drift = laws.alignment_drift(clouds, CONFIG)
@@ -25,11 +23,10 @@ def test_batch_sizes(aligned: thor2.PointClouds, clouds: thor2.PointClouds) -> N
 
 
 PROGRAM = """
-import hashlib, sys, tempfile
+import hashlib, tempfile
 from pathlib import Path
 import numpy as np
 from flax import nnx
-sys.path.append(sys.argv[1])
 from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
 import colornet, thor2_jax as thor2
@@ -55,6 +52,5 @@ print(hasher.hexdigest())
 
 @pytest.mark.slow
 def test_two_processes_give_equal_descriptors_and_weights() -> None:
-    tests = Path(__file__).parents[1]
-    first, second = finish_programs(start_program(PROGRAM, tests), start_program(PROGRAM, tests))
+    first, second = finish_programs(start_program(PROGRAM), start_program(PROGRAM))
     assert first == second and len(first.strip()) == 64

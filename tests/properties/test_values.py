@@ -14,17 +14,15 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
+from .conftest import batches
+
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
-SIZE = 4
-
-
-def aligned_batches(max_points: int = 512, margin: float = 0.1, reach: float = 1.0) -> Any:
-    return laws.packed(laws.aligned_clouds(CONFIG, max_points=max_points, margin=margin, reach=reach), SIZE, 512)
+ALIGNED = batches(laws.aligned_clouds(CONFIG))
 
 
 @pytest.mark.slow
-@given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), aligned=aligned_batches(reach=1.5))
+@given(clouds=batches(laws.camera_clouds()), aligned=batches(laws.aligned_clouds(CONFIG, reach=1.5)))
 def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.PointClouds) -> None:
     for function, batch in ((thor2.describe, clouds), (thor2.describe_aligned, aligned)):
         for config in (CONFIG, thor2.DescriptorConfig.released(homology="closed_form")):
@@ -36,7 +34,7 @@ def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.Poin
 @given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
 def test_equations(pipeline: Any, data: st.DataObject, reach: float) -> None:
     """Both conventions follow the equations, and overflow is the same count."""
-    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, pipeline.capacity))
+    aligned = pipeline.draw(data, laws.aligned_clouds(CONFIG, reach=reach))
     for config in (pipeline.config, dataclasses.replace(pipeline.config, convention="released")):
         ways = dataclasses.replace(pipeline, config=config)
         laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, config)
@@ -51,14 +49,13 @@ def test_embedding_is_linear(pipeline: Any, data: st.DataObject, seed: int, fact
     def describe_with(clouds: thor2.PointClouds, similarity: np.ndarray) -> thor2.Descriptors:
         return pipeline.describe_aligned(clouds, dataclasses.replace(parameters, similarity=jnp.asarray(similarity)))
 
-    strategy = laws.packed(laws.aligned_clouds(CONFIG, max_points=256), SIZE, pipeline.capacity)
-    first, second = data.draw(strategy), data.draw(strategy)
+    first, second = (pipeline.draw(data, laws.aligned_clouds(CONFIG, max_points=256)) for _ in range(2))
     laws.assert_embedding_additive(pipeline.describe_aligned, first, second)
     pair = tuple(np.random.default_rng(seed).normal(size=(2, 22, 22)).astype(np.float32))
     laws.assert_embedding_linear(describe_with, first, pair, factors)
 
 
-@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds(), axis=st.sampled_from("xyz"))
+@given(aligned=ALIGNED, network=laws.networks(), seed=laws.seeds(), axis=st.sampled_from("xyz"))
 def test_strips_and_other_networks(
     aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int, axis: str
 ) -> None:
@@ -71,7 +68,7 @@ def test_strips_and_other_networks(
     laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
 
 
-@given(aligned=aligned_batches(), exponent=st.integers(1, 37), seed=laws.seeds())
+@given(aligned=ALIGNED, exponent=st.integers(1, 37), seed=laws.seeds())
 def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, seed: int) -> None:
     """Some points lie up to 10^37 from the origin, close to the limit of float32."""
     rng = np.random.default_rng(seed)
@@ -97,11 +94,14 @@ def test_points_too_far_to_be_sliced_are_counted_in_overflow(far: float) -> None
         assert int(moved.overflow[0]) == 40 and not np.asarray(moved.tops2).any()
 
 
+AT_LEAST_15 = settings(max_examples=max(15, settings().max_examples))
+
+
 def test_an_occluded_end_flips_the_cloud() -> None:
     seen: set[int] = set()
 
-    @settings(settings.get_profile("properties-quick"), max_examples=15)
-    @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), seed=laws.seeds())
+    @AT_LEAST_15
+    @given(clouds=batches(laws.camera_clouds()), seed=laws.seeds())
     def law(clouds: thor2.PointClouds, seed: int) -> None:
         flipped = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
         seen.update(flipped.tolist())
@@ -112,7 +112,7 @@ def test_an_occluded_end_flips_the_cloud() -> None:
 
 @given(data=st.data(), seed=laws.seeds(), eps=st.floats(1e-4, 0.0025))
 def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) -> None:
-    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG), SIZE, pipeline.capacity))
+    aligned = pipeline.draw(data, laws.aligned_clouds(CONFIG))
     moved = laws.moved_within_strips(aligned, CONFIG, seed, eps)
     share = laws.assert_stable(
         pipeline.describe_aligned, lambda c: thor2.diagrams(c, pipeline.config), aligned, moved, eps, CONFIG
@@ -141,7 +141,7 @@ def test_the_stability_bound_is_tight() -> None:
 
 
 @pytest.mark.slow
-@given(aligned=aligned_batches(max_points=256, margin=0.2), factor=st.sampled_from([0.02, 0.01]))
+@given(aligned=batches(laws.aligned_clouds(CONFIG, max_points=256, margin=0.2)), factor=st.sampled_from([0.02, 0.01]))
 def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
     def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
         return thor2.describe_aligned(clouds, NETWORK, config)

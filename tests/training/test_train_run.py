@@ -1,4 +1,4 @@
-"""Trainings: uninterrupted, interrupted and resumed, and with several folds."""
+"""Trainings: uninterrupted, interrupted and resumed, with several folds, and two in the same run directory."""
 
 import dataclasses
 import os
@@ -10,11 +10,11 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from commands import files_of
 from failures import Interrupted, full_disk, stop_when
 from PIL import Image
 from refusals import assert_refused
 from small_clouds import brick_and_stick, random_clouds
+from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -264,3 +264,43 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
     assert_refused("out: .* already contains", run)
+
+
+def test_a_second_training_is_refused(tmp_path: Path) -> None:
+    """At every stage of the first training, a second one is refused and changes nothing."""
+    out, refusals = tmp_path / "run", []
+
+    def meanwhile(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "describe" or done not in (1, total):
+            return
+        before = files_of(out)
+        assert_refused(str(out), train, out)
+        refusals.append(stage)
+        assert files_of(out) == before
+
+    train(out, progress=meanwhile)
+    assert refusals and load_run(out).classes == ("red brick", "stick")
+    assert not list(out.rglob(".lock"))
+
+
+@pytest.mark.slow
+def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
+    """Both start with a new directory, and the slower one is refused or resumes the other one."""
+    out, done = tmp_path / "run", []
+
+    def quicker(stage: str, count: int, total: int, note: str) -> None:
+        if stage == "describe" and not done:
+            done.append(train(out))
+
+    assert_refused("already contains", train, out, progress=quicker)
+    assert load_run(out).record == done[0].record
+
+    other, begun = tmp_path / "other", []
+
+    def dies(stage: str, count: int, total: int, note: str) -> None:
+        if stage == "describe" and not begun:
+            begun.append(1)
+            with pytest.raises(Interrupted):
+                train(other, progress=stop_when("fit tops", 3))
+
+    assert train(other, progress=dies).record == done[0].record  # resumes the other training

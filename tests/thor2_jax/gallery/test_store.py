@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import safetensors.numpy
-from commands import files_of
+from written_files import files_of
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance

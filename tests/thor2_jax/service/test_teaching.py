@@ -14,12 +14,12 @@ import httpx
 import numpy as np
 import pytest
 import schemathesis
-from commands import files_of
 from failures import full_disk
 from image_files import encode_image
 from processes import HANG
 from refusals import assert_refused
 from service_requests import calls, check_refused
+from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, files_of, frame_options, run_thor2
+from commands import Command, frame_options, run_thor2
 from image_files import write_frame_files
 from rendered_objects import write_meshes
+from written_files import files_of
 
 import colornet
 from thor2_jax.files import temporary_directory

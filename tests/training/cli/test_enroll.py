@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, files_of, frame_options, run_thor2
+from commands import Command, frame_options, run_thor2
 from failures import full_disk
 from image_files import write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 from refusals import assert_refused
 from rendered_objects import write_box
+from written_files import files_of
 
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run

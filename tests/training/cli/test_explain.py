@@ -6,9 +6,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import Command, ParsedPage, run_thor2
+from commands import Command, run_thor2
 from failures import full_disk
 from image_files import write_frame
+from written_files import ParsedPage
 
 from thor2_jax import capacity
 from thor2_jax.errors import InputError

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Command, Recognize, files_of, frame_options, json_lines, run_thor2
+from commands import Command, Recognize, frame_options, json_lines, run_thor2
 from image_files import small_frame, write_frame_files
 from PIL import Image
 from recording_files import table_frame
+from written_files import files_of
 
 
 def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:

@@ -1,9 +1,7 @@
 """`thor2 watch`; the run's weights are random."""
 
-import json
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from commands import Command, run_thor2
 from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
-from thor2_jax.watch.live import Broadcast, LiveView
+from thor2_jax.watch.live import LiveView
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 
@@ -24,25 +22,6 @@ def folder(tmp_path: Path) -> Path:
         write_frame_files(tmp_path / "frames" / f"{k}", frame)
     (tmp_path / "frames" / "2" / "depth.png").write_bytes(b"damaged")
     return tmp_path / "frames"
-
-
-@pytest.fixture
-def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
-    """The messages that are published; the command is interrupted when it waits for Ctrl-C."""
-    published: list[dict[str, Any]] = []
-    publish = Broadcast.publish
-
-    def record(self: Broadcast, text: str) -> None:
-        published.append(json.loads(text))
-        publish(self, text)
-        if published[-1]["state"] == "ended":
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Broadcast, "publish", record)
-    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job starts with it ignored
-    yield published
-    signal.signal(signal.SIGINT, handler)
 
 
 def test_frames_of_a_folder(

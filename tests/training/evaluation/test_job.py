@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import ParsedPage, json_lines
+from commands import json_lines
 from image_files import small_frame
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG, untrained_embedding_run
 from toy_recognizers import ToyDescriptors, UntaughtRecognizer
+from written_files import ParsedPage
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import ParsedPage, run_thor2
+from commands import run_thor2
 from failures import Interrupted
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG
+from written_files import ParsedPage
 
 import colornet
 from thor2_jax.figures import plain_text

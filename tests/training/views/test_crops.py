@@ -8,9 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import files_of, run_thor2
+from commands import run_thor2
 from refusals import assert_refused
 from scipy.ndimage import generic_filter
+from written_files import files_of
 
 import thor2_jax as thor2
 from training.objects.meshes import find_meshes, load_mesh

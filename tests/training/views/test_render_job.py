@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from commands import Command, files_of
+from commands import Command
 from failures import Interrupted, full_disk
 from refusals import assert_refused
 from rendered_objects import write_box
+from written_files import files_of
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations

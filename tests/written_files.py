@@ -1,0 +1,35 @@
+"""Files that commands write: the contents of a folder, and HTML pages."""
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files of a folder but locks, by relative paths."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+class ParsedPage(HTMLParser):
+    """An HTML page: its texts, attributes of its pictures, its tags, and tags that are open at the end."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.pictures: list[dict[str, str | None]] = []
+        self.tags: set[str] = set()
+        self.open: list[str] = []
+        self.feed(content)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
