@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from training.rendering.ray_caster import Hits, RayCaster, pixel_rays
+from training.rendering.camera import Hits, RayCaster, pixel_rays
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(290.0, 290.0, 159.5, 119.5)

@@ -28,8 +28,8 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.protocol import DEFAULT
 from training.readers.labelled import LabelledFrame
+from training.rendering.camera import camera_pose
 from training.rendering.scenes import Scene, compose_scene
-from training.rendering.view_sphere import camera_pose
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves

@@ -34,7 +34,7 @@ from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import build_samples
-from training.rendering.view_sphere import view_angles
+from training.rendering.camera import view_angles
 
 __all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
 

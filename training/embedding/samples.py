@@ -35,8 +35,7 @@ from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.orientation import reorient
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import Camera, camera_pose, random_angles
+from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
 from training.storage.arrays import load_arrays, save_arrays
 from training.storage.jobs import processor
 from training.storage.workers import IN_PROCESS, WorkerPool

@@ -16,8 +16,7 @@ from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import RayCaster, camera_pose, render_view
 
 __all__ = ["draw_descriptor", "draw_objects"]
 

@@ -23,8 +23,7 @@ from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstanc
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import RenderedView, camera_pose, random_angles, view_angles
+from training.rendering.camera import RayCaster, RenderedView, camera_pose, random_angles, render_view, view_angles
 
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from thor2_jax.types import Cloud

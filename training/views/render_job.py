@@ -31,7 +31,7 @@ from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
-from training.rendering.view_sphere import DISTANCE, TRAINING_CAMERA, view_angles
+from training.rendering.camera import DISTANCE, TRAINING_CAMERA, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views import mesh_views

@@ -14,8 +14,7 @@ from scipy.ndimage import generic_filter
 
 import thor2_jax as thor2
 from training.objects.meshes import find_meshes, load_mesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose, view_angles
+from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
 from training.views import render_job
 from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, quantized, rgbd_crop, stacked, surface_normals
 from training.views.dataset import ViewDataset

@@ -20,7 +20,7 @@ from rendered_objects import write_box
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations
-from training.augmentation.illumination import Illumination
+from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.storage.jobs import locked
