@@ -11,8 +11,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.files import check_baselines
-from training.baselines.job import check_weights, crop_size, pretrained_files, train_baselines
+from training.baselines.image_baselines import check_weights, crop_size, pretrained_files
+from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol

@@ -16,8 +16,7 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds, Strips
-from training.baselines.baseline import FitTask, Predictor
-from training.baselines.files import StoredBaseline
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline
 from training.fitting.samples import MIRRORS, VIEWS_PER_BATCH
 from training.views.normalized_views import padded_batches
 

@@ -28,8 +28,7 @@ from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
-from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled_network
-from training.baselines.files import StoredBaseline
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, as_given, compiled_network
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
