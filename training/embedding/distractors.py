@@ -24,8 +24,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import json_digest
 from thor2_jax.types import Cloud
 from training.embedding.samples import ObjectSource, Samples, build_samples, render_clouds, samples_record
-from training.storage.arrays import load_arrays, load_metadata, save_arrays
-from training.storage.jobs import cache_directory, locked
+from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, save_arrays
 from training.storage.workers import local_workers
 
 __all__ = [

@@ -36,8 +36,7 @@ from training.augmentation.orientation import reorient
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
-from training.storage.arrays import load_arrays, save_arrays
-from training.storage.jobs import processor
+from training.storage.jobs import load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import ViewSource, padded_batches
