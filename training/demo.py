@@ -31,8 +31,7 @@ from training.readers.labelled import LabelledFrame
 from training.rendering.camera import camera_pose
 from training.rendering.scenes import Scene, compose_scene
 from training.reports.html import Picture, Section, write_page
-from training.reports.object_plots import draw_descriptor, draw_objects
-from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
 from training.storage.jobs import Progress
 from training.train_job import TrainJob, run_train_job
 from training.train_run import is_finished
