@@ -21,7 +21,8 @@ from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.loop import EpochMetrics, append_metrics, read_metrics
-from training.views.dataset import MANIFEST, Manifest
+from training.storage.jobs import MANIFEST
+from training.views.dataset import Manifest
 
 NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)

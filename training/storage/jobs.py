@@ -32,12 +32,14 @@ from thor2_jax.files import (
 
 __all__ = [
     "LOCK",
+    "MANIFEST",
     "Progress",
     "add_prefix",
     "begin_job",
     "cache_directory",
     "check_begun",
     "check_same_job",
+    "intact_content",
     "load_arrays",
     "load_metadata",
     "locked",
@@ -45,6 +47,7 @@ __all__ = [
     "of_stage",
     "processor",
     "save_arrays",
+    "write_checked",
 ]
 
 VARIABLE = "THOR2_CACHE"
@@ -223,6 +226,28 @@ def locked(directory: Path) -> AbstractContextManager[object]:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
+
+
+MANIFEST = "manifest.json"
+"""List of the finished files in an output directory, with their checksums."""
+
+
+def write_checked(path: Path, content: bytes) -> str:
+    """Write a file and return its SHA-256.
+
+    Raises:
+        OSError: the file cannot be written; an older one stays.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return content_digest([content])
+
+
+def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
+    """Return the bytes of a file; None if it is missing or has another checksum."""
+    path = directory / name
+    content = path.read_bytes() if path.is_file() else b""
+    return content if content_digest([content]) == sha256 else None
 
 
 Arrays = Mapping[str, NDArray[Any]]

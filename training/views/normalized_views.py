@@ -26,10 +26,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
 from thor2_jax.types import Cloud, PointClouds
 from training.views.crops import ViewCrops
+from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH
 
 __all__ = [
-    "COORDINATE_STEP",
-    "MAX_VIEW_LENGTH",
     "MemoryViews",
     "NormalizedViews",
     "SourceShard",
@@ -40,12 +39,6 @@ __all__ = [
     "padded_batches",
     "sequence_sources",
 ]
-
-COORDINATE_STEP = 2.0**-14
-"""Resolution of the coordinates, scaled units (0.024 mm)."""
-
-MAX_VIEW_LENGTH = COORDINATE_STEP * np.iinfo(np.uint16).max
-"""Largest coordinate, scaled units (1.6 m): multiples of `COORDINATE_STEP` up to it fit into 16 bits."""
 
 CLOUDS_PER_BATCH = 64
 """Batch size of the normalization."""

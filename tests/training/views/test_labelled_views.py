@@ -12,7 +12,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
-from training.views.normalized_views import COORDINATE_STEP, MemoryViews, WithoutClasses
+from training.views.mesh_views import COORDINATE_STEP
+from training.views.normalized_views import MemoryViews, WithoutClasses
 
 CONFIG = DescriptorConfig(homology="closed_form")
 
