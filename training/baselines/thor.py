@@ -167,7 +167,7 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # of each view number
-    config = dataclasses.replace(task.run.config, homology="closed_form")
+    config = task.run.config
     samples = build_samples(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
     best = np.zeros((len(samples), len(samples.classes)), np.float32)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -14,9 +14,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, logit
 from sklearn.linear_model import LogisticRegression
 
-from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import EMBEDDING, Feature, feature_of
+from thor2_jax.model.classifier import EMBEDDING, feature_of
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
@@ -32,7 +30,6 @@ __all__ = [
     "fit_calibration",
     "fit_temperature",
     "sample_probabilities",
-    "temperatures",
 ]
 
 SAMPLES_PER_BATCH = 256
@@ -49,7 +46,6 @@ def sample_probabilities(
     model: MLP, samples: Samples, rows: NDArray[np.intp], context: FitContext
 ) -> NDArray[np.float32]:
     """Return the class probabilities [len(rows), C] of samples; `context` is that of the fit."""
-    context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
     graph, state = nnx.split(model)
     chunks = [np.zeros((0, len(samples.classes)), np.float32)]
     for first in range(0, len(rows), SAMPLES_PER_BATCH):
@@ -57,32 +53,6 @@ def sample_probabilities(
         batch = samples.take(np.resize(chunk, SAMPLES_PER_BATCH))
         chunks.append(np.asarray(_probabilities(context, graph, state, batch))[: len(chunk)])
     return np.concatenate(chunks)
-
-
-def temperatures(
-    classifiers: Mapping[Feature, MLP],
-    samples: Samples,
-    held_out: NDArray[np.bool_] | None,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-) -> dict[str, float]:
-    """Fit each classifier's temperature on the held-out set; return an empty dict if there is none.
-
-    Args:
-        classifiers: trained on the other samples.
-        samples: all samples.
-        held_out: [M], True for samples of the held-out set.
-        network: as in the fit.
-        config: as in the fit.
-    """
-    if held_out is None or not held_out.any():
-        return {}
-    rows = np.flatnonzero(held_out)
-    truth = samples.label[rows]
-    return {
-        name: fit_temperature(sample_probabilities(model, samples, rows, FitContext(name, network, config)), truth)
-        for name, model in classifiers.items()
-    }
 
 
 def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.integer[Any]]) -> float:

@@ -122,6 +122,9 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     assert len((report / "answers.jsonl").read_text().splitlines()) == 1 + 5
     with (report / "answers.jsonl").open("a") as file:
         file.write('{"frame": "frame5", "attrib')  # as after a kill during a write
+    for folder in (report, report / "frames"):
+        with temporary_directory(folder) as temporary:
+            shutil.copytree(temporary, folder / ".thor2-killed")
     dataset = ToyDataset(9)
     resumed = evaluate_toys(tmp_path / "stopped", dataset)
     assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
@@ -130,10 +133,6 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     pictures = {p.relative_to(report): p.read_bytes() for p in report.rglob("*.jpg")}
     other = tmp_path / "whole" / "report"
     assert pictures == {p.relative_to(other): p.read_bytes() for p in other.rglob("*.jpg")}
-
-    for folder in (report, report / "frames"):
-        with temporary_directory(folder) as temporary:
-            shutil.copytree(temporary, folder / ".thor2-killed")
     assert without_times(evaluate_toys(tmp_path / "stopped", 9)) == without_times(whole)
     assert len((tmp_path / "stopped" / "log").read_text().split()) == 9
     assert {p.name for p in report.rglob(".*")} == {LOCK, ".answers.x.jsonl"}

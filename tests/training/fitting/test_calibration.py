@@ -56,17 +56,6 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     assert calibration.sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
 
 
-def test_temperatures_are_fitted_to_the_held_out_set() -> None:
-    samples = build_samples(source(3), NETWORK, CONFIG)
-    model = MLP(input_size("tops", CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
-    held_out = samples.view == 1
-    fitted = calibration.temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
-    context, rows = FitContext("tops", NETWORK, CONFIG), np.flatnonzero(held_out)
-    probabilities = calibration.sample_probabilities(model, samples, rows, context)
-    assert fitted == {"tops": calibration.fit_temperature(probabilities, samples.label[held_out])}
-    assert calibration.temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
-
-
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])
 def test_known_temperature_is_recovered(temperature: float) -> None:
     rng = np.random.default_rng(0)
