@@ -33,7 +33,6 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks import MLP
 from thor2_jax.types import Cloud
 from training.embedding.distractors import (
-    COPIES,
     Distractors,
     distractor_samples,
     held_out_clouds,
@@ -280,7 +279,7 @@ class _Fold(NamedTuple):
         others = distractor_samples(distractors, scratch, network, config, shown)
         kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(n_classes)}
         shown = of_stage(self.report, DESCRIBE_EMBEDDED)
-        samples, known = sample_views(self.source, kept, network, config, COPIES, seed, shown)
+        samples, known = sample_views(self.source, kept, network, config, seed, shown)
         unknown = held_out_clouds(distractors, n_classes)
         samples = with_fitted_distractors(samples, others, n_classes)
         del others  # takes as much memory as the samples
