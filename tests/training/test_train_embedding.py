@@ -14,7 +14,6 @@ from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
 
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
@@ -120,8 +119,8 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     with monkeypatch.context() as patch, pytest.raises(Interrupted):  # an epoch is logged and has no checkpoint yet
         patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))
         train(out)
-    with pytest.raises(InputError, match="networks"):
-        train(out, dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3)))
+    other = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3))
+    assert_refused("networks", train, out, other)
     (run,) = train(out)
     assert render.call_count == 1
     assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()

@@ -119,8 +119,8 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
     ):
-        with pytest.raises(thor2.InputError, match=message):
-            train_run(MemoryViews(bad, CONFIG), tmp_path / "run", Protocol(["tops"], OPTIONS, CONFIG, folds))
+        settings = Protocol(["tops"], OPTIONS, CONFIG, folds)
+        assert_refused(message, train_run, MemoryViews(bad, CONFIG), tmp_path / "run", settings)
         assert names(tmp_path) == []
 
 
@@ -183,8 +183,8 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         (r"descriptor_config\.\w+ ", 0, {"config": thor2.DescriptorConfig()}),
     ]
     for message, seed, changes in cases:
-        with pytest.raises(thor2.InputError, match=f"out: {out} was written with {message}"):
-            train_run(source(seed), out, dataclasses.replace(begun, **changes))
+        settings = dataclasses.replace(begun, **changes)
+        assert_refused(f"out: {out} was written with {message}", train_run, source(seed), out, settings)
     assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
     assert_refused(r"begun\.json cannot be read", train, out)

@@ -15,7 +15,6 @@ from small_clouds import random_clouds
 from small_runs import untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import image_baselines
@@ -163,8 +162,8 @@ def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     assert 0 < np.abs(moved).max() < 1e-3  # a step of the small learning rate away
     train_baselines(folder, SOURCE, [SMALL], weights=weights)
     write_weights(weights, seed=1)
-    with pytest.raises(InputError, match="^weights is .*was trained without these files"):
-        train_baselines(folder, SOURCE, [SMALL], weights=weights)
+    message = "^weights is .*was trained without these files"
+    assert_refused(message, train_baselines, folder, SOURCE, [SMALL], weights=weights)
 
 
 def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
@@ -182,8 +181,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     ]
     for damage, message in cases:
         damage()
-        with pytest.raises(InputError, match=f"^weights: .*{message}"):
-            train_baselines(folder, SOURCE, [SMALL], weights=weights)
+        assert_refused(f"^weights: .*{message}", train_baselines, folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()
 
 

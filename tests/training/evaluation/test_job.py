@@ -208,8 +208,8 @@ def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
     frame = dataclasses.replace(small_frame(), labels=np.zeros((90, 120), np.uint8))
     evaluate_toys(tmp_path / "known", Frames([LabelledFrame("f", frame, {1: "mug"}, {})]))
     assert ParsedPage((tmp_path / "known" / "report" / "report.html").read_text()).open == []
-    with pytest.raises(InputError, match="dragon.*bowl, can, mug"):
-        evaluate_toys(tmp_path / "unknown", Frames([LabelledFrame("f", frame, {1: "dragon"}, {})]))
+    dragons = Frames([LabelledFrame("f", frame, {1: "dragon"}, {})])
+    assert_refused("dragon.*bowl, can, mug", evaluate_toys, tmp_path / "unknown", dragons)
     assert not (tmp_path / "unknown" / "report" / "report.json").exists()
 
 
@@ -282,8 +282,8 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
 def test_directories_of_others_are_refused(tmp_path: Path) -> None:
     """These have files of the user, or another process is evaluating into them."""
     (tmp_path / "report").mkdir()
-    with locked(tmp_path / "report"), pytest.raises(InputError, match="^out: "):
-        evaluate_toys(tmp_path, 1)
+    with locked(tmp_path / "report"):
+        assert_refused("^out: ", evaluate_toys, tmp_path, 1)
     (tmp_path / "report" / "thesis.tex").touch()
     assert_refused("^out: ", evaluate_toys, tmp_path, 1)
     assert {p.name for p in (tmp_path / "report").iterdir()} == {"thesis.tex", LOCK}
