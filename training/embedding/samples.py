@@ -53,8 +53,6 @@ __all__ = [
     "samples_record",
 ]
 
-CLOUDS_PER_BATCH = 64
-
 COPIES = 2
 """Samples of each cloud, in random orientations."""
 
@@ -155,7 +153,7 @@ def sample_clouds(
     label = np.array([labels[k] for k in order], np.int32)
     chunks: list[Samples] = []
     done = 0
-    for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
+    for count, batch in padded_batches([clouds[k] for k in order]):
         normal = batch if are_normal else view_normalize(batch, config)
         sides = jnp.max(normal.points, axis=1)
         balanced = balanced_histogram(normal.colors, normal.mask)
@@ -163,7 +161,7 @@ def sample_clouds(
             occupied = strips(turn(reorient(normal, rng), config), network, config)
             statistics = np.hstack([cloud_statistics(sides, normal, occupied), balanced])[:count]
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
-            length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
+            length = np.asarray(occupied.high - occupied.low).reshape(len(occupied.high), -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)
             at, named = (sample, strip), label[done : done + count]
             of_strips = strip.astype(np.uint16), length[at].astype(np.float16), color[at].astype(np.float16)

@@ -23,7 +23,7 @@ from thor2_jax.networks import MLP
 from thor2_jax.types import Cloud
 from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples
-from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
+from training.views.normalized_views import padded_batches
 
 __all__ = [
     "KEPT",
@@ -92,7 +92,7 @@ def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> t
     model = Model.of_run(run)
     held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
     label = np.array([label for label, _ in held_out])
-    batches = padded_batches([cloud for _, cloud in held_out], CLOUDS_PER_BATCH)
+    batches = padded_batches([cloud for _, cloud in held_out])
     chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet

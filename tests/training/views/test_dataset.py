@@ -29,7 +29,7 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.storage.jobs import MANIFEST, locked
 from training.storage.workers import local_workers, ray_workers
-from training.views import mesh_views
+from training.views import mesh_views, normalized_views
 from training.views.dataset import Manifest, ViewDataset, encode, remove_views, render_dataset
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
 from training.views.normalized_views import NormalizedViews, normalize_views, padded_batches
@@ -319,13 +319,14 @@ def test_empty_views_and_views_beyond_the_range() -> None:
     assert_refused("4.05 scaled units", views_of, [(line, rgb), (line * np.float32(1.62), rgb)])
 
 
-def test_padded_batches() -> None:
+def test_padded_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     clouds = random_clouds(0, (3, 2100, 5))
-    batches = list(padded_batches(clouds, 2))
+    batches = list(padded_batches(clouds))
     assert [count for count, _ in batches] == [2, 1]
     assert [batch.mask.shape for _, batch in batches] == [(2, 4096), (2, 2048)]
     assert [batch.mask.sum(axis=1).tolist() for _, batch in batches] == [[3, 2100], [5, 0]]
-    assert list(padded_batches([], 2)) == []
+    assert list(padded_batches([])) == []
 
 
 def check_refused(directory: Path, message: str) -> None:
