@@ -72,6 +72,13 @@ def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
     assert re.fullmatch(r"error: embreex is not installed; .*docs/install.md\n", ended.stderr)
 
 
+def test_training_on_given_views_needs_no_ray_caster() -> None:
+    """Neither embreex nor gudhi has wheels for ARM on Linux."""
+    program = "import sys; sys.modules |= dict.fromkeys(('embreex', 'gudhi')); import training.train_job"
+    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+
+
 def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     clouds = thor2.PointClouds.pack(random_clouds(0, [9]))
     monkeypatch.setitem(sys.modules, "gudhi", None)

@@ -29,6 +29,7 @@ from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
+from training.storage.jobs import Progress
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
@@ -186,7 +187,7 @@ class FitTask:
     run: TrainedRun
     directory: Path
     weights: Path | None
-    progress: Callable[[str, int, int, str], object]
+    progress: Progress
 
     @property
     def options(self) -> FitOptions:

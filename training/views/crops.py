@@ -16,7 +16,7 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +29,7 @@ from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.mesh_views import RenderJob, RenderProgress, ViewTask, all_views
+from training.views.mesh_views import RenderJob, ViewTask, all_views
 
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from training.views.dataset import ViewDataset
@@ -315,7 +315,7 @@ def render_crops(
     dataset: "ViewDataset",
     size: int = CROP_SIZE,
     pool: WorkerPool = IN_PROCESS,
-    progress: RenderProgress = lambda done, total: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> None:
     """Render the crops of all views of a dataset; an interrupted rendering resumes.
 

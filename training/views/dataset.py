@@ -34,7 +34,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ from thor2_jax.types import Cloud
 from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.crops import CROPS, ViewCrops, read_crops
-from training.views.mesh_views import COORDINATE_STEP, RenderJob, RenderProgress, render_task
+from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
 from training.views.normalized_views import NormalizedViews, normalize_views
 
 __all__ = ["Manifest", "Shard", "ViewDataset", "encode", "remove_views", "render_dataset"]
@@ -286,7 +286,7 @@ def render_dataset(
     job: RenderJob,
     out: str | Path,
     pool: WorkerPool = IN_PROCESS,
-    progress: RenderProgress = lambda done, total: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> ViewDataset:
     """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
 

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import itertools
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,6 @@ __all__ = [
     "MESH_VIEWS",
     "MIN_VIEW_POINTS",
     "RenderJob",
-    "RenderProgress",
     "ViewTask",
     "all_views",
     "cloud_of",
@@ -69,9 +68,6 @@ MAX_VIEW_LENGTH = COORDINATE_STEP * np.iinfo(np.uint16).max
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard of a dataset, rounded down to whole views: a few megabytes, about a second of rendering."""
-
-RenderProgress = Callable[[int, int], object]
-"""Called with (clouds done, total clouds)."""
 
 
 def cloud_of(view: RenderedView) -> "Cloud":
