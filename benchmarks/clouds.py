@@ -9,8 +9,7 @@ from thor2_jax.frames.frames import backproject
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import RayCaster, camera_pose, render_view
 
 __all__ = ["SCANS", "sample_clouds"]
 

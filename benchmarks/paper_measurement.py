@@ -16,7 +16,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.model.recognition import DescribedFrame
 from training.baselines.baseline import Predictor, baseline_inputs
-from training.baselines.files import CLOUD_BASELINES, NETWORKS, TITLES
+from training.baselines.job import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
 from training.evaluation.results import compute_results, fuse_answers

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from thor2_jax.files import atomic_write
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.baselines.files import TITLES
+from training.baselines.job import TITLES
 from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
 
 __all__ = ["draw_claims", "report_text"]

@@ -42,8 +42,8 @@ from training.evaluation.scores import placement_accuracy, steadiness
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
 from training.readers.labelled import LabelledFrame, sequence_of
+from training.rendering.camera import Camera
 from training.rendering.scenes import Scene, compose_views
-from training.rendering.view_sphere import Camera
 from training.storage.jobs import check_same_job
 from training.view_table import view_table
 

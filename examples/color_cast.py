@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 import colornet
 import thor2_jax as thor2
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
 
 LAMP = np.array([0.80, 0.66, 0.55], np.float32)

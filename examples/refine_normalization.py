@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 import colornet
 import thor2_jax as thor2
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
 
 HARD = thor2.DescriptorConfig(homology="closed_form")

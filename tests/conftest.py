@@ -190,7 +190,7 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
 @pytest.fixture
 def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
     """The messages that `thor2 watch` publishes; it is interrupted when it waits for Ctrl-C."""
-    from thor2_jax.watch.server import Broadcast
+    from thor2_jax.watch.live import Broadcast
 
     published: list[dict[str, Any]] = []
     publish = Broadcast.publish

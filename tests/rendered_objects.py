@@ -9,8 +9,8 @@ from image_files import write_frame_files
 from numpy.typing import NDArray
 
 from training.objects.builtin_objects import builtin_objects
+from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
-from training.rendering.view_sphere import Camera, RenderedView
 
 
 def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 100, 50)) -> Path:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.segmentation import overlaps
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from training.rendering.ray_caster import Hits, RayCaster, pixel_rays
+from training.rendering.camera import Hits, RayCaster, pixel_rays
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(290.0, 290.0, 159.5, 119.5)

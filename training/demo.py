@@ -28,12 +28,11 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.protocol import DEFAULT
 from training.readers.labelled import LabelledFrame
+from training.rendering.camera import camera_pose
 from training.rendering.scenes import Scene, compose_scene
-from training.rendering.view_sphere import camera_pose
 from training.reports.html import Picture, Section, write_page
-from training.reports.object_plots import draw_descriptor, draw_objects
-from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
-from training.storage.jobs import Progress
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+from training.storage.jobs import Progress, numbered
 from training.train_job import TrainJob, run_train_job
 from training.train_run import is_finished
 from training.views.mesh_views import view_cloud
@@ -53,6 +52,10 @@ PROTOCOL = dataclasses.replace(
 
 N_SCENES = 40
 """Each scene is seen by one of the ten cameras of `CHOOSE`, in turn."""
+
+COMPOSE, RECOGNIZE = "compose scenes", "recognize scenes"
+SCENE_STAGES = {COMPOSE: 0.2, RECOGNIZE: 0.4}
+"""The stages after the training, with their times, divided by that of rendering the views."""
 
 N_SHOWN = 6
 NAMES = ("CE", "TOPS", "TOPS2", "THOR2")
@@ -100,12 +103,14 @@ def run_demo(
     # Without a run, pictures are not those of a demo.
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
-    run_train_job(TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers), progress)
+    job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
+    run_train_job(job, progress, SCENE_STAGES)
+    shown = numbered(progress, job.stages | SCENE_STAGES)
     trained = load_run(out / "run")
     pictures.mkdir(exist_ok=True)
-    scenes = _compose_scenes(objects, seed, progress)
+    scenes = _compose_scenes(objects, seed, shown)
     (run,) = load_runs([out / "run"])
-    answers = _answer_scenes(run, scenes, progress)
+    answers = _answer_scenes(run, scenes, shown)
     report = compute_results("demo", [run], answers)
     cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]
     subsets = {" ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all": cell for cell in cells}
@@ -139,7 +144,7 @@ def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Pr
         scene = compose_scene(objects, np.random.default_rng(scene_seed))
         camera = CHOOSE[(number - 1) % len(CHOOSE)]
         scenes.append(dataclasses.replace(scene, frame=through_camera(scene.frame, camera)))
-        progress("compose scenes", number, N_SCENES, "")
+        progress(COMPOSE, number, N_SCENES, "")
     return scenes
 
 
@@ -151,7 +156,7 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
         for degree in ("none", "low", "high"):
             instances = [i for i in answers.instances if scenes[number].occlusion(i.label) == degree]
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))
-        progress("recognize scenes", number + 1, N_SCENES, "")
+        progress(RECOGNIZE, number + 1, N_SCENES, "")
     return grouped
 
 

@@ -14,7 +14,7 @@ from training.embedding.samples import AUGMENTATIONS
 from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 from training.objects.mesh import TexturedMesh
-from training.views.render_job import RenderJob
+from training.views.mesh_views import RenderJob
 
 __all__ = [
     "CALIBRATE",

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import jax
 
@@ -11,8 +12,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.files import check_baselines
-from training.baselines.job import check_weights, crop_size, pretrained_files, train_baselines
+from training.baselines.image_baselines import check_weights, crop_size, pretrained_files
+from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
@@ -20,10 +21,10 @@ from training.readers.frames import FrameFolder, find_frames
 from training.storage.jobs import Progress, add_prefix, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
-from training.views.dataset import ViewDataset, remove_views
+from training.views.crops import render_crops
+from training.views.dataset import ViewDataset, remove_views, render_dataset
 from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
-from training.views.render_job import render_crops, render_dataset
 
 __all__ = ["TrainJob", "run_train_job"]
 
@@ -64,13 +65,28 @@ class TrainJob:
     workers: int = 1
     mesh_scale: float = 1.0
 
+    @property
+    def crop_size(self) -> int | None:
+        """Side of the crops that the baselines are trained on, pixels; None if they need none."""
+        return crop_size(self.baselines, self.weights is not None)
 
-def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedRun]]:
+    @property
+    def stages(self) -> dict[str, float]:
+        """The stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
+        if self.meshes is None:
+            return self.protocol.stages
+        return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if self.crop_size is not None else {}) | self.protocol.stages
+
+
+def run_train_job(
+    job: TrainJob, progress: Progress, later: Mapping[str, float] = MappingProxyType({})
+) -> dict[Path, list[TrainedRun]]:
     """Train everything that the job asks for and that is not finished yet.
 
     Args:
         job: the job.
-        progress: called with (stage, done, total, note); the stages of a sequence begin with its name.
+        progress: called with (stage, done, total, note); the stages are numbered, those of a sequence after its name.
+        later: stages of the caller after the training, with their times, which are counted with those of the job.
 
     Returns:
         Run directory -> the runs of its folds that this call has trained; none if they were finished.
@@ -94,7 +110,8 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
             _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    shown = numbered(progress, _stages(job))
+    stages = {**job.stages, **later}
+    shown = numbered(progress, stages)
     source = _open_views(job, labelled, shown)
     if job.leave_out:
         source = WithoutClasses(source, job.leave_out)
@@ -110,24 +127,13 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         if job.sequences is not None:
-            shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), _stages(job))
+            shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), stages)
         runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown)
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
         remove_views(job.out / VIEWS)
     return runs
-
-
-def _stages(job: TrainJob) -> dict[str, float]:
-    """Return the stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
-    if job.meshes is None:
-        return job.protocol.stages
-    return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.protocol.stages
-
-
-def _crop_size(job: TrainJob) -> int | None:
-    return crop_size(job.baselines, job.weights is not None)
 
 
 def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
@@ -193,7 +199,7 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
     if "thor" in baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
     frames = FrameFolder([source for path in job.frames for source in find_frames([path])])
-    return read_instances(frames, job.protocol.config.sigma_s, crop_size=_crop_size(job))
+    return read_instances(frames, job.protocol.config.sigma_s, crop_size=job.crop_size)
 
 
 def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
@@ -237,7 +243,7 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
-        rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), _crop_size(job)
+        rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

@@ -33,7 +33,6 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks import MLP
 from thor2_jax.types import Cloud
 from training.embedding.distractors import (
-    COPIES,
     Distractors,
     distractor_samples,
     held_out_clouds,
@@ -41,7 +40,7 @@ from training.embedding.distractors import (
 )
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
 from training.embedding.samples import sample_views
-from training.fitting.calibration import fit_calibration, temperatures
+from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
     BEGUN,
@@ -213,9 +212,9 @@ class _Fold(NamedTuple):
         """Train and publish the run, unless it is finished, and read it back."""
         directory = self.out if self.settings.folds == 1 else self.out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
-            classifiers, best_epochs, calibrated = self.fit_classifiers()
+            classifiers, best_epochs, temperatures = self.fit_classifiers()
             if jax.process_index() == 0:
-                run = self.complete_run(classifiers, best_epochs, calibrated)
+                run = self.complete_run(classifiers, best_epochs, temperatures)
                 _publish(run, self.scratch / "run", directory)
             wait_for_all("published")
         return load_run(directory)
@@ -227,19 +226,23 @@ class _Fold(NamedTuple):
             return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
+        temperatures: dict[str, float] = {}
         for name in settings.classifiers:
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
             classifiers[name], best_epochs[name] = fitted
-        calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
-        return classifiers, best_epochs, calibrated
+            if self.held_out is not None:
+                rows = np.flatnonzero(self.held_out)
+                probabilities = sample_probabilities(classifiers[name], samples, rows, context)
+                temperatures[name] = fit_temperature(probabilities, samples.label[rows])
+        return classifiers, best_epochs, temperatures
 
     def complete_run(
         self,
         classifiers: Mapping[Feature, MLP],
         best_epochs: Mapping[Feature, int],
-        calibrated: Mapping[str, float],
+        temperatures: Mapping[str, float],
     ) -> TrainedRun:
         """Return the run with its classifiers, the embedding if it has one, the fitted confidence and the record."""
         settings = self.settings
@@ -259,7 +262,7 @@ class _Fold(NamedTuple):
         record |= {"dataset": self.source.record, "samples": len(self.samples.label), "fold": self.number}
         record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
         record["held_out_accuracy"] |= accuracy
-        record |= {"temperatures": calibrated, **confidence}
+        record |= {"temperatures": temperatures, **confidence}
         return dataclasses.replace(run, record=record)
 
     def fit_embedding(self, distractors: Distractors) -> tuple[Embedding, list[tuple[int, Cloud]]]:
@@ -276,7 +279,7 @@ class _Fold(NamedTuple):
         others = distractor_samples(distractors, scratch, network, config, shown)
         kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(n_classes)}
         shown = of_stage(self.report, DESCRIBE_EMBEDDED)
-        samples, known = sample_views(self.source, kept, network, config, COPIES, seed, shown)
+        samples, known = sample_views(self.source, kept, network, config, seed, shown)
         unknown = held_out_clouds(distractors, n_classes)
         samples = with_fitted_distractors(samples, others, n_classes)
         del others  # takes as much memory as the samples

@@ -10,8 +10,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.viewpoints import ViewTable
 from training.objects.mesh import TexturedMesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import RayCaster, camera_pose, render_view
 from training.views.mesh_views import cloud_of
 
 __all__ = ["view_table"]

@@ -19,8 +19,8 @@ from colornet.draw import draw_similarity
 from thor2_jax import plot
 from thor2_jax.frames.frames import RGBDFrame
 from training.objects.builtin_objects import builtin_objects
+from training.rendering.camera import camera_pose
 from training.rendering.scenes import compose_scene
-from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import view_cloud
 
 OUT = Path(__file__).parents[1] / "images" / "explanation"

@@ -15,7 +15,7 @@ from benchmarks import paper
 from benchmarks.paired import paired_difference
 from benchmarks.paper_measurement import CLAIMS
 from benchmarks.paper_report import report_text
-from training.baselines.files import TITLES
+from training.baselines.job import TITLES
 from training.evaluation.answers import fusions
 
 

@@ -18,9 +18,10 @@ from rendered_objects import write_box
 from small_runs import untrained_run
 
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
-from training.baselines.files import baseline_file, read_baseline
+from training.baselines.baseline import baseline_file, read_baseline
 from training.fitting.loop import read_metrics
-from training.views.dataset import MANIFEST, Manifest
+from training.storage.jobs import MANIFEST
+from training.views.dataset import Manifest
 
 pytestmark = pytest.mark.slow
 

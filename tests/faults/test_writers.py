@@ -21,10 +21,11 @@ from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
-from training.baselines.files import StoredBaseline, write_baseline
+from training.baselines.baseline import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.loop import EpochMetrics, append_metrics, read_metrics
-from training.views.dataset import MANIFEST, Manifest
+from training.storage.jobs import MANIFEST
+from training.views.dataset import Manifest
 
 
 class Disk:

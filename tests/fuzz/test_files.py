@@ -21,7 +21,7 @@ from refusals import assert_refused
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
 from thor2_jax.testing import damaged
-from training.baselines.files import StoredBaseline, read_baseline, write_baseline
+from training.baselines.baseline import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
 from training.fitting.loop import read_metrics
 from training.objects.meshes import read_names

@@ -24,7 +24,8 @@ from training.readers.bop import BOP
 from training.readers.frames import FrameFolder
 from training.readers.ocid import OCID
 from training.readers.uwis import UWISOccluded
-from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+from training.storage.jobs import MANIFEST
+from training.views.dataset import Manifest, Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews
 
 from .conftest import other_content

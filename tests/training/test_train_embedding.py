@@ -14,13 +14,12 @@ from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
 
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module
-from training.embedding import distractors, fit, samples
+from training.embedding import fit, samples
 from training.embedding.distractors import Distractors
 from training.embedding.samples import render_clouds
 from training.fitting.calibration import fit_calibration
@@ -94,7 +93,7 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
     _, run, _, views = whole
     assert run.embedding is not None and run.embedding.distractors == 9 and run.embedding.sizes.nearest
     assert sorted(label for label, _ in views) == [0, 1, 2, 2, 2, 2]
-    expected = render_clouds({0: DISTRACTORS.sources[0]}, 4, distractors.SEED)
+    expected = render_clouds({0: DISTRACTORS.sources[0]}, 4)
     for (label, (xyz, rgb)), (_, (points, colors)) in zip(views[2:], expected, strict=True):
         assert label == 2 and np.array_equal(xyz, points) and np.array_equal(rgb, colors)
     for name, (label, cloud) in zip(CLASSES, views, strict=False):  # normalized before, but described as they were
@@ -120,8 +119,8 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     with monkeypatch.context() as patch, pytest.raises(Interrupted):  # an epoch is logged and has no checkpoint yet
         patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))
         train(out)
-    with pytest.raises(InputError, match="networks"):
-        train(out, dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3)))
+    other = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3))
+    assert_refused("networks", train, out, other)
     (run,) = train(out)
     assert render.call_count == 1
     assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()

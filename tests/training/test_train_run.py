@@ -22,10 +22,13 @@ from thor2_jax.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting import loop
+from training.fitting.calibration import fit_temperature, sample_probabilities
+from training.fitting.fit import FitContext
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, find_run_directories
+from training.fitting.samples import build_samples
 from training.protocol import Protocol
 from training.train_run import train_run
-from training.views.normalized_views import MemoryViews
+from training.views.normalized_views import MemoryViews, fold_of_views
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -116,8 +119,8 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
     ):
-        with pytest.raises(thor2.InputError, match=message):
-            train_run(MemoryViews(bad, CONFIG), tmp_path / "run", Protocol(["tops"], OPTIONS, CONFIG, folds))
+        settings = Protocol(["tops"], OPTIONS, CONFIG, folds)
+        assert_refused(message, train_run, MemoryViews(bad, CONFIG), tmp_path / "run", settings)
         assert names(tmp_path) == []
 
 
@@ -180,8 +183,8 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         (r"descriptor_config\.\w+ ", 0, {"config": thor2.DescriptorConfig()}),
     ]
     for message, seed, changes in cases:
-        with pytest.raises(thor2.InputError, match=f"out: {out} was written with {message}"):
-            train_run(source(seed), out, dataclasses.replace(begun, **changes))
+        settings = dataclasses.replace(begun, **changes)
+        assert_refused(f"out: {out} was written with {message}", train_run, source(seed), out, settings)
     assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
     assert_refused(r"begun\.json cannot be read", train, out)
@@ -250,8 +253,12 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {name for name in names(out) if name[0] != "."} == finished
     assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]
     same_weights(runs[0], first)
-    for one in load_runs([out]):
-        assert set(one.temperatures) == {"tops"} and 0.01 <= one.temperatures["tops"] <= 100
+    samples = build_samples(source(), runs[0].network, CONFIG)
+    fold_of = fold_of_views(samples.label, samples.view, samples.classes, 3, OPTIONS.seed)
+    for fold, one in enumerate(load_runs([out])):
+        rows, context = np.flatnonzero(fold_of == fold), FitContext("tops", runs[fold].network, CONFIG)
+        probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)
+        assert one.temperatures == {"tops": pytest.approx(fit_temperature(probabilities, samples.label[rows]))}
         assert one.recognizer.run.record["temperatures"] == one.temperatures
     rows = []
     for fold, record in enumerate(run.record for run in runs):

@@ -18,12 +18,9 @@ import numpy as np
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.outliers import flying_pixels
-from training.augmentation.illumination import Illumination, Registration, misregistered, relit
-from training.augmentation.occlusion import Occlusion, occluded
-from training.augmentation.pixels import without
-from training.augmentation.segmentation import Base, Segmentation, resegmented, without_base
-from training.augmentation.sensor import Sensor, sensed
-from training.rendering.view_sphere import RenderedView
+from training.augmentation.masks import Base, Occlusion, Segmentation, occluded, resegmented, without_base
+from training.augmentation.sensing import Illumination, Registration, Sensor, misregistered, relit, sensed
+from training.rendering.camera import RenderedView
 
 __all__ = ["KINDS", "Augmentations", "augment"]
 
@@ -112,4 +109,4 @@ def _without_flying(view: RenderedView) -> RenderedView:
     """Remove flying pixels as recognition does: unless they are more than half of all pixels."""
     pixels = np.flatnonzero(view.depth)
     flying = flying_pixels(view.frame, pixels)
-    return view if 2 * flying.sum() > len(pixels) else without(view, pixels[flying])
+    return view if 2 * flying.sum() > len(pixels) else view.without(pixels[flying])

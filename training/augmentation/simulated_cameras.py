@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from colornet.lab import LUMA
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from training.rendering.depth_camera import axial_deviation
+from training.rendering.camera import axial_deviation
 
 __all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]
 

@@ -1,8 +1,14 @@
-"""The interface of a trained baseline, the inputs it reads, and what the fits of baselines share."""
+"""The interface of a trained baseline, its inputs and its file, and what the fits of baselines share.
+
+The file is RUN/baselines/NAME.safetensors. Its metadata entry "about" is JSON: the format, the classes, the temperature
+(null without a held-out set), the training time in seconds, the files of pretrained weights if there were any, and a
+digest of these entries and the arrays.
+"""
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +19,8 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
@@ -21,6 +29,7 @@ from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
+from training.storage.jobs import Progress
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
@@ -29,11 +38,15 @@ __all__ = [
     "FitTask",
     "NetworkFit",
     "Predictor",
+    "StoredBaseline",
     "as_given",
+    "baseline_file",
     "baseline_inputs",
     "compiled_network",
     "fit_network",
     "in_batches",
+    "read_baseline",
+    "write_baseline",
 ]
 
 Integers = NDArray[np.integer[Any]]
@@ -78,6 +91,84 @@ Predictor = Callable[[BaselineInputs], NDArray[np.float32]]
 """A trained baseline: function of the inputs that returns class probabilities [B, C]."""
 
 
+BASELINE_FORMAT = 1
+
+
+def baseline_file(run: Path, name: str) -> Path:
+    """Return the path of a baseline in a run directory; `name` may be a glob pattern."""
+    return run / "baselines" / f"{name}.safetensors"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredBaseline:
+    """Contents of a baseline file.
+
+    Attributes:
+        arrays: learned arrays by name.
+        temperature: temperature fitted on the held-out set; None without one.
+        weights: files of pretrained weights it was fitted from -> SHA-256; empty if it was trained from scratch.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    temperature: float | None
+    weights: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
+    parts: list[str | bytes] = [json_digest(about)]
+    for name in sorted(arrays):
+        parts += [f"{name} {arrays[name].dtype} {arrays[name].shape}\0", np.ascontiguousarray(arrays[name]).tobytes()]
+    return content_digest(parts)
+
+
+def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], seconds: float) -> None:
+    """Write a baseline file and its training time atomically, and create its directory if it is missing.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    about: dict[str, Any] = {
+        "format": BASELINE_FORMAT,
+        "classes": list(classes),
+        "temperature": stored.temperature,
+        "seconds": round(seconds, 1),
+    }
+    if stored.weights:
+        about["weights"] = dict(stored.weights)
+    about["digest"] = _digest(stored.arrays, about)
+    path.parent.mkdir(exist_ok=True)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(pack_arrays(stored.arrays, {"about": json.dumps(about)}))
+
+
+def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
+    """Read a baseline file.
+
+    Args:
+        path: path of the file.
+        classes: class names of its run.
+
+    Raises:
+        InputError: if the file is damaged or has another format or other classes; the message names the file.
+    """
+    try:
+        arrays, metadata = unpack_arrays(read_file(path))
+        about = json.loads(metadata["about"])
+        if about["format"] != BASELINE_FORMAT:
+            raise InputError(
+                f"model: {path} has format {about['format']!r}; expected {BASELINE_FORMAT}; train the baseline again"
+            )
+        if about.pop("digest") != _digest(arrays, about):
+            raise ValueError("its digest does not match")
+        if about["classes"] != list(classes):
+            raise InputError(f"model: {path} has other classes than its run; train the baseline again")
+        return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None
+
+
 @dataclasses.dataclass(frozen=True)
 class FitTask:
     """Data and options for fitting a baseline.
@@ -96,7 +187,7 @@ class FitTask:
     run: TrainedRun
     directory: Path
     weights: Path | None
-    progress: Callable[[str, int, int, str], object]
+    progress: Progress
 
     @property
     def options(self) -> FitOptions:

@@ -16,9 +16,8 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds, Strips
-from training.baselines.baseline import FitTask, Predictor
-from training.baselines.files import StoredBaseline
-from training.fitting.samples import MIRRORS, VIEWS_PER_BATCH
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline
+from training.fitting.samples import MIRRORS
 from training.views.normalized_views import padded_batches
 
 __all__ = ["fit_forest", "forest_features", "load_forest", "predict", "tree_arrays"]
@@ -113,7 +112,7 @@ def _features_of_views(task: FitTask) -> tuple[NDArray[np.float32], NDArray[np.i
     features, label, view, run = [], [], [], task.run
     for _, _, views in task.shards("measure for forest", "views"):
         first = 0
-        for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
+        for count, normal in padded_batches(views.clouds()):
             for axes in MIRRORS:
                 features.append(forest_features(mirror(normal, axes), run.network, run.config)[:count])
                 label.append(np.full(count, views.label))

@@ -1,4 +1,4 @@
-"""Training and loading the baselines of finished runs, RUN/baselines/NAME.safetensors."""
+"""The baselines by name, and their training in and loading from run directories: RUN/baselines/NAME.safetensors."""
 
 import functools
 import time
@@ -6,32 +6,66 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flax import nnx
-
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.baseline import FitTask, Predictor
-from training.baselines.files import (
-    BASELINES,
-    NETWORKS,
-    TEMPLATES,
+from training.baselines.baseline import (
+    FitTask,
+    Predictor,
     StoredBaseline,
     baseline_file,
     read_baseline,
     write_baseline,
 )
 from training.baselines.forest import fit_forest, load_forest
-from training.baselines.image_network import fit_image_network, load_image_network
-from training.baselines.networks.architectures import ARCHITECTURES, load_weights, weights_file
+from training.baselines.image_baselines import (
+    TEMPLATES,
+    fit_image_network,
+    fit_templates,
+    load_image_network,
+    load_templates,
+    pretrained_files,
+)
+from training.baselines.networks.architectures import ARCHITECTURES, weights_file
 from training.baselines.pointnet import fit_pointnet, load_pointnet
-from training.baselines.templates import DINOV2, DINOV2_SIZE, create_backbone, fit_templates, load_templates
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = ["TrainedBaseline", "check_weights", "crop_size", "load_baselines", "pretrained_files", "train_baselines"]
+__all__ = [
+    "BASELINES",
+    "CLOUD_BASELINES",
+    "NETWORKS",
+    "TITLES",
+    "TrainedBaseline",
+    "check_baselines",
+    "load_baselines",
+    "train_baselines",
+]
+
+CLOUD_BASELINES = ("thor", "forest", "pointnet")
+"""Baselines on point clouds."""
+
+NETWORKS = tuple(ARCHITECTURES)
+"""Image networks on crops of colour and surface normals."""
+
+BASELINES = (*CLOUD_BASELINES, *NETWORKS, TEMPLATES)
+"""Names on the command line and in run directories, in the order of training."""
+
+TITLES = {
+    "forest": "forest",
+    "pointnet": "PointNet",
+    "thor": "THOR",
+    "rcfusion": "RCFusion",
+    "rcfusion-small": "RCFusion-small",
+    "vit-cnn": "ViT-CNN",
+    "vit-cnn-small": "ViT-CNN-small",
+    "rgbd-vit": "RGB-D ViT",
+    "rgbd-vit-small": "RGB-D ViT-small",
+    TEMPLATES: "templates",
+}
+"""Column titles of the baselines, in the order of the columns."""
 
 Load = Callable[[Mapping[str, Any], TrainedRun], Predictor]
 
@@ -44,6 +78,19 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
 }
 """Name -> functions that fit a baseline and that build it from its arrays and run; the second raises KeyError or
 ValueError for unfit arrays."""
+
+
+def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
+    """Return `names` in the order of BASELINES.
+
+    Raises:
+        InputError: a name is unknown or given twice.
+    """
+    if not set(names) <= set(BASELINES) or len(set(names)) != len(names):
+        raise InputError(
+            f"baselines is {', '.join(names)}; expected any of {', '.join(BASELINES)}; give each at most once"
+        )
+    return tuple(name for name in BASELINES if name in names)
 
 
 class TrainedBaseline(NamedTuple):
@@ -130,36 +177,3 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
             ) from None
         loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
     return loaded
-
-
-def pretrained_files(name: str) -> list[str]:
-    """Return the files of pretrained weights that a baseline reads, without the suffix; none for most baselines."""
-    if name == TEMPLATES:
-        return [DINOV2]
-    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
-
-
-def crop_size(names: Sequence[str], weights: bool) -> int | None:
-    """Return the side of the crops in pixels that baselines are trained on, the largest one; None if they need none.
-
-    Args:
-        names: names of the baselines.
-        weights: whether there are pretrained weights: DINOv2, by which templates are compared then, reads large crops.
-    """
-    sizes = [ARCHITECTURES[name].size for name in names if name in ARCHITECTURES]
-    if TEMPLATES in names:
-        sizes.append(DINOV2_SIZE if weights else ARCHITECTURES["rgbd-vit-small"].size)
-    return max(sizes, default=None)
-
-
-def check_weights(directory: Path, name: str) -> None:
-    """Read the files of a baseline's pretrained weights, without keeping them.
-
-    Raises:
-        InputError: a file is missing, damaged or of another architecture.
-    """
-    if name == TEMPLATES:
-        load_weights(directory, [(nnx.eval_shape(lambda: create_backbone(DINOV2)), DINOV2)])
-    elif name in ARCHITECTURES:
-        architecture = ARCHITECTURES[name]
-        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

@@ -17,12 +17,12 @@ from training.baselines.baseline import (
     FitTask,
     NetworkFit,
     Predictor,
+    StoredBaseline,
     as_given,
     compiled_network,
     fit_network,
     in_batches,
 )
-from training.baselines.files import StoredBaseline
 
 __all__ = ["POINTS", "PointNet", "fit_pointnet", "load_pointnet"]
 

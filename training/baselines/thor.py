@@ -28,13 +28,12 @@ from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
-from training.baselines.baseline import BaselineInputs, FitTask, Predictor, as_given, compiled_network
-from training.baselines.files import StoredBaseline
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, as_given, compiled_network
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import build_samples
-from training.rendering.view_sphere import view_angles
+from training.rendering.camera import view_angles
 
 __all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
 
@@ -168,7 +167,7 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # of each view number
-    config = dataclasses.replace(task.run.config, homology="closed_form")
+    config = task.run.config
     samples = build_samples(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
     best = np.zeros((len(samples), len(samples.classes)), np.float32)

@@ -54,7 +54,9 @@ def render(
     from training.objects.meshes import find_meshes, scaled_meshes
     from training.storage.jobs import of_stage
     from training.storage.workers import IN_PROCESS
-    from training.views.render_job import RenderJob, render_crops, render_dataset
+    from training.views.crops import render_crops
+    from training.views.dataset import render_dataset
+    from training.views.mesh_views import RenderJob
 
     pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None

@@ -20,7 +20,6 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from training.embedding.distractors import COPIES, SEED
 from training.embedding.fit import fit_embedding, reference_views
 from training.embedding.samples import ObjectSource, build_samples, samples_record
 from training.fitting.loop import Checkpoints, fit_progress
@@ -47,7 +46,7 @@ def build_embedding(
     of_meshes = find_meshes(meshes).values() if meshes else ()
     sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in of_meshes for _ in range(MESH_WEIGHT))]
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
-    arguments = sources, network, config, views, COPIES, SEED
+    arguments = sources, network, config, views
     job, directory = samples_record(*arguments) | {"epochs": epochs}, out.with_name(f"{out.name}.checkpoints")
     start = time.monotonic()
 

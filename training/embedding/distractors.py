@@ -24,24 +24,16 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import json_digest
 from thor2_jax.types import Cloud
 from training.embedding.samples import ObjectSource, Samples, build_samples, render_clouds, samples_record
-from training.storage.arrays import load_arrays, load_metadata, save_arrays
-from training.storage.jobs import cache_directory, locked
+from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, save_arrays
 from training.storage.workers import local_workers
 
 __all__ = [
-    "COPIES",
     "Distractors",
     "distractor_samples",
     "held_out_clouds",
     "stored_samples",
     "with_fitted_distractors",
 ]
-
-COPIES = 2
-"""Samples of each view, in random orientations."""
-
-SEED = 0
-"""Seed of the distractors of all runs, which therefore share their samples in the user's cache."""
 
 ONE_HELD_OUT_OF = 10
 """One of so many distractors is held out."""
@@ -118,7 +110,7 @@ def distractor_samples(
         OSError: the directory cannot be written.
     """
     sources = distractors.sources
-    arguments = sources, network, config, distractors.views, COPIES, SEED
+    arguments = sources, network, config, distractors.views
     name = f"distractors-{json_digest(samples_record(*arguments))}"
 
     def build() -> Samples:
@@ -145,7 +137,7 @@ def held_out_clouds(distractors: Distractors, first: int) -> list[tuple[int, Clo
     They are rendered again: samples are strips in random orientations, without the points that the looks need.
     """
     objects = dict(list(enumerate(distractors.sources))[::ONE_HELD_OUT_OF])
-    return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views, SEED)]
+    return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views)]
 
 
 MAX_FILES = 3

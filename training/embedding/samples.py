@@ -35,10 +35,8 @@ from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.orientation import reorient
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import Camera, camera_pose, random_angles
-from training.storage.arrays import load_arrays, save_arrays
-from training.storage.jobs import processor
+from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
+from training.storage.jobs import load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import ViewSource, padded_batches
@@ -55,7 +53,8 @@ __all__ = [
     "samples_record",
 ]
 
-CLOUDS_PER_BATCH = 64
+COPIES = 2
+"""Samples of each cloud, in random orientations."""
 
 
 class Batch(NamedTuple):
@@ -136,18 +135,16 @@ def sample_clouds(
     labels: Sequence[int],
     network: ColorNetwork,
     config: DescriptorConfig,
-    copies: int,
     rng: np.random.Generator,
     are_normal: bool = False,
 ) -> Samples:
-    """Return samples of clouds, each in `copies` random orientations.
+    """Return samples of clouds, each in `COPIES` random orientations.
 
     Args:
         clouds: xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8. At least one.
         labels: of the clouds.
         network: colour network.
         config: descriptor. Static.
-        copies: samples of each cloud.
         rng: generator of the orientations.
         are_normal: whether the clouds are normalized. They stay in their order; clouds of one size share a batch
             otherwise, so that little of it is padding.
@@ -156,15 +153,15 @@ def sample_clouds(
     label = np.array([labels[k] for k in order], np.int32)
     chunks: list[Samples] = []
     done = 0
-    for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
+    for count, batch in padded_batches([clouds[k] for k in order]):
         normal = batch if are_normal else view_normalize(batch, config)
         sides = jnp.max(normal.points, axis=1)
         balanced = balanced_histogram(normal.colors, normal.mask)
-        for _ in range(copies):
+        for _ in range(COPIES):
             occupied = strips(turn(reorient(normal, rng), config), network, config)
             statistics = np.hstack([cloud_statistics(sides, normal, occupied), balanced])[:count]
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
-            length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
+            length = np.asarray(occupied.high - occupied.low).reshape(len(occupied.high), -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)
             at, named = (sample, strip), label[done : done + count]
             of_strips = strip.astype(np.uint16), length[at].astype(np.float16), color[at].astype(np.float16)
@@ -174,6 +171,9 @@ def sample_clouds(
 
 
 OBJECTS_PER_TASK = 32
+
+SEED = 0
+"""Seed of the views of objects and of their orientations: all runs share the distractors in the user's cache."""
 
 AUGMENTATIONS = Augmentations.of_names(KINDS)
 
@@ -187,13 +187,12 @@ ObjectSource = int | Path
 """The seed of a procedural object, or a mesh file."""
 
 
-def render_clouds(objects: Mapping[int, ObjectSource], views: int, seed: int) -> list[tuple[int, Cloud]]:
+def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple[int, Cloud]]:
     """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
 
     Args:
         objects: index -> object.
         views: number of views of each object.
-        seed: seed for cameras and augmentations, with the index.
 
     Raises:
         InputError: a mesh is unreadable.
@@ -202,7 +201,7 @@ def render_clouds(objects: Mapping[int, ObjectSource], views: int, seed: int) ->
     for index, source in objects.items():
         mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
         caster = RayCaster([mesh])
-        rng = np.random.default_rng([seed, index])
+        rng = np.random.default_rng([SEED, index])
         for _ in range(views):
             view = render_view(caster, camera_pose(*random_angles(rng), mesh.centre), CAMERA)
             cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
@@ -219,7 +218,7 @@ LIBRARY_CODE = (".", "descriptor", "frames")
 
 
 def samples_record(
-    sources: Sequence[ObjectSource], network: ColorNetwork, config: DescriptorConfig, views: int, copies: int, seed: int
+    sources: Sequence[ObjectSource], network: ColorNetwork, config: DescriptorConfig, views: int
 ) -> dict[str, Any]:
     """Return everything that determines the samples of `build_samples`, whose arguments these are, as JSON holds it.
 
@@ -235,8 +234,8 @@ def samples_record(
         "color_network": network.fingerprint,
         "objects": [digests[each] for each in sources],
         "views": views,
-        "copies": copies,
-        "seed": seed,
+        "copies": COPIES,
+        "seed": SEED,
         "augmentations": AUGMENTATIONS.record(),
         "version": thor2_jax.__version__,
         "code": content_digest(file.read_bytes() for file in files),
@@ -249,8 +248,6 @@ def build_samples(
     network: ColorNetwork,
     config: DescriptorConfig,
     views: int,
-    copies: int = 2,
-    seed: int = 0,
     pool: WorkerPool = IN_PROCESS,
     progress: Callable[[int, int], object] = lambda done, total: None,
     *,
@@ -264,8 +261,6 @@ def build_samples(
         network: colour network.
         config: descriptor. Static.
         views: number of views of each object.
-        copies: samples of each view, in random orientations.
-        seed: seed for cameras, augmentations and orientations.
         pool: worker processes that render; does not affect the result.
         progress: called with (objects done, number of objects) at the start and after each task of a worker.
         directory: directory of these samples only, created if it is missing, where those of each task are stored, so
@@ -289,15 +284,15 @@ def build_samples(
     missing = {file: task for file, task in tasks.items() if file not in chunks}
     done = sum(len(tasks[file]) for file in chunks)
     progress(done, len(sources))
-    render = functools.partial(render_clouds, views=views, seed=seed)
+    render = functools.partial(render_clouds, views=views)
     with contextlib.closing(pool(render, missing.values())) as results:
         for (file, task), rendered in zip(missing.items(), results, strict=True):
             invisible = task.keys() - {index for index, _ in rendered}
             if invisible:
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
-            rng = np.random.default_rng([seed, len(sources), min(task)])
+            rng = np.random.default_rng([SEED, len(sources), min(task)])
             labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
-            chunks[file] = sample_clouds(clouds, labels, network, config, copies, rng)
+            chunks[file] = sample_clouds(clouds, labels, network, config, rng)
             save_arrays(file, chunks[file].arrays(), {})
             done += len(task)
             progress(done, len(sources))
@@ -309,7 +304,6 @@ def sample_views(
     held_out: Mapping[int, NDArray[np.integer[Any]]],
     network: ColorNetwork,
     config: DescriptorConfig,
-    copies: int,
     seed: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> tuple[Samples, list[tuple[int, Cloud]]]:
@@ -320,7 +314,6 @@ def sample_views(
         held_out: label -> indices of the views of the held-out set.
         network: colour network.
         config: descriptor. Static.
-        copies: samples of each view, in random orientations.
         seed: seed for the orientations.
         progress: called with (shards done, number of shards).
 
@@ -336,7 +329,7 @@ def sample_views(
         clouds = list(itertools.compress(views.clouds(), ~is_kept))
         if clouds:
             labels = [views.label] * len(clouds)
-            fitted.append(sample_clouds(clouds, labels, network, config, copies, rng, are_normal=True))
+            fitted.append(sample_clouds(clouds, labels, network, config, rng, are_normal=True))
         for xyz, rgb in itertools.compress(views.clouds(), is_kept):
             # A copy, since a slice would keep all views of the shard in memory.
             kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))

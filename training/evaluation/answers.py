@@ -19,7 +19,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
-from training.baselines.files import TITLES
+from training.baselines.job import TITLES
 from training.storage.jobs import check_same_job
 
 __all__ = [

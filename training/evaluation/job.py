@@ -19,7 +19,7 @@ import numpy as np
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
+from thor2_jax.files import check_output_directory, file_digest, write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
@@ -91,8 +91,6 @@ def evaluate_dataset(
         }
         file = AnswerFile(out / ANSWERS, header)
         _check_unchanged(file, frames, out, progress)
-        for directory in (out, out / "frames", out / "confusions"):
-            remove_leftovers(directory)
         pictures = FramePictures(out, runs, len(frames))
         for answers in file.frames:
             pictures.record(answers)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from training.baselines.files import TITLES
+from training.baselines.job import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.published import published_seconds

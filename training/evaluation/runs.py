@@ -24,9 +24,9 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
-from training.baselines.baseline import BaselineInputs
-from training.baselines.files import NETWORKS, TEMPLATES, TITLES, baseline_file
-from training.baselines.job import TrainedBaseline, load_baselines
+from training.baselines.baseline import BaselineInputs, baseline_file
+from training.baselines.image_baselines import TEMPLATES
+from training.baselines.job import NETWORKS, TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of

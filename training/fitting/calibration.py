@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -14,9 +14,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, logit
 from sklearn.linear_model import LogisticRegression
 
-from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import EMBEDDING, Feature, feature_of
+from thor2_jax.model.classifier import EMBEDDING, feature_of
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
@@ -25,14 +23,13 @@ from thor2_jax.networks import MLP
 from thor2_jax.types import Cloud
 from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples
-from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
+from training.views.normalized_views import padded_batches
 
 __all__ = [
     "KEPT",
     "fit_calibration",
     "fit_temperature",
     "sample_probabilities",
-    "temperatures",
 ]
 
 SAMPLES_PER_BATCH = 256
@@ -49,7 +46,6 @@ def sample_probabilities(
     model: MLP, samples: Samples, rows: NDArray[np.intp], context: FitContext
 ) -> NDArray[np.float32]:
     """Return the class probabilities [len(rows), C] of samples; `context` is that of the fit."""
-    context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
     graph, state = nnx.split(model)
     chunks = [np.zeros((0, len(samples.classes)), np.float32)]
     for first in range(0, len(rows), SAMPLES_PER_BATCH):
@@ -57,32 +53,6 @@ def sample_probabilities(
         batch = samples.take(np.resize(chunk, SAMPLES_PER_BATCH))
         chunks.append(np.asarray(_probabilities(context, graph, state, batch))[: len(chunk)])
     return np.concatenate(chunks)
-
-
-def temperatures(
-    classifiers: Mapping[Feature, MLP],
-    samples: Samples,
-    held_out: NDArray[np.bool_] | None,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-) -> dict[str, float]:
-    """Fit each classifier's temperature on the held-out set; return an empty dict if there is none.
-
-    Args:
-        classifiers: trained on the other samples.
-        samples: all samples.
-        held_out: [M], True for samples of the held-out set.
-        network: as in the fit.
-        config: as in the fit.
-    """
-    if held_out is None or not held_out.any():
-        return {}
-    rows = np.flatnonzero(held_out)
-    truth = samples.label[rows]
-    return {
-        name: fit_temperature(sample_probabilities(model, samples, rows, FitContext(name, network, config)), truth)
-        for name, model in classifiers.items()
-    }
 
 
 def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.integer[Any]]) -> float:
@@ -122,7 +92,7 @@ def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> t
     model = Model.of_run(run)
     held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
     label = np.array([label for label, _ in held_out])
-    batches = padded_batches([cloud for _, cloud in held_out], CLOUDS_PER_BATCH)
+    batches = padded_batches([cloud for _, cloud in held_out])
     chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet

@@ -71,12 +71,15 @@ class FitContext:
     Attributes:
         feature: which part of the descriptor the classifier reads.
         network: colour network; gives the colour regions and their similarity.
-        config: descriptor, as the samples were built with.
+        config: descriptor, as the samples were built with, but always in closed form, which is equal to gudhi's values.
     """
 
     feature: Feature
     network: ColorNetwork
     config: DescriptorConfig
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "config", dataclasses.replace(self.config, homology="closed_form"))
 
 
 def initial_state(model: nnx.Module, optimizer: Any) -> tuple[Any, FitState]:
@@ -205,7 +208,7 @@ def fit(
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, or resume from the last checkpoint.
 
-    Samples are expanded to descriptors on the devices, one batch at a time, in closed form (equal to gudhi's values).
+    Samples are expanded to descriptors on the devices, one batch at a time.
 
     Args:
         samples: training samples and held-out set; with several processes, the same in each.
@@ -224,7 +227,6 @@ def fit(
         InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
         OSError: A checkpoint cannot be written. The last complete one stays.
     """
-    context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
     train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]

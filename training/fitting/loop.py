@@ -28,8 +28,7 @@ from jax.experimental import multihost_utils
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.run_record import RUN_FILE
-from training.storage.arrays import load_arrays, load_metadata, save_arrays
-from training.storage.jobs import Progress
+from training.storage.jobs import Progress, load_arrays, load_metadata, save_arrays
 
 __all__ = [
     "BEGUN",

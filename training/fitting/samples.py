@@ -37,9 +37,6 @@ MIRRORS = ("", "x")
 PAPER_MIRRORS = ("", "x", "y", "xy")
 """The four mirrors of the paper."""
 
-VIEWS_PER_BATCH = 64
-"""Batch size of the description of views."""
-
 PADDING = np.iinfo(np.uint16).max
 """Strip index of padding."""
 
@@ -154,7 +151,7 @@ def build_samples(
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         done = 0
-        for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
+        for count, normal in padded_batches(views.clouds()):
             copies = (mirror(normal, axes) for axes in mirrors)
             for copy in itertools.chain(copies, (reorient(normal, rng) for _ in range(orientations))):
                 strips = strips_by_sets(turn(copy, config), counting, config)

@@ -15,8 +15,8 @@ from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.recordings.detection_files import COMPRESSED_IMAGE, MessageBag
 from thor2_jax.recordings.messages import ros_time
 from training.objects.builtin_objects import builtin_objects
+from training.rendering.camera import Camera
 from training.rendering.scenes import compose_views
-from training.rendering.view_sphere import Camera
 
 __all__ = ["write_sample_recording"]
 

@@ -16,9 +16,15 @@ from scipy.spatial import ConvexHull
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.objects.mesh import TexturedMesh, moved
-from training.rendering.depth_camera import axial_deviation, depth_edges
-from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
-from training.rendering.view_sphere import Camera, camera_pose
+from training.rendering.camera import (
+    Camera,
+    RayCaster,
+    axial_deviation,
+    camera_pose,
+    depth_edges,
+    pixel_rays,
+    render_view,
+)
 
 __all__ = ["SCENE_CAMERA", "Scene", "compose_scene", "compose_views"]
 

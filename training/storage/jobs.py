@@ -1,6 +1,7 @@
-"""Long jobs: their records and locks on output directories, their progress, and the user's cache directory.
+"""Long jobs: records and locks of their output directories, arrays by which they resume, progress, and the cache.
 
-The cache directory may be deleted at any time. The environment variable THOR2_CACHE names another one, or is `off`.
+The user's cache directory may be deleted at any time. The environment variable THOR2_CACHE names another one, or is
+`off`.
 """
 
 import itertools
@@ -14,24 +15,39 @@ from pathlib import Path
 from typing import Any
 
 import filelock
+import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, write_text
+from thor2_jax.files import (
+    atomic_write,
+    content_digest,
+    pack_arrays,
+    read_file,
+    safetensors_metadata,
+    unpack_arrays,
+    write_text,
+)
 
 __all__ = [
-    "JOB_FILE",
     "LOCK",
+    "MANIFEST",
     "Progress",
+    "add_prefix",
     "begin_job",
     "cache_directory",
     "check_begun",
     "check_same_job",
+    "intact_content",
+    "load_arrays",
+    "load_metadata",
     "locked",
     "numbered",
     "of_stage",
-    "add_prefix",
     "processor",
+    "save_arrays",
+    "write_checked",
 ]
 
 VARIABLE = "THOR2_CACHE"
@@ -210,3 +226,70 @@ def locked(directory: Path) -> AbstractContextManager[object]:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
+
+
+MANIFEST = "manifest.json"
+"""List of the finished files in an output directory, with their checksums."""
+
+
+def write_checked(path: Path, content: bytes) -> str:
+    """Write a file and return its SHA-256.
+
+    Raises:
+        OSError: the file cannot be written; an older one stays.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return content_digest([content])
+
+
+def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
+    """Return the bytes of a file; None if it is missing or has another checksum."""
+    path = directory / name
+    content = path.read_bytes() if path.is_file() else b""
+    return content if content_digest([content]) == sha256 else None
+
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def _arrays_digest(arrays: Arrays) -> str:
+    return content_digest(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]).tobytes()))
+
+
+def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None:
+    """Write arrays and metadata to a safetensors file.
+
+    Raises:
+        OSError: the file cannot be written; an older one stays.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(pack_arrays(arrays, {**metadata, "sha256": _arrays_digest(arrays)}))
+
+
+def load_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of a file, which may be damaged behind its header.
+
+    Raises:
+        ValueError: the file is missing, or its header is damaged.
+    """
+    try:
+        with path.open("rb") as stream:
+            return safetensors_metadata(stream.read(2**20))
+    except (OSError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(str(error)) from None
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file.
+
+    Raises:
+        ValueError: the file is missing or damaged.
+    """
+    try:
+        arrays, metadata = unpack_arrays(read_file(path))
+    except OSError as error:
+        raise ValueError(str(error)) from None
+    if _arrays_digest(arrays) != metadata.get("sha256"):
+        raise ValueError("its content is damaged")
+    return arrays

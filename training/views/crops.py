@@ -4,24 +4,45 @@
     crop.color, crop.normals, crop.mask         # [224, 224, 3], [224, 224, 3], [224, 224]
 
 A rendered view is cropped alike (`rgbd_crop(view.frame, 1)`). Image networks are trained on the crops of the views of a
-dataset (`ViewDataset.read_crops`).
+dataset, which are rendered once more for them:
+
+    render_crops(job, dataset, size=96, pool=local_workers(2))
+
+The dataset and its digest do not change: crops may be added to views that runs were trained on.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import functools
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from thor2_jax.errors import InputError
+from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
+from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views.mesh_views import RenderJob, ViewTask, all_views
+
+if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
+    from training.views.dataset import ViewDataset
 
 __all__ = [
+    "CROPS",
     "CROP_SIZE",
     "QuantizedCrop",
     "ViewCrops",
     "fill_depth",
     "quantized",
+    "read_crops",
+    "render_crops",
     "rgbd_crop",
     "stacked",
     "surface_normals",
@@ -206,3 +227,141 @@ def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
     for row, (color, normals) in enumerate(crops):
         record.color[row], record.normals[row] = color, normals
     return record
+
+
+CROPS = "crops"
+"""Directory of the crops in the directory of a dataset."""
+
+CROPS_FORMAT = 1
+
+
+def _encode(crops: ViewCrops) -> bytes:
+    """Return the bytes of a file of crops."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, color=crops.color, normals=crops.normals)
+    return stream.getvalue()
+
+
+def _write_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
+    """Write the manifest of a directory of crops.
+
+    Args:
+        directory: the directory.
+        size: side of the crops, pixels.
+        dataset: digest of the dataset.
+        files: file name -> SHA-256 of the finished files.
+
+    Raises:
+        OSError: the manifest cannot be written.
+    """
+    content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset, "files": files}
+    write_text(directory / MANIFEST, json.dumps(content) + "\n")
+
+
+def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
+    """Return size, dataset and files of the manifest in a directory of crops, see `_write_manifest`.
+
+    Raises:
+        InputError: it is missing, damaged or of another format.
+    """
+    path = directory / MANIFEST
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] != CROPS_FORMAT:
+            raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
+        return int(content["size"]), str(content["dataset"]), dict(content["files"])
+    except OSError:
+        raise InputError(
+            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
+            "`thor2 render` command with --crops"
+        ) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
+        ) from None
+
+
+def _crop_file(shard: str) -> str:
+    """Return the file name of the crops of a shard, given its file name."""
+    return Path(shard).with_suffix(".npz").name
+
+
+def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
+    """Return (number of the view, of the copy) -> crop of the views of a task in which something is visible."""
+    return {
+        (number, copy): quantized(rgbd_crop(view.frame, 1, size))
+        for number, copy, view in all_views(task)
+        if view.depth.any()
+    }
+
+
+def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]:
+    """Return the intact files of an interrupted rendering, file name -> checksum.
+
+    Raises:
+        InputError: the crops have another size, or are of another dataset.
+    """
+    check_output_directory(directory, MANIFEST)
+    if not (directory / MANIFEST).is_file():
+        return {}
+    stored_size, digest, files = _read_manifest(directory)
+    requested = {"crops": size, "dataset": dataset.digest}
+    check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
+    return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
+
+
+def render_crops(
+    job: RenderJob,
+    dataset: "ViewDataset",
+    size: int = CROP_SIZE,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> None:
+    """Render the crops of all views of a dataset; an interrupted rendering resumes.
+
+    Args:
+        job: the job of the dataset.
+        dataset: the dataset.
+        size: side of the crops, pixels, at least 1.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (crops done, total crops) at the start and after each shard.
+
+    Raises:
+        InputError: the dataset has crops of another size.
+        OSError: a file cannot be written; the rendering can be resumed.
+    """
+    directory = dataset.directory / CROPS
+    with locked(directory):
+        done = _begin(directory, dataset, size)
+        missing = [index for index, shard in enumerate(dataset.shards) if _crop_file(shard.file) not in done]
+        n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
+        progress(n_done, len(dataset))
+        tasks = job.tasks(dataset.shards[index].file for index in missing)
+        with contextlib.closing(pool(functools.partial(_crops_of, size=size), tasks)) as results:
+            for index, rendered in zip(missing, results, strict=True):
+                views, name = dataset.read(index), _crop_file(dataset.shards[index].file)
+                of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
+                done[name] = write_checked(directory / name, _encode(stacked(of_shard, size)))
+                _write_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
+                n_done += len(views)
+                progress(n_done, len(dataset))
+
+
+def read_crops(dataset: "ViewDataset", index: int, size: int) -> ViewCrops:
+    """Read the crops of a shard; arguments and exceptions as `ViewDataset.read_crops`."""
+    directory, name = dataset.directory / CROPS, _crop_file(dataset.shards[index].file)
+    stored, digest, files = _read_manifest(directory)
+    if digest != dataset.digest:
+        raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
+    if stored < size:
+        raise InputError(
+            f"dataset: {directory} has crops of {stored} pixels; expected at least {size}; delete it and render "
+            f"with --crops {size}"
+        )
+    content = intact_content(directory, name, files.get(name, ""))
+    if content is None:
+        raise InputError(
+            f"dataset: {directory / name} is missing or damaged; repeat `thor2 render` with --crops to restore it"
+        )
+    with np.load(io.BytesIO(content)) as arrays:
+        return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)

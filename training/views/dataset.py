@@ -1,6 +1,7 @@
-"""Datasets of normalized views on disk, written by `render_dataset` and read by training.
+"""Datasets of normalized views on disk, rendered from meshes and read by training.
 
-    dataset = ViewDataset.open("views")
+    job = RenderJob(find_meshes("meshes"))
+    dataset = render_dataset(job, "views", pool=local_workers(2))     # later: ViewDataset.open("views")
     dataset.classes, len(dataset)
     for index in range(len(dataset.shards)):
         views = dataset.read(index)                # views.xyz, views.rgb, views.counts, views.label
@@ -18,6 +19,9 @@ too few points are left out. Its directory has `manifest.json` and shards, safet
 The manifest has the job, everything that determines the views, and the finished shards with their checksums. It has no
 time stamps: the same job gives the same bytes.
 
+Worker processes render; this process normalizes and writes the shards one by one, in a fixed order. The bytes therefore
+do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
+
 Image networks are trained on crops of the same views, which `render_crops` adds:
 
     crops = dataset.read_crops(index, 96)          # one crop for each cloud of `read(index)`
@@ -28,44 +32,28 @@ Image networks are trained on crops of the same views, which `render_crops` adds
 
 import contextlib
 import dataclasses
-import io
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import safetensors.numpy
 
-from thor2_jax.config import DESCRIPTOR_VERSION
-from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, read_file, remove_written, write_text
-from training.views.crops import ViewCrops
-from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import check_output_directory, content_digest, read_file, remove_written, write_text
+from thor2_jax.types import Cloud
+from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
+from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views.crops import CROPS, ViewCrops, read_crops
+from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
+from training.views.normalized_views import NormalizedViews, normalize_views
 
-__all__ = [
-    "CROPS",
-    "MANIFEST",
-    "Manifest",
-    "NormalizedViews",
-    "Shard",
-    "ViewDataset",
-    "crop_file",
-    "encode",
-    "encode_crops",
-    "intact_content",
-    "read_crop_manifest",
-    "remove_views",
-    "write_crop_manifest",
-]
+__all__ = ["Manifest", "Shard", "ViewDataset", "encode", "remove_views", "render_dataset"]
 
-MANIFEST = "manifest.json"
 MANIFEST_FORMAT = 2
-
-CROPS = "crops"
-"""Directory of the crops in the directory of a dataset."""
-
-CROPS_FORMAT = 1
 
 
 def remove_views(directory: Path) -> None:
@@ -81,13 +69,6 @@ def encode(views: NormalizedViews) -> bytes:
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
     others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy")}
     return safetensors.numpy.save({"xyz": steps, **others})
-
-
-def intact_content(directory: Path, name: str, sha256: str) -> bytes | None:
-    """Return the bytes of a file; None if it is missing or has another checksum."""
-    path = directory / name
-    content = path.read_bytes() if path.is_file() else b""
-    return content if content_digest([content]) == sha256 else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,57 +152,6 @@ class Manifest:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
-
-
-def encode_crops(crops: ViewCrops) -> bytes:
-    """Return the bytes of a file of crops."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, color=crops.color, normals=crops.normals)
-    return stream.getvalue()
-
-
-def write_crop_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
-    """Write the manifest of a directory of crops.
-
-    Args:
-        directory: the directory.
-        size: side of the crops, pixels.
-        dataset: digest of the dataset.
-        files: file name -> SHA-256 of the finished files.
-
-    Raises:
-        OSError: the manifest cannot be written.
-    """
-    content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset, "files": files}
-    write_text(directory / MANIFEST, json.dumps(content) + "\n")
-
-
-def read_crop_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
-    """Return size, dataset and files of the manifest in a directory of crops, see `write_crop_manifest`.
-
-    Raises:
-        InputError: it is missing, damaged or of another format.
-    """
-    path = directory / MANIFEST
-    try:
-        content = json.loads(path.read_bytes())
-        if content["format"] != CROPS_FORMAT:
-            raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
-        return int(content["size"]), str(content["dataset"]), dict(content["files"])
-    except OSError:
-        raise InputError(
-            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
-            "`thor2 render` command with --crops"
-        ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
-        ) from None
-
-
-def crop_file(shard: str) -> str:
-    """Return the file name of the crops of a shard, given its file name."""
-    return Path(shard).with_suffix(".npz").name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -317,19 +247,80 @@ class ViewDataset:
         Raises:
             InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
         """
-        directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
-        stored, digest, files = read_crop_manifest(directory)
-        if digest != self.digest:
-            raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
-        if stored < size:
-            raise InputError(
-                f"dataset: {directory} has crops of {stored} pixels; expected at least {size}; delete it and render "
-                f"with --crops {size}"
-            )
-        content = intact_content(directory, name, files.get(name, ""))
-        if content is None:
-            raise InputError(
-                f"dataset: {directory / name} is missing or damaged; repeat `thor2 render` with --crops to restore it"
-            )
-        with np.load(io.BytesIO(content)) as arrays:
-            return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)
+        return read_crops(self, index, size)
+
+
+def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
+    """Return the manifest with the intact shards; write it if it is missing or lists damaged shards.
+
+    Raises:
+        InputError: The directory holds another job.
+        OSError: The directory cannot be written.
+    """
+    path = directory / MANIFEST
+    stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
+    if stored:
+        check_same_job(directory, stored.job, job)
+    shards = stored.shards if stored else ()
+    is_intact = [intact_content(directory, shard.file, shard.sha256) is not None for shard in shards]
+    manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)))
+    if manifest != stored:
+        manifest.write(directory)
+    return manifest
+
+
+def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
+    """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
+
+    Raises:
+        InputError: A cloud cannot be normalized or stored.
+        OSError: The file cannot be written.
+    """
+    numbers = [number for number, _, _ in rendered], [copy for _, copy, _ in rendered]
+    views = normalize_views([cloud for _, _, cloud in rendered], label, *numbers, DescriptorConfig())
+    digest, n_views = write_checked(path, encode(views)), len(views)
+    return Shard(path.name, digest, label, n_views, left_out=planned - n_views, points=len(views.xyz))
+
+
+def render_dataset(
+    job: RenderJob,
+    out: str | Path,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> ViewDataset:
+    """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
+
+    A resumed rendering renders what is missing or damaged; the dataset ends up with the same bytes as without the
+    interruption. Memory holds one shard per worker, and one.
+
+    Args:
+        job: the job.
+        out: directory: new, empty, or with a dataset of the same job; created with its parents.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (clouds done, total clouds) at the start and after each shard.
+
+    Raises:
+        InputError: Nothing is written if the job is invalid, see `RenderJob.record`, or `out` holds something else,
+            views of another job (names what differs) or is written by another process.
+        OSError: `out` cannot be written; the rendering can be resumed.
+    """
+    out = Path(out)
+    check_output_directory(out, MANIFEST)
+    record, labels = job.record(), {name: label for label, name in enumerate(job.meshes)}
+    total = len(labels) * len(job.angles) * job.copies
+    with locked(out):
+        done = {shard.file: shard for shard in _begin(out, record).shards}
+        progress(_clouds(done), total)
+        missing = [file for file in job.shards if file not in done]
+        with contextlib.closing(pool(render_task, job.tasks(missing))) as results:
+            for file, rendered in zip(missing, results, strict=True):
+                name, views = job.shards[file]
+                with with_context(f"object {name!r}"):
+                    done[file] = _store(out / file, labels[name], job.copies * len(views), rendered)
+                Manifest(record, tuple(done[file] for file in job.shards if file in done)).write(out)
+                progress(_clouds(done), total)
+    return ViewDataset.open(out)
+
+
+def _clouds(shards: Mapping[str, Shard]) -> int:
+    return sum(shard.views + shard.left_out for shard in shards.values())

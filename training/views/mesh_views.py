@@ -2,20 +2,23 @@
 
     views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5)     # name -> clouds
 
-`render_dataset` writes more views than memory holds to disk. Nothing here imports JAX, so that processes that render
-start quickly.
+`render_dataset` writes the views of a `RenderJob` to disk, more than memory holds. Nothing here imports JAX, so that
+processes that render start quickly.
 """
 
 import dataclasses
+import functools
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+import itertools
+import operator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import pixel_points
 from thor2_jax.frames.outliers import downsample_to_fit
@@ -23,23 +26,30 @@ from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstanc
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import RenderedView, camera_pose, random_angles, view_angles
+from training.rendering.camera import (
+    DISTANCE,
+    TRAINING_CAMERA,
+    RayCaster,
+    RenderedView,
+    camera_pose,
+    random_angles,
+    render_view,
+    view_angles,
+)
 
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from thor2_jax.types import Cloud
 
 __all__ = [
+    "COORDINATE_STEP",
+    "MAX_VIEW_LENGTH",
     "MESH_VIEWS",
     "MIN_VIEW_POINTS",
-    "RenderProgress",
+    "RenderJob",
     "ViewTask",
     "all_views",
-    "checked_meshes",
     "cloud_of",
-    "clouds_per_view",
     "mesh_views",
-    "read_mesh",
     "render_task",
     "render_views",
     "view_cloud",
@@ -50,8 +60,14 @@ SIGMA_S = DescriptorConfig().sigma_s
 MIN_VIEW_POINTS = 30
 """Views with fewer points are left out: too little of the object is visible to describe it."""
 
-RenderProgress = Callable[[int, int], object]
-"""Called with (clouds done, total clouds)."""
+COORDINATE_STEP = 2.0**-14
+"""Resolution of the coordinates, scaled units (0.024 mm)."""
+
+MAX_VIEW_LENGTH = COORDINATE_STEP * np.iinfo(np.uint16).max
+"""Largest coordinate, scaled units (1.6 m): multiples of `COORDINATE_STEP` up to it fit into 16 bits."""
+
+CLOUDS_PER_SHARD = 256
+"""Clouds per shard of a dataset, rounded down to whole views: a few megabytes, about a second of rendering."""
 
 
 def cloud_of(view: RenderedView) -> "Cloud":
@@ -112,7 +128,7 @@ class ViewTask:
     seed: int = 0
 
 
-def clouds_per_view(augmentations: Augmentations | None) -> int:
+def _clouds_per_view(augmentations: Augmentations | None) -> int:
     """Return the number of clouds per view: the view as rendered and its augmented copies."""
     return 1 + augmentations.copies if augmentations else 1
 
@@ -127,7 +143,7 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
     caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
         yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
-        for copy in range(1, clouds_per_view(task.augmentations)):
+        for copy in range(1, _clouds_per_view(task.augmentations)):
             assert task.augmentations is not None
             rng = np.random.default_rng([task.seed, name, number, copy])
             other = render_view(caster, camera_pose(*random_angles(rng), centre))
@@ -147,12 +163,12 @@ def render_task(task: ViewTask) -> list[tuple[int, int, "Cloud"]]:
     return list(_clouds(task))
 
 
-def read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
+def _read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
     """Return the mesh of a file, or the mesh itself."""
     return source if isinstance(source, TexturedMesh) else load_mesh(source)
 
 
-def checked_meshes(
+def _checked_meshes(
     meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
 ) -> Iterator[tuple[str, TexturedMesh]]:
     """Yield each object's name and mesh, one in memory at a time; finds unusable meshes before the long rendering.
@@ -163,13 +179,102 @@ def checked_meshes(
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
-        mesh = read_mesh(source)
+        mesh = _read_mesh(source)
         if next(_clouds(ViewTask(name, mesh, angles)), None) is None:
             raise InputError(
                 f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
                 "mesh or leave it out"
             )
         yield name, mesh
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderJob:
+    """Everything that determines a dataset of views.
+
+    Attributes:
+        meshes: object name -> mesh file, as from `find_meshes`, or mesh.
+        azimuth_step: degrees; divides 360.
+        polar_step: degrees; divides 180.
+        augmentations: adds augmented copies of each view; None adds none.
+        seed: seed for the augmentations, at least 0. The copies of an object do not depend on the other objects.
+    """
+
+    meshes: Mapping[str, Path | TexturedMesh]
+    azimuth_step: float = 5.0
+    polar_step: float = 5.0
+    augmentations: Augmentations | None = None
+    seed: int = 0
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Azimuth and polar angle [n, 2] of the views of an object; raises InputError for an invalid step."""
+        return view_angles(self.azimuth_step, self.polar_step)
+
+    @property
+    def copies(self) -> int:
+        """Number of clouds of a view."""
+        return _clouds_per_view(self.augmentations)
+
+    @functools.cached_property
+    def shards(self) -> dict[str, tuple[str, range]]:
+        """File name -> object and numbers of the views of each shard."""
+        size, n_views = max(1, CLOUDS_PER_SHARD // self.copies), len(self.angles)
+        return {
+            f"{label:04d}-{number:04d}.safetensors": (name, range(first, min(first + size, n_views)))
+            for label, name in enumerate(self.meshes)
+            for number, first in enumerate(range(0, n_views, size))
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Check the job and return it as JSON holds it.
+
+        Raises:
+            InputError: there are no meshes, a mesh is unreadable, too large or never visible, or a step or the seed is
+                invalid.
+        """
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}; it must be at least 0")
+        augmentations, camera = self.augmentations, TRAINING_CAMERA
+        objects = [
+            {"name": name, "mesh": _checked_size(name, mesh).digest}
+            for name, mesh in _checked_meshes(self.meshes, self.angles)
+        ]
+        # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
+        intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
+        return {
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "sigma_s": SIGMA_S,
+            "voxel": DESCRIPTOR_VOXEL,
+            "step": COORDINATE_STEP,
+            "min_points": MIN_VIEW_POINTS,
+            "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
+            "azimuth_step": float(self.azimuth_step),
+            "polar_step": float(self.polar_step),
+            "variations": {"seed": self.seed, "cameras": "random", **augmentations.record()} if augmentations else None,
+            "objects": objects,
+            "shards": len(self.shards),
+        }
+
+    def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
+        """Yield the task of each of these shards; a mesh is read once for consecutive shards of its object."""
+        angles = self.angles
+        for name, group in itertools.groupby(map(self.shards.__getitem__, files), key=operator.itemgetter(0)):
+            mesh = _read_mesh(self.meshes[name])
+            for _, views in group:
+                of_views = angles[views.start : views.stop]
+                yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
+
+
+def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
+    """Return a mesh unless its views may be too large to be stored."""
+    diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if SIGMA_S * diameter > MAX_VIEW_LENGTH:
+        raise InputError(
+            f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
+            "stored; scale the mesh to metres"
+        )
+    return mesh
 
 
 def render_views(
@@ -190,7 +295,7 @@ def render_views(
         InputError: There are no meshes, a mesh is unreadable or never visible, or a step is invalid.
     """
     angles = view_angles(azimuth_step, polar_step)
-    tasks = (ViewTask(name, mesh, angles) for name, mesh in checked_meshes(meshes, angles))
+    tasks = (ViewTask(name, mesh, angles) for name, mesh in _checked_meshes(meshes, angles))
     return {task.name: [cloud for _, _, cloud in _clouds(task)] for task in tasks}
 
 

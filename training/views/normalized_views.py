@@ -26,10 +26,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
 from thor2_jax.types import Cloud, PointClouds
 from training.views.crops import ViewCrops
+from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH
 
 __all__ = [
-    "COORDINATE_STEP",
-    "MAX_VIEW_LENGTH",
     "MemoryViews",
     "NormalizedViews",
     "SourceShard",
@@ -41,24 +40,17 @@ __all__ = [
     "sequence_sources",
 ]
 
-COORDINATE_STEP = 2.0**-14
-"""Resolution of the coordinates, scaled units (0.024 mm)."""
-
-MAX_VIEW_LENGTH = COORDINATE_STEP * np.iinfo(np.uint16).max
-"""Largest coordinate, scaled units (1.6 m): multiples of `COORDINATE_STEP` up to it fit into 16 bits."""
-
 CLOUDS_PER_BATCH = 64
-"""Batch size of the normalization."""
+"""Batch size of everything that is computed of the clouds of a training."""
 
 
 def padded_batches(
-    clouds: Sequence[Cloud], size: int, boundary: Sequence[NDArray[np.bool_]] | None = None
+    clouds: Sequence[Cloud], boundary: Sequence[NDArray[np.bool_]] | None = None
 ) -> Iterator[tuple[int, PointClouds]]:
-    """Yield clouds in batches of `size`; the last batch is filled up with empty clouds.
+    """Yield clouds in batches of `CLOUDS_PER_BATCH`; the last batch is filled up with empty clouds.
 
     Args:
         clouds: the clouds.
-        size: clouds in a batch.
         boundary: for each cloud [n] bool, the points on the occlusion boundary; None if there are none.
 
     Yields:
@@ -68,10 +60,10 @@ def padded_batches(
         InputError: A cloud has more points than the largest bucket.
     """
     empty: Cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    for start in range(0, len(clouds), size):
-        chunk = list(clouds[start : start + size])
-        padding = size - len(chunk)
-        marks = None if boundary is None else [*boundary[start : start + size], *[None] * padding]
+    for start in range(0, len(clouds), CLOUDS_PER_BATCH):
+        chunk = list(clouds[start : start + CLOUDS_PER_BATCH])
+        padding = CLOUDS_PER_BATCH - len(chunk)
+        marks = None if boundary is None else [*boundary[start : start + len(chunk)], *[None] * padding]
         capacity = batch_points(len(xyz) for xyz, _ in chunk)
         yield len(chunk), PointClouds.pack(chunk + [empty] * padding, capacity, boundary=marks)
 
@@ -167,7 +159,7 @@ def normalize_views(
     xyz = [np.zeros((0, 3), np.float32)]
     # Always on the CPU: an accelerator rounds differently, and rendering should not occupy its memory.
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        for count, batch in padded_batches(clouds, CLOUDS_PER_BATCH, boundary):
+        for count, batch in padded_batches(clouds, boundary):
             normal = view_normalize(batch, config)
             padded, mask = np.asarray(normal.points)[:count], np.asarray(normal.mask)[:count]
             xyz.append(np.rint(padded[mask] / np.float32(COORDINATE_STEP)) * np.float32(COORDINATE_STEP))

@@ -9,7 +9,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
 from thor2_jax.tracking.viewpoints import check_pose, merge_views
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import camera_pose
 
 
 def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:

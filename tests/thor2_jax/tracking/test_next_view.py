@@ -7,7 +7,7 @@ from scipy.stats import entropy
 
 import thor2_jax as thor2
 from thor2_jax.tracking.viewpoints import ViewTable, next_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import camera_pose
 
 AZIMUTHS = np.arange(8) * np.pi / 4
 CENTRE = np.array([0.3, -0.2, 0.1])

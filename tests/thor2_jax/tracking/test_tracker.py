@@ -16,7 +16,7 @@ from thor2_jax.model.inference import Inference
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker
 from thor2_jax.tracking.viewpoints import ViewTable
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import camera_pose
 
 run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), seed=1))
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.frames.frames import Intrinsics
 from training.augmentation.augmentations import Augmentations, augment
-from training.rendering.view_sphere import RenderedView
+from training.rendering.camera import RenderedView
 
 
 def flat_view(

@@ -13,12 +13,10 @@ from scipy.special import ndtr
 
 from thor2_jax.frames.frames import backproject
 from training.augmentation.augmentations import KINDS, Augmentations, augment
-from training.augmentation.illumination import Illumination, Registration
-from training.augmentation.occlusion import Occlusion, _silhouettes
-from training.augmentation.segmentation import Base, Segmentation
+from training.augmentation.masks import Base, Occlusion, Segmentation, _silhouettes
+from training.augmentation.sensing import Illumination, Registration
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import TRAINING_CAMERA, RenderedView, camera_pose
+from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose, render_view
 from training.views.mesh_views import cloud_of
 
 from .conftest import augmented_view, flat_view, wall

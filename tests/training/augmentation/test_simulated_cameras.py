@@ -8,7 +8,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 import thor2_jax as thor2
 from training.augmentation.simulated_cameras import REPORT, SimulatedCamera, through_camera
-from training.rendering.depth_camera import axial_deviation
+from training.rendering.camera import axial_deviation
 
 INTRINSICS = thor2.Intrinsics(100.0, 100.0, 40.0, 30.0)
 SQUARE = np.ones((3, 3), bool)

@@ -20,9 +20,8 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import forest, job
 from training.baselines.baseline import baseline_inputs
-from training.baselines.files import CLOUD_BASELINES, check_baselines
 from training.baselines.forest import load_forest
-from training.baselines.job import load_baselines, train_baselines
+from training.baselines.job import CLOUD_BASELINES, check_baselines, load_baselines, train_baselines
 from training.evaluation.runs import load_runs
 from training.views.normalized_views import MemoryViews, fold_of_views
 

@@ -52,18 +52,17 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
     return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, views=6, directory=tmp_path_factory.mktemp("samples"))
 
 
-def test_views_depend_on_seed_and_object_only() -> None:
-    one = render_clouds({3: 15, 4: 20}, 2, 0)
-    again = render_clouds({4: 20}, 2, 0)
+def test_views_depend_on_their_object_only() -> None:
+    one = render_clouds({3: 15, 4: 20}, 2)
+    again = render_clouds({4: 20}, 2)
     assert [index for index, _ in one] == [3, 3, 4, 4]
     np.testing.assert_equal(again, one[2:])
-    other = render_clouds({4: 20}, 2, 1)
-    assert not np.array_equal(other[0][1][0], again[0][1][0])
 
 
-def test_each_object_has_one_label(views: Samples, tmp_path: Path) -> None:
+def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
-    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, copies=1, directory=tmp_path)
+    monkeypatch.setattr(module, "COPIES", 1)
+    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, directory=tmp_path)
     assert sorted(repeated.label) == [0, 0, 0, 0, 1, 1]
     first = repeated.statistics[repeated.label == 0]
     assert len(np.unique(first, axis=0)) == 4
@@ -73,10 +72,10 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     monkeypatch.setattr(
         orientation, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
     )
-    rendered = render_clouds({0: 0, 1: 10}, 3, 0)
+    rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
     rng = np.random.default_rng(0)
-    samples = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, 1, rng)
+    samples = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, rng)
     rows = np.array([5, 0, 5, 1, 2])
     batch = samples.take(rows, SMALL_CONFIG)
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
@@ -123,7 +122,7 @@ def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.M
 
     def render() -> Samples:
         show = lambda *numbers: done.append(numbers)  # noqa: E731
-        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, 2, 0, stopped, show, directory=tmp_path / "samples")
+        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, stopped, show, directory=tmp_path / "samples")
 
     with pytest.raises(Interrupted):
         render()

@@ -41,11 +41,11 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def counted(tmp_path: Path) -> Callable[..., int]:
-    """Return a function that asks for the samples of a seed, checks them and returns how often they were built."""
+    """Return a function that asks for the samples of an object, checks them and returns how often they were built."""
 
-    def get(seed: int = 0) -> int:
+    def get(number: int = 0) -> int:
         build = mock.Mock(return_value=SAMPLES)
-        record = samples_record([0], colornet.load_default(), SMALL_CONFIG, 1, 1, seed)
+        record = samples_record([number], colornet.load_default(), SMALL_CONFIG, 1)
         samples = stored_samples(f"distractors-{json_digest(record)}.safetensors", build)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
@@ -86,8 +86,8 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     users |= {cache / name: b"a user's" for name in ("mine.safetensors", "notes.txt")}
     for path, content in users.items():
         path.write_bytes(content)
-    for seed in range(3):
-        assert counted(seed) == 1
+    for number in range(3):
+        assert counted(number) == 1
     for path in files(cache):
         os.utime(path, (1, 1))
     assert counted(0) == 0  # the file used last
@@ -147,5 +147,5 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert key(epochs=3, networks=2, workers=2) == same and key(box=0.1) == box
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
-    record = samples_record([0], network, SMALL_CONFIG, 1, 1, 0)
+    record = samples_record([0], network, SMALL_CONFIG, 1)
     assert record["color_network"] == network.fingerprint and "augmentations" in record

@@ -17,7 +17,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.types import PointClouds
-from training.baselines.files import baseline_file
+from training.baselines.baseline import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")

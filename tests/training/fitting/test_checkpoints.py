@@ -13,7 +13,7 @@ from refusals import assert_refused
 
 from colornet import files
 from training.fitting.loop import Checkpoints, find_run_directories
-from training.storage.arrays import load_arrays, save_arrays
+from training.storage.jobs import load_arrays, save_arrays
 
 
 class State(NamedTuple):

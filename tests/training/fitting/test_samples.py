@@ -15,8 +15,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.types import Cloud
-from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, build_samples, expand
+from training.views import normalized_views
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
 NETWORK = colornet.load_default()
@@ -40,7 +40,7 @@ expand_batch = jax.jit(lambda batch, config: expand(batch, region_sets(NETWORK).
 def test_every_view_is_used_mirrored_in_four_ways(
     config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "VIEWS_PER_BATCH", 2)
+    monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []
     samples = build_samples(source, NETWORK, config, lambda *done: progress.append(done), PAPER_MIRRORS)

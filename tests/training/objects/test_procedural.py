@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from training.objects.procedural import _FAMILIES, SIZES, procedural_object
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.camera import RayCaster, camera_pose, render_view
 
 OBJECTS = [procedural_object(seed) for seed in range(60)]
 

@@ -7,6 +7,7 @@ from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
+from training.rendering.camera import Camera
 from training.rendering.scenes import (
     MIN_PIXELS,
     SCENE_CAMERA,
@@ -17,7 +18,6 @@ from training.rendering.scenes import (
     compose_scene,
     compose_views,
 )
-from training.rendering.view_sphere import Camera
 
 OBJECTS = builtin_objects()
 SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))

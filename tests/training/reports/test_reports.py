@@ -20,7 +20,6 @@ from training.fitting.loop import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports import plots
 from training.reports.html import Picture, Section, write_page
-from training.reports.object_plots import draw_descriptor, draw_objects
 
 pytestmark = pytest.mark.usefixtures("drawn_pictures")
 
@@ -61,10 +60,10 @@ def test_plots_draw_any_name(tmp_path: Path) -> None:
     plots.draw_curves({names[0]: [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
     plots.draw_known_unknown({"kept": [0, 0.5, 1], "named": [0, 0.1, 1]}, (0.5, 0.1), "THOR2", tmp_path / "unknown.png")
     plots.draw_reliability({"answers": [0, 3], "accuracy": [None, 0.5]}, "THOR2", tmp_path / "reliability.png")
-    draw_objects(dict.fromkeys(names, builtin_objects()["mug_blue"]), tmp_path / "objects.png")
+    plots.draw_objects(dict.fromkeys(names, builtin_objects()["mug_blue"]), tmp_path / "objects.png")
     points, colors = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1), np.full((200, 3), 200)
     drawn = points, colors.astype(np.uint8), colornet.load_default(), SMALL_CONFIG, names[0]
-    draw_descriptor(*drawn, tmp_path / "descriptor.png")
+    plots.draw_descriptor(*drawn, tmp_path / "descriptor.png")
     assert len(list(tmp_path.iterdir())) == 7 and all(colors_in(path) > 10 for path in tmp_path.iterdir())
     assert plain_text("$x$ a\u202eb") == r"\$x\$ a\u202eb"
 
@@ -111,7 +110,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     (summary,) = summaries
     printed = capsys.readouterr().out
     assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
-    assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
+    assert stages == {"stage 6 of 7: compose scenes": (6, 6), "stage 7 of 7: recognize scenes": (6, 6)}
     assert_refused("^out: ", run_demo, tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
     subsets = {name: count for name, count in summary.instances.items() if name != "all"}

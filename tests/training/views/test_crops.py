@@ -15,13 +15,21 @@ from written_files import files_of
 
 import thor2_jax as thor2
 from training.objects.meshes import find_meshes, load_mesh
-from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose, view_angles
-from training.views import render_job
-from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, quantized, rgbd_crop, stacked, surface_normals
-from training.views.dataset import ViewDataset
+from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
+from training.views import crops as crops_module
+from training.views.crops import (
+    CROP_SIZE,
+    ViewCrops,
+    fill_depth,
+    quantized,
+    render_crops,
+    rgbd_crop,
+    stacked,
+    surface_normals,
+)
+from training.views.dataset import ViewDataset, render_dataset
+from training.views.mesh_views import RenderJob
 from training.views.normalized_views import WithoutClasses
-from training.views.render_job import RenderJob, render_crops, render_dataset
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)
 
@@ -167,8 +175,8 @@ def test_interrupted_crops_resume_with_the_same_bytes(
     first.write_bytes(first.read_bytes()[:-1])
     assert_refused("is missing or damaged", dataset.read_crops, 0, SIZE)
     written = []
-    encode = render_job.encode_crops
-    monkeypatch.setattr(render_job, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
+    encode = crops_module._encode
+    monkeypatch.setattr(crops_module, "_encode", lambda crops: written.append(len(crops)) or encode(crops))
     again = render_command(meshes, dataset.directory)
     assert run_thor2(*again, SIZE) == 0
     assert len(written) == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest

@@ -1,32 +1,65 @@
-"""Datasets of views: they are read as written, and damaged files are refused by name."""
+"""Datasets of views: what was rendered is read, interrupted rendering resumes, damaged files are refused by name."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 import shutil
+import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
+from commands import Command
+from failures import Interrupted, full_disk
 from refusals import assert_refused
+from rendered_objects import write_box
 from small_clouds import random_clouds
+from written_files import files_of
 
 import thor2_jax
+from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud
+from training.augmentation.augmentations import Augmentations
+from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
-from training.views.dataset import Manifest, ViewDataset, encode, remove_views
-from training.views.mesh_views import render_views
-from training.views.normalized_views import (
-    COORDINATE_STEP,
-    MAX_VIEW_LENGTH,
-    NormalizedViews,
-    normalize_views,
-    padded_batches,
-)
-from training.views.render_job import RenderJob, render_dataset
+from training.objects.mesh import TexturedMesh
+from training.storage.jobs import MANIFEST, locked
+from training.storage.workers import local_workers, ray_workers
+from training.views import mesh_views, normalized_views
+from training.views.dataset import Manifest, ViewDataset, encode, remove_views, render_dataset
+from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
+from training.views.normalized_views import NormalizedViews, normalize_views, padded_batches
 
-OBJECTS = {name: builtin_objects()[name] for name in ("tennis_ball", "screwdriver")}
+NAMES = ("screwdriver", "tennis_ball")
+OBJECTS = {name: builtin_objects()[name] for name in NAMES}
+JOB = RenderJob(OBJECTS, 180, 90)
+"""6 views an object: of 4 and 2 with the shards of these tests."""
 CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of a job that nothing interrupted."""
+    out = tmp_path_factory.mktemp("whole") / "deep" / "views"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
+        render_dataset(JOB, out)
+    return out
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole, tmp_path / "views")
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +69,204 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.fixture
-def copied(written: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(written, tmp_path / "views")
+def sphere(radius: float) -> TexturedMesh:
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    colors = np.full((len(shape.faces), 3, 3), 9, np.uint8)
+    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
+
+
+def test_files_of_a_dataset(whole: Path) -> None:
+    dataset = ViewDataset.open(whole)
+    names = [f"{label:04}-{number:04}.safetensors" for label in (0, 1) for number in (0, 1)]
+    assert [shard.file for shard in dataset.shards] == names
+    shards = [(shard.label, shard.views, shard.left_out) for shard in dataset.shards]
+    assert shards == [(0, 4, 0), (0, 2, 0), (1, 4, 0), (1, 2, 0)]
+    assert set(files_of(whole)) == {MANIFEST, *names}
+    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(6))
+    assert "time" not in (whole / MANIFEST).read_text()
+
+
+@pytest.mark.slow
+def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
+    render_dataset(JOB, tmp_path / "views", local_workers(2))
+    assert files_of(tmp_path / "views") == files_of(whole)
+
+
+@pytest.mark.slow
+def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task is repeated, and the cluster ends with the job."""
+    ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    died = tmp_path / "died"
+
+    def pool(function: Any, tasks: Any) -> Any:
+        def dying(task: Any) -> Any:
+            if not died.exists():
+                died.touch()
+                os._exit(3)
+            return function(task)
+
+        return ray_workers(2)(dying, tasks)
+
+    render_dataset(JOB, tmp_path / "views", pool)
+    assert died.exists() and not ray.is_initialized()
+    assert files_of(tmp_path / "views") == files_of(whole)
+
+
+@pytest.mark.parametrize("stops", [(1, 4, 18), pytest.param((2, 3, *range(5, 18)), marks=pytest.mark.slow)], ids=str)
+def test_rendering_interrupted_at_any_write_resumes(
+    stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupts before and after each of the nine files of a job is moved to its name.
+
+    The quick ones are those before the first manifest, after the first shard, and the last one.
+    """
+    replace, left = os.replace, 0
+
+    def stopping(source: Path, target: Path) -> None:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise Interrupted
+        replace(source, target)
+        left -= 1
+        if left == 0:
+            raise Interrupted
+
+    monkeypatch.setattr(os, "replace", stopping)
+    for stop in stops:
+        out, left = tmp_path / str(stop), stop
+        with pytest.raises(Interrupted):
+            render_dataset(JOB, out)
+        with pytest.raises(InputError, match=MANIFEST) if stop < 18 else contextlib.nullcontext():
+            ViewDataset.open(out)
+        left, before = 0, files_of(out)
+        seen: list[tuple[int, int]] = []
+        render_dataset(JOB, out, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
+        assert files_of(out) == files_of(whole)
+        # Shards that were listed are not rendered again.
+        listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
+        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= listed]
+        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
+
+
+def changed(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
+    bad, missing = copied / "0000-0001.safetensors", copied / "0001-0000.safetensors"
+    content = bytearray(bad.read_bytes())
+    content[1000] ^= 1
+    bad.write_bytes(content)
+    missing.unlink()
+    before = changed(copied)
+    render_dataset(JOB, copied)
+    assert files_of(copied) == files_of(whole)
+    same = {name for name, time in changed(copied).items() if before.get(name) == time}
+    assert same - {".lock"} == {"0000-0000.safetensors", "0001-0001.safetensors"}
+    before = changed(copied)
+    with locked(copied):
+        assert_refused(str(copied), render_dataset, JOB, copied)
+    assert len(render_dataset(JOB, copied)) == 12
+    assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
+
+
+def test_another_job_is_refused(copied: Path) -> None:
+    before = files_of(copied)
+    ball, screwdriver = OBJECTS["tennis_ball"], OBJECTS["screwdriver"]
+    moved = dataclasses.replace(ball, vertices=ball.vertices + 1e-3)
+    painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
+    for changes, message in [
+        ({"azimuth_step": 90}, "azimuth_step 180.0, not 90.0"),
+        ({"polar_step": 45}, "polar_step 90.0, not 45.0"),
+        ({"meshes": OBJECTS | {"tennis_ball": moved}}, r"objects\[\d\].mesh "),
+        ({"meshes": OBJECTS | {"screwdriver": painted}}, r"objects\[\d\].mesh "),
+        ({"meshes": OBJECTS | {"apple": moved}}, r"objects\[2\] null, not \{"),
+        ({"meshes": dict(reversed(OBJECTS.items()))}, r"objects\[0\].name "),
+    ]:
+        assert_refused(f"{copied} .*{message}", render_dataset, dataclasses.replace(JOB, **changes), copied)
+        assert files_of(copied) == before
+
+
+def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 8)
+    ball = {"ball": sphere(0.03)}
+    out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
+    job = RenderJob(ball, 90, 90, light, 1)
+    dataset = render_dataset(job, out)
+    assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
+    assert [shard.views for shard in dataset.shards] == [6] * 6
+    views = dataset.read(1)
+    assert views.view.tolist() == [2, 2, 2, 3, 3, 3] and views.copy.tolist() == [0, 1, 2] * 2
+    for changes in ({"augmentations": None}, {"seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
+        assert_refused("variations", render_dataset, dataclasses.replace(job, **changes), out)
+    off = render_dataset(RenderJob(ball, 90, 90, Augmentations(), 2), tmp_path / "off")
+    assert len(off) == 12 and off.record["job"]["variations"] is None
+    assert_refused("variations null, not {", render_dataset, job, tmp_path / "off")
+
+
+def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One shard keeps none of its views; objects may have any name."""
+    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 2)
+    sheet, name = sphere(0.03), "../a b/ü"
+    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
+    dataset = render_dataset(RenderJob({name: sheet}, 180, 90), tmp_path / "views")
+    assert [(shard.views, shard.left_out) for shard in dataset.shards] == [(2, 0), (0, 2), (2, 0)]
+    assert [dataset.read(k).view.tolist() for k in range(3)] == [[0, 1], [], [4, 5]]
+    assert dataset.record["left_out"] == 2 and dataset.read(1).xyz.shape == (0, 3)
+    assert dataset.classes == (name,) and [path.name for path in tmp_path.iterdir()] == ["views"]
+
+
+def test_bad_requests_write_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    (tmp_path / "bad.ply").write_text("not a mesh")
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"meshes": {}}, "meshes is empty"),
+        ({"azimuth_step": 0}, "azimuth_step"),
+        ({"seed": -1}, "seed is -1"),
+        ({"meshes": {**OBJECTS, "z": tmp_path / "bad.ply"}}, "bad.ply"),
+        ({"meshes": {"speck": sphere(0.003)}}, "object 'speck'"),
+        ({"meshes": {"door": sphere(0.6)}}, "object 'door' .*2.08 m"),
+    ]
+    for changes, message in cases:
+        assert_refused(message, render_dataset, dataclasses.replace(JOB, **changes), out)
+        assert not out.exists()
+
+
+def test_other_files_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("text")
+    assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, JOB, tmp_path)
+    (tmp_path / MANIFEST).write_text('{"format": 1}')
+    assert_refused("manifest.json has format 1; expected 2", render_dataset, JOB, tmp_path)
+    assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
+
+
+def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is room for a manifest, but not for a shard."""
+    replace = os.replace
+
+    def full_for_shards(source: Path, target: Path) -> None:
+        full_disk() if target.suffix == ".safetensors" else replace(source, target)
+
+    (copied / "0001-0000.safetensors").unlink()
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(os, "replace", full_for_shards)
+        render_dataset(JOB, copied)
+    assert set(files_of(whole)) - set(files_of(copied)) == {"0001-0000.safetensors"}
+    assert_refused("3 of 4 shards", ViewDataset.open, copied)
+    render_dataset(JOB, copied)
+    assert files_of(copied) == files_of(whole)
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
+    write_box(tmp_path / "meshes" / "box.ply", (0.06, 0.06, 0.06))
+    command = ("render", "--meshes", tmp_path / "meshes", "--out", tmp_path / "views", "--azimuth-step", 180)
+    for _ in range(2):  # it may be repeated
+        assert "6 views of 1 objects (0 left out)" in printed(*command, "--polar-step", 90, "--workers", 1)
+    assert "address is head:6379" in refused(*command, "--address", "head:6379")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "'.[cluster]'" in refused(*command, "--engine", "ray")
 
 
 def views_of(clouds: list[Cloud]) -> NormalizedViews:
@@ -60,7 +288,7 @@ def test_only_what_was_rendered_is_removed(copied: Path) -> None:
 def test_views_are_read_normalized(written: Path) -> None:
     """Coordinates differ from those of `view_normalize`, cloud by cloud, by at most half a step."""
     dataset = ViewDataset.open(written)
-    assert dataset.classes == ("tennis_ball", "screwdriver")
+    assert dataset.classes == NAMES
     assert len(dataset) == 60 and [(shard.label, shard.views) for shard in dataset.shards] == [(0, 30), (1, 30)]
     for index, (name, clouds) in enumerate(render_views(OBJECTS, 60, 45).items()):
         views = dataset.read(index)
@@ -92,13 +320,14 @@ def test_empty_views_and_views_beyond_the_range() -> None:
     assert_refused("4.05 scaled units", views_of, [(line, rgb), (line * np.float32(1.62), rgb)])
 
 
-def test_padded_batches() -> None:
+def test_padded_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     clouds = random_clouds(0, (3, 2100, 5))
-    batches = list(padded_batches(clouds, 2))
+    batches = list(padded_batches(clouds))
     assert [count for count, _ in batches] == [2, 1]
     assert [batch.mask.shape for _, batch in batches] == [(2, 4096), (2, 2048)]
     assert [batch.mask.sum(axis=1).tolist() for _, batch in batches] == [[3, 2100], [5, 0]]
-    assert list(padded_batches([], 2)) == []
+    assert list(padded_batches([])) == []
 
 
 def check_refused(directory: Path, message: str) -> None:
@@ -107,17 +336,17 @@ def check_refused(directory: Path, message: str) -> None:
 
 def test_incomplete_and_other_datasets_are_refused(copied: Path) -> None:
     """The message has the name of the file and the reason; tests/fuzz/test_tables.py has all kinds of damage."""
-    path = copied / "0001-0000.safetensors"
+    path = copied / "0000-0001.safetensors"
     shutil.copy(copied / "0000-0000.safetensors", path)
-    check_refused(copied, "0001-0000.safetensors is missing or damaged")
+    check_refused(copied, "0000-0001.safetensors is missing or damaged")
     path.unlink()
-    check_refused(copied, "0001-0000.safetensors is missing or damaged")
-    assert len(ViewDataset.open(copied).read(0)) == 30
+    check_refused(copied, "0000-0001.safetensors is missing or damaged")
+    assert len(ViewDataset.open(copied).read(0)) == 4
     manifest, path = ViewDataset.open(copied).manifest, copied / "manifest.json"
     Manifest({**manifest.job, "descriptor_version": 99}, manifest.shards).write(copied)
     check_refused(copied, "descriptor version 99")
     dataclasses.replace(manifest, shards=manifest.shards[:1]).write(copied)
-    check_refused(copied, "1 of 2 shards")
+    check_refused(copied, "1 of 4 shards")
     for content in ("[]", "{}", "[" * 100_000, path.read_text().replace('"label": 0', '"label": 1')):
         path.write_text(content)
         check_refused(copied, "manifest.json is damaged")

@@ -4,15 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
-from training.views.normalized_views import COORDINATE_STEP, MemoryViews, WithoutClasses
+from training.views.mesh_views import COORDINATE_STEP
+from training.views.normalized_views import MemoryViews, WithoutClasses
 
 CONFIG = DescriptorConfig(homology="closed_form")
 
@@ -84,5 +85,5 @@ def test_the_digest_depends_on_everything_that_is_read() -> None:
 
 def test_an_instance_that_is_too_long_is_refused() -> None:
     long = dataclasses.replace(instance(0), points=instance(0).points * np.float32(20))
-    with pytest.raises(InputError, match="frames: 'mug': .*depth scale"):
-        WithLabelledViews(LabelledInstances({"mug": [long]}), CONFIG).read(0)
+    source = WithLabelledViews(LabelledInstances({"mug": [long]}), CONFIG)
+    assert_refused("frames: 'mug': .*depth scale", source.read, 0)

@@ -8,11 +8,11 @@ from refusals import assert_refused
 from scipy.spatial import cKDTree
 
 from training.augmentation.augmentations import Augmentations
-from training.augmentation.illumination import Illumination
+from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
-from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
+from training.rendering.camera import DISTANCE, camera_pose, view_angles
 from training.views import mesh_views as views
 
 

@@ -15,16 +15,14 @@ from small_clouds import random_clouds
 from small_runs import untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
-from training.baselines import templates
-from training.baselines.baseline import BaselineInputs
-from training.baselines.files import read_baseline
-from training.baselines.job import crop_size, load_baselines, pretrained_files, train_baselines
+from training.baselines import image_baselines
+from training.baselines.baseline import BaselineInputs, read_baseline
+from training.baselines.image_baselines import compare, crop_size, pretrained_files
+from training.baselines.job import load_baselines, train_baselines
 from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
-from training.baselines.templates import compare
 from training.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
@@ -85,7 +83,7 @@ def quick_network() -> Iterator[None]:
     architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ARCHITECTURES, SMALL, architecture)
-        patch.setattr(templates, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
+        patch.setattr(image_baselines, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
         yield
 
 
@@ -164,8 +162,8 @@ def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     assert 0 < np.abs(moved).max() < 1e-3  # a step of the small learning rate away
     train_baselines(folder, SOURCE, [SMALL], weights=weights)
     write_weights(weights, seed=1)
-    with pytest.raises(InputError, match="^weights is .*was trained without these files"):
-        train_baselines(folder, SOURCE, [SMALL], weights=weights)
+    message = "^weights is .*was trained without these files"
+    assert_refused(message, train_baselines, folder, SOURCE, [SMALL], weights=weights)
 
 
 def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
@@ -183,8 +181,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     ]
     for damage, message in cases:
         damage()
-        with pytest.raises(InputError, match=f"^weights: .*{message}"):
-            train_baselines(folder, SOURCE, [SMALL], weights=weights)
+        assert_refused(f"^weights: .*{message}", train_baselines, folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from training.augmentation.sensor import Sensor, sensed
+from training.augmentation.sensing import Sensor, sensed
 
 from .conftest import augmented_view, flat_view, wall
 

@@ -1,0 +1,284 @@
+"""Baselines on crops: image networks, and the nearest template by the features of a frozen backbone.
+
+A crop has the class of the template whose features have the largest cosine similarity. The backbone of the templates
+reads the colours of the masked crop.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax  # type: ignore[import-untyped]
+from flax import nnx
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import model_arrays, model_from_arrays
+from training.baselines.baseline import (
+    FitTask,
+    NetworkFit,
+    Predictor,
+    StoredBaseline,
+    baseline_file,
+    compiled_network,
+    fit_network,
+    in_batches,
+    read_baseline,
+)
+from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
+from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
+from training.views.crops import ViewCrops
+
+__all__ = [
+    "TEMPLATES",
+    "check_weights",
+    "compare",
+    "crop_size",
+    "fit_image_network",
+    "fit_templates",
+    "load_image_network",
+    "load_templates",
+    "pretrained_files",
+]
+
+TEMPLATES = "templates"
+"""The nearest template by the features of a frozen backbone, which may be that of a network of the same run."""
+
+INFERENCE_BATCH = 8
+"""Crops that a network reads at a time, about the instances of a frame: one compiled program for all."""
+
+
+def _crop_function(
+    model: nnx.Module,
+    inputs: Callable[..., tuple[Any, ...]] = network_inputs,
+    output: Callable[[Any], Any] = jax.nn.softmax,
+) -> Callable[[ViewCrops], NDArray[np.float32]]:
+    """Return a function of V crops, at least 1: `output` [V, ...] of a network that is applied to `inputs` of them."""
+    model.eval()
+    function = compiled_network(model, inputs, output)
+    return lambda crops: in_batches(function, INFERENCE_BATCH, crops.color, crops.normals)
+
+
+def load_image_network(name: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+    """Return the network of `ARCHITECTURES` called `name` of its weights; equal probabilities for padding rows.
+
+    Raises:
+        ValueError: an array is missing or has another shape.
+    """
+    architecture, n_classes = ARCHITECTURES[name], len(run.classes)
+    predict = _crop_function(model_from_arrays(lambda: architecture.build(n_classes, 0), arrays))
+    return lambda inputs: inputs.predicted(architecture.size, n_classes, predict)
+
+
+BATCH_SIZE = 32
+
+SCRATCH_RATE, PRETRAINED_RATE = 1e-3, 1e-4
+"""Highest learning rates, without and with pretrained weights."""
+
+WARM_UP = 0.05
+"""Fraction of the steps in which the learning rate rises."""
+
+OPTIMIZER = partial(optax.adamw, weight_decay=0.05)
+
+
+def _rows_of(crops: ViewCrops, rows: Any) -> ViewCrops:
+    """Return the crops of some rows."""
+    return ViewCrops(crops.color[rows], crops.normals[rows])
+
+
+def _read_samples(task: FitTask, size: int) -> tuple[ViewCrops, NDArray[np.int32], NDArray[np.int32]]:
+    """Return the crops, class indices and view numbers of all views, with 6 bytes for each pixel of a crop.
+
+    Raises:
+        InputError: the source has no crops, or smaller ones.
+    """
+    shape = task.n_clouds, size, size, 3
+    crops = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
+    label, view = np.zeros((2, task.n_clouds), np.int32)
+    for index, rows, views in task.shards(f"read for {task.name}", "crops"):
+        read = task.source.read_crops(index, size)
+        crops.color[rows], crops.normals[rows] = read.color, read.normals
+        label[rows], view[rows] = views.label, views.view
+    return crops, label, view
+
+
+def _learning_rate(highest: float, number: int, n_steps: int) -> float:
+    """Return the learning rate of a step: it rises, and falls along a cosine."""
+    progress = (number + 0.5) / n_steps
+    if progress < WARM_UP:
+        return highest * progress / WARM_UP
+    return float(highest * (1 + np.cos(np.pi * (progress - WARM_UP) / (1 - WARM_UP))) / 2)
+
+
+def fit_image_network(task: FitTask) -> StoredBaseline:
+    """Fit a network of `ARCHITECTURES`; an interrupted fit resumes after its last epoch.
+
+    An epoch uses as many crops as there are views, drawn from all their copies, each mirrored at random.
+
+    Raises:
+        InputError: the source has no crops, a file of weights does not fit, or the loss is not finite.
+    """
+    architecture = ARCHITECTURES[task.name]
+    model: Any = architecture.build(len(task.source.classes), task.options.seed)
+    weights = {} if task.weights is None else load_weights(task.weights, architecture.backbones(model))
+    samples, label, view = _read_samples(task, architecture.size)
+    held_out = task.held_out(label, view)
+    directory, rate = ("pretrained", PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
+    n_views = len(np.unique(np.stack([label, view])[:, ~held_out], axis=1).T)
+
+    def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
+        """Return copies of colour and normals, mirrored at random along x, with the x of the normals."""
+        crops, flip = _rows_of(samples, rows), rng.random(len(rows)) < 0.5  # fancy indices copy
+        crops.color[flip] = crops.color[flip, :, ::-1]
+        crops.normals[flip] = crops.normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
+        return crops.color, crops.normals
+
+    model.train()
+    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, OPTIMIZER, partial(_learning_rate, rate))
+    fitted = fit_network(task, fit, model, label, np.flatnonzero(~held_out), n_views)
+    predict = _crop_function(fitted)
+    temperature = task.temperature(label, held_out, lambda: predict(_rows_of(samples, held_out)))
+    return StoredBaseline(model_arrays(fitted), temperature, weights)
+
+
+SHARPNESS = 20.0
+"""Factor of the similarities before the softmax."""
+
+DINOV2 = "vit_small_patch14_dinov2"
+"""File of DINOv2's weights, without the suffix."""
+
+DINOV2_SIZE = 224
+
+BACKBONES = (DINOV2, "rgbd-vit", "rgbd-vit-small")
+"""DINOv2 from a file of weights, or the colour stream of a network that was trained on the same views."""
+
+
+def _create_backbone(source: str) -> ViT:
+    """Return a backbone of BACKBONES with random weights."""
+    if source == DINOV2:
+        return ViT(VIT_DINOV2_SMALL, DINOV2_SIZE, rngs=nnx.Rngs(0))
+    return ARCHITECTURES[source].create(1, rngs=nnx.Rngs(0)).color
+
+
+def _backbone_size(source: str) -> int:
+    """Return the side of the images that a backbone reads, pixels."""
+    return DINOV2_SIZE if source == DINOV2 else ARCHITECTURES[source].size
+
+
+def _color(color: Any, normals: Any) -> tuple[jax.Array]:
+    return network_inputs(color, normals)[:1]
+
+
+def _unit(features: jax.Array) -> jax.Array:
+    return features / jnp.linalg.norm(features, axis=1, keepdims=True)
+
+
+def load_templates(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
+    """Return the comparison with templates: equal probabilities for padding rows.
+
+    Raises:
+        KeyError, ValueError: an array is missing or has another shape.
+    """
+    name, n_classes = BACKBONES[int(arrays["number"][0])], len(run.classes)
+    embed = _crop_function(model_from_arrays(partial(_create_backbone, name), arrays, "backbone/"), _color, _unit)
+    features, label = arrays["features"], arrays["label"]
+
+    def predict(crops: ViewCrops) -> NDArray[np.float32]:
+        return compare(embed(crops), features, label, n_classes)
+
+    return lambda inputs: inputs.predicted(_backbone_size(name), n_classes, predict)
+
+
+def compare(
+    features: NDArray[np.float32], stored: NDArray[np.float16], label: NDArray[np.int16], n_classes: int
+) -> NDArray[np.float32]:
+    """Return class probabilities [V, C] for unit features [V, D]: a softmax of the largest similarities.
+
+    Args:
+        features: the features.
+        stored: [T, D] unit features of the templates.
+        label: [T] their classes; every class has a template.
+        n_classes: number of classes.
+    """
+    similarity = features @ stored.astype(np.float32).T
+    nearest = np.stack([similarity[:, label == c].max(axis=1) for c in range(n_classes)], axis=1)
+    return np.asarray(jax.nn.softmax(SHARPNESS * nearest, axis=1))
+
+
+def _backbone(task: FitTask) -> tuple[int, ViT, Mapping[str, str]]:
+    """Return the number of the backbone, the backbone, and the digests of its files of weights.
+
+    Raises:
+        InputError: there is no backbone, or its file cannot be used.
+    """
+    if task.weights is not None:
+        model = _create_backbone(DINOV2)
+        return BACKBONES.index(DINOV2), model, load_weights(task.weights, [(model, DINOV2)])
+    for number, name in enumerate(BACKBONES):
+        file = baseline_file(task.directory, name)
+        if file.is_file():
+            stored = read_baseline(file, task.source.classes)
+            create = partial(ARCHITECTURES[name].build, len(task.source.classes), 0)
+            network: Any = model_from_arrays(create, stored.arrays)
+            return number, network.color, stored.weights
+    raise InputError(
+        f"baselines: templates needs a backbone; expected --weights with {DINOV2}.safetensors, or the "
+        "baseline rgbd-vit or rgbd-vit-small in the same run"
+    )
+
+
+def fit_templates(task: FitTask) -> StoredBaseline:
+    """Store the features of all crops that are not held out.
+
+    Raises:
+        InputError: there is no backbone, or the source has no crops.
+    """
+    number, model, weights = _backbone(task)
+    crops, label, view = _read_samples(task, _backbone_size(BACKBONES[number]))
+    held_out = task.held_out(label, view)
+    features = _crop_function(model, _color, _unit)(crops)
+    task.progress("collect templates", 1, 1, f"{len(features)} crops")
+    stored = features[~held_out].astype(np.float16), label[~held_out].astype(np.int16)
+    n_classes = len(task.source.classes)
+    temperature = task.temperature(label, held_out, lambda: compare(features[held_out], *stored, n_classes))
+    arrays = model_arrays(model, "backbone/")
+    arrays |= {"number": np.array([number]), "features": stored[0], "label": stored[1]}
+    return StoredBaseline(arrays, temperature, weights)
+
+
+def pretrained_files(name: str) -> list[str]:
+    """Return the files of pretrained weights that a baseline reads, without the suffix; none for most baselines."""
+    if name == TEMPLATES:
+        return [DINOV2]
+    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def crop_size(names: Sequence[str], weights: bool) -> int | None:
+    """Return the side of the crops in pixels that baselines are trained on, the largest one; None if they need none.
+
+    Args:
+        names: names of the baselines.
+        weights: whether there are pretrained weights: DINOv2, by which templates are compared then, reads large crops.
+    """
+    sizes = [ARCHITECTURES[name].size for name in names if name in ARCHITECTURES]
+    if TEMPLATES in names:
+        sizes.append(DINOV2_SIZE if weights else ARCHITECTURES["rgbd-vit-small"].size)
+    return max(sizes, default=None)
+
+
+def check_weights(directory: Path, name: str) -> None:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    if name == TEMPLATES:
+        load_weights(directory, [(nnx.eval_shape(lambda: _create_backbone(DINOV2)), DINOV2)])
+    elif name in ARCHITECTURES:
+        architecture = ARCHITECTURES[name]
+        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))
