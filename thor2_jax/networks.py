@@ -17,7 +17,8 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, square_root
+from thor2_jax.descriptor.looks import N_BALANCED, N_SCALARS
+from thor2_jax.descriptor.slicing import square_root
 from thor2_jax.types import Descriptors
 
 __all__ = [
