@@ -287,8 +287,8 @@ def relaxed_strips(
             all points count fully. Their gradients attribute an answer to points (`explanation.attributions`).
 
     Returns:
-        Strips; a strip is occupied if any point has a positive weight in it. Their overflow is 0: `strips_of_cloud` adds
-        that of the hard slices.
+        Strips; a strip is occupied if any point has a positive weight in it. Their overflow is 0: `strips_of_cloud`
+        counts that of the hard slices.
     """
     relaxation = config.relaxation or Relaxation()
     x, y, z = points

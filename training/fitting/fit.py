@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips
-from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
+from thor2_jax.descriptor.describe import BATCH_AXIS, batch_mesh, describe_strips
 from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import Feature, feature_of
