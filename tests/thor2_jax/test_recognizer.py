@@ -14,9 +14,9 @@ from small_runs import SMALL_CONFIG, assert_same_answers, class_probabilities, s
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model import classifier
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
 
 CLASSES = ("a", "b", "c", "d")
@@ -105,7 +105,7 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     described = recognizer.describe(tilted(patches()))
     for name, probabilities in class_probabilities(recognizer, described.oriented).items():
-        expected = jax.nn.softmax(run.classifiers[name](classifier.feature_of(described.descriptors, name)))
+        expected = jax.nn.softmax(run.classifiers[name](feature_of(described.descriptors, name)))
         np.testing.assert_allclose(probabilities, expected, atol=1e-5)
 
 

@@ -123,7 +123,7 @@ def infer(
         clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
         classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
     """
-    names = model.classifiers.default if classifiers is None else classifiers
+    names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
     if clouds is None:
         return Inference(oriented.overflow, probabilities)
@@ -144,15 +144,18 @@ def infer_clouds(
     Args:
         model: the model.
         clouds: the clouds.
-        classifiers: classifiers to evaluate, if they answer; by default those that do.
+        classifiers: classifiers to evaluate, if they answer, see `Model.chosen_classifiers`.
         answer_by: source of the answers, see `Model.answers_by`.
+
+    Raises:
+        InputError: a classifier that the run does not have.
     """
     source = model.answers_by(answer_by)
     config = model.run.config
     # The gallery alone needs two looks, which `infer` would otherwise describe again.
     count = max(config.looks, LOOKS) if source == "gallery" else config.looks
     oriented = describe_looks(clouds, model.run.network, config, count)
-    names = classifiers if source != "gallery" else ()
+    names = model.chosen_classifiers(classifiers) if source != "gallery" else ()
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
 
 

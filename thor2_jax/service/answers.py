@@ -16,11 +16,11 @@ from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.model.classifier import THOR2
 from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.networks import THOR2
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import compiled
+from thor2_jax.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step

@@ -16,12 +16,11 @@ from sklearn.linear_model import LogisticRegression
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import EMBEDDING, Feature, feature_of
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import MLP
+from thor2_jax.networks import EMBEDDING, MLP, Feature, feature_of
 from thor2_jax.types import Cloud
 from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples
