@@ -30,8 +30,8 @@ from thor2_jax.errors import with_context
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
 from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows

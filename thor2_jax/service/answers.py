@@ -15,7 +15,7 @@ from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model

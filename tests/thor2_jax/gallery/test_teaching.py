@@ -11,8 +11,7 @@ from small_runs import small_embedding, untrained_run
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import augmented_copies
-from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.enrollment import ObjectGallery, augmented_copies
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import answers
@@ -77,9 +76,9 @@ def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monke
     assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ()), embedding).objects
     assert "2 of 2 enrolled objects" in alone.weak_rejection
-    monkeypatch.setattr("thor2_jax.gallery.objects.FEW", 2)
+    monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
     assert alone.weak_rejection.startswith("1 of 2")
-    monkeypatch.setattr("thor2_jax.gallery.objects.FEW", 1)
+    monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
     assert ObjectGallery(()).gallery.union.summary == "no object yet"
     assert ObjectGallery(tuple("abcdefg")).gallery.union.summary.endswith("f, ...")
