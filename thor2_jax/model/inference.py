@@ -29,7 +29,7 @@ __all__ = [
     "Inference",
     "answers",
     "compute_by_chunks",
-    "gallery_scores",
+    "object_scores",
     "infer",
     "infer_clouds",
     "padded_rows",
@@ -159,7 +159,7 @@ def infer_clouds(
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
 
 
-def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
+def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
     """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
     if inference.embeddings is None:
         return inference.scores
@@ -168,7 +168,7 @@ def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | 
 
 def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:
     """Return the values [B, n] of all names, whose largest one is the answer and its confidence."""
-    return model.combined(jax.tree.map(np.asarray, inference.probabilities), gallery_scores(model, inference))
+    return model.combined(jax.tree.map(np.asarray, inference.probabilities), object_scores(model, inference))
 
 
 def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:
@@ -181,7 +181,7 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
     """
     n_usable = sum(instance.reason is None for instance in instances)
     inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)
-    names, scores = model.names, gallery_scores(model, inference)
+    names, scores = model.names, object_scores(model, inference)
     combined = model.combined(inference.probabilities, scores)
     thresholds = model.thresholds("both" if inference.probabilities else "gallery")
     by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}

@@ -17,7 +17,7 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
-from thor2_jax.model.inference import gallery_scores, infer
+from thor2_jax.model.inference import infer, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
@@ -117,7 +117,7 @@ class Run:
             values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}
         values = {name: model.union.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
-            scores = gallery_scores(model, inference)
+            scores = object_scores(model, inference)
             if scores is None:  # no instance is usable
                 scores = np.zeros((len(inference.overflow), len(model.gallery.names)), np.float32)
             values[GALLERY] = model.combined({}, scores)
