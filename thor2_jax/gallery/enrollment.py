@@ -210,8 +210,7 @@ class ObjectGallery:
         """
         self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
         if reembed and directory.exists():
-            embed = functools.partial(_embed_views, self.embedding)
-            self._change(lambda gallery: gallery.reembed(self.embedding.fingerprint, embed), rebuild=True)
+            self._change(self._reembedded, rebuild=True)
         else:
             store.check_index(directory)
             self.refresh()
@@ -244,6 +243,15 @@ class ObjectGallery:
             return False
         self._set(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
         return True
+
+    def _reembedded(self, gallery: Gallery) -> Gallery:
+        objects = {
+            name: dataclasses.replace(
+                views, embeddings=_embed_views(self.embedding, views.clouds, views.source), file=None
+            )
+            for name, views in gallery.objects.items()
+        }
+        return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
     def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
         if self.directory is None:

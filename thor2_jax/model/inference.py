@@ -184,9 +184,9 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
     names, scores = model.names, object_scores(model, inference)
     combined = model.combined(inference.probabilities, scores)
     thresholds = model.thresholds("both" if inference.probabilities else "gallery")
-    by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}
+    by_source = {name: model.gallery.of_classifiers(p) for name, p in inference.probabilities.items()}
     if scores is not None:
-        by_source["gallery"] = model.union.combine(None, scores)
+        by_source["gallery"] = model.gallery.combine(None, scores)
     rows = iter(range(n_usable))
     result = []
     for instance in instances:

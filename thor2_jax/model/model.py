@@ -23,7 +23,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
@@ -170,14 +169,9 @@ class Model:
         return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
 
     @property
-    def union(self) -> ClassUnion:
-        """The trained classes and the enrolled objects."""
-        return self.gallery.union
-
-    @property
     def names(self) -> tuple[str, ...]:
         """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
-        return self.union.names
+        return self.gallery.answered_names
 
     @property
     def embedding(self) -> Embedding:
@@ -227,10 +221,12 @@ class Model:
         """
         if self.unknown_below is not None:
             return np.full(len(self.names), self.unknown_below)
-        thresholds = self.union.of_gallery(self.gallery.unknown_below[None])[0]
+        thresholds = self.gallery.of_gallery(self.gallery.unknown_below[None])[0]
         if self.answers_by(answer_by) == "gallery":
             return thresholds
-        return np.where(self.union.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds)
+        return np.where(
+            self.gallery.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds
+        )
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
         """Return an instance with the colours that `color_transform` makes of those of the camera."""
@@ -261,5 +257,5 @@ class Model:
             scores: [B, n_objects] of the gallery; None if the classifiers alone answer.
         """
         if scores is None:
-            return self.union.of_classifiers(self.fused(probabilities))
-        return self.union.combine(self.fused(probabilities) if probabilities else None, scores)
+            return self.gallery.of_classifiers(self.fused(probabilities))
+        return self.gallery.combine(self.fused(probabilities) if probabilities else None, scores)

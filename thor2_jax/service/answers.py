@@ -69,11 +69,11 @@ def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
     """Return the JSON records of all objects that may be answered."""
-    union, enrolled = objects.gallery.union, objects.gallery.objects
+    gallery = objects.gallery
     answers = []
-    for name, is_trained in zip(union.names, union.has_output, strict=True):
+    for name, is_trained in zip(gallery.answered_names, gallery.has_output, strict=True):
         about: dict[str, Any] = {"views": 0, "source": None, "date": None}
-        if (views := enrolled.get(name)) is not None:
+        if (views := gallery.objects.get(name)) is not None:
             about = {"views": len(views.clouds), "source": views.source, "date": views.date}
         answers.append(schemas.ObjectAnswer(name=name, trained=bool(is_trained), **about))
     return answers
@@ -121,7 +121,7 @@ def calibrated_confidence(model: Model, recognition: Recognition, inference: Inf
         recognition: the answer for the cloud.
         inference: the outputs of the model for it, without the axis of the batch.
     """
-    if model.answers_by() != "classifiers" or model.union.hidden:
+    if model.answers_by() != "classifiers" or model.gallery.hidden:
         return None
     if model.calibration is not None:
         return recognition.confidence

@@ -115,7 +115,7 @@ class Run:
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
             values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}
-        values = {name: model.union.of_classifiers(p) for name, p in values.items()}
+        values = {name: model.gallery.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
             scores = object_scores(model, inference)
             if scores is None:  # no instance is usable

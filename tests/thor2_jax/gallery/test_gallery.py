@@ -138,7 +138,7 @@ def test_a_trained_class_needs_extend_or_replace(gallery: Gallery) -> None:
     gallery = dataclasses.replace(gallery, trained=("a", "b", "c"))
     assert_refused("'a' is a trained class", gallery.with_object, "a", enrolled(1))
     changed = gallery.with_object("a", enrolled(1), extend=True).with_object("b", enrolled(1), replace=True)
-    assert changed.hidden == ("b",) and changed.union.names == ("a", "c", *gallery.names, "b")
+    assert changed.hidden == ("b",) and changed.answered_names == ("a", "c", *gallery.names, "b")
 
 
 def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:

@@ -13,7 +13,7 @@ import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery, augmented_copies
-from thor2_jax.gallery.union import ClassUnion
+from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import answers
 from thor2_jax.model.model import Model
@@ -69,11 +69,11 @@ def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) 
 
 def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monkeypatch: pytest.MonkeyPatch) -> None:
     objects = ObjectGallery(tuple(builtin_objects()))
-    assert objects.gallery.union.summary == "18 toy objects of the demo; it knows nothing of yours"
+    assert objects.gallery.summary == "18 toy objects of the demo; it knows nothing of yours"
     objects.forget("apple")
-    assert objects.gallery.union.summary.startswith("17 toy objects")
+    assert objects.gallery.summary.startswith("17 toy objects")
     objects = taught(run, embedding).objects
-    assert objects.gallery.union.summary == "5 objects: a, b, c, brick, book"
+    assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
     assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ()), embedding).objects
     assert "2 of 2 enrolled objects" in alone.weak_rejection
@@ -81,8 +81,8 @@ def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monke
     assert alone.weak_rejection.startswith("1 of 2")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
-    assert ObjectGallery(()).gallery.union.summary == "no object yet"
-    assert ObjectGallery(tuple("abcdefg")).gallery.union.summary.endswith("f, ...")
+    assert ObjectGallery(()).gallery.summary == "no object yet"
+    assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
 
 
 def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
@@ -234,18 +234,18 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
 
 
 def test_combined_values_of_classes_and_objects() -> None:
-    union = ClassUnion(("a", "b", "c"), ("x", "b"), ("c",))
-    assert union.names == ("a", "b", "x")
+    gallery = Gallery("", dict.fromkeys(("x", "b")), ("c",), ("a", "b", "c"))  # type: ignore[arg-type]
+    assert gallery.answered_names == ("a", "b", "x")
     p, s = np.array([[0.5, 0.4, 0.1]]), np.array([[0.25, 0.9]])
-    np.testing.assert_allclose(union.of_classifiers(p), [[0.5, 0.4, 0]])
-    np.testing.assert_allclose(union.of_gallery(s), [[0, 0.9, 0.25]])
+    np.testing.assert_allclose(gallery.of_classifiers(p), [[0.5, 0.4, 0]])
+    np.testing.assert_allclose(gallery.of_gallery(s), [[0, 0.9, 0.25]])
     # The best class leaves 0.5; odds of 1.95 and 91.1. The best share, that of b, gets the probability of being known.
     x, b = 0.5 * (0.25 / 0.2) ** 3, 0.5 * 4.5**3
     known = (0.5 + b) / (1 + b)
-    np.testing.assert_allclose(union.combine(p, s), known * np.array([[0.5, 0.4 + b, x]]) / (0.4 + b))
-    np.testing.assert_allclose(union.combine(None, s), 2 * np.array([[0, b, x]]) / (1 + 2 * b))
+    np.testing.assert_allclose(gallery.combine(p, s), known * np.array([[0.5, 0.4 + b, x]]) / (0.4 + b))
+    np.testing.assert_allclose(gallery.combine(None, s), 2 * np.array([[0, b, x]]) / (1 + 2 * b))
     x = 0.5 * 0.8**3  # below the best class, which keeps its confidence
-    np.testing.assert_allclose(union.combine(p, np.array([[0.16, 0]])), [[0.5, 0.4, x]])
-    assert union.combine(None, np.zeros((1, 2))).tolist() == [[0, 0, 0]]
-    same = ClassUnion(("a", "b"))
+    np.testing.assert_allclose(gallery.combine(p, np.array([[0.16, 0]])), [[0.5, 0.4, x]])
+    assert gallery.combine(None, np.zeros((1, 2))).tolist() == [[0, 0, 0]]
+    same = Gallery("", trained=("a", "b"))
     assert same.of_classifiers(p) is p and same.combine(p[:, :2], np.zeros((1, 0))) == pytest.approx(p[:, :2])
