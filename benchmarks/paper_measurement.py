@@ -14,7 +14,7 @@ from benchmarks.paired import paired_difference
 from thor2_jax.files import json_digest
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
-from thor2_jax.model.recognition import DescribedFrame
+from thor2_jax.recognizer import DescribedFrame
 from training.baselines.baseline import Predictor, baseline_inputs
 from training.baselines.job import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers

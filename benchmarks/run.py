@@ -28,9 +28,8 @@ import thor2_jax as thor2
 from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
 from thor2_jax.descriptor.describe import describe_stream
-from thor2_jax.model.classifier import FEATURES
-from thor2_jax.model.run_directory import TrainedRun, input_size
-from thor2_jax.networks import MLP
+from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import FEATURES, MLP, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
 

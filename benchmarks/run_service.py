@@ -28,9 +28,8 @@ from PIL import Image
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import multipart
-from thor2_jax.model.classifier import FEATURES
-from thor2_jax.model.run_directory import TrainedRun, input_size, save_run
-from thor2_jax.networks import MLP
+from thor2_jax.model.run_directory import TrainedRun, save_run
+from thor2_jax.networks import FEATURES, MLP, input_size
 from thor2_jax.service.decoding import decode_frame
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene

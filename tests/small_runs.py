@@ -13,10 +13,9 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.inference import infer
-from thor2_jax.model.run_directory import TrainedRun, input_size
-from thor2_jax.networks import MLP, EmbeddingSizes
+from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import FEATURES, MLP, EmbeddingSizes, input_size
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""

@@ -8,7 +8,6 @@ import numpy as np
 
 import thor2_jax as thor2
 from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.model.classifier import RunClassifiers
 from thor2_jax.model.model import Model
 
 
@@ -37,7 +36,7 @@ class UntaughtRecognizer:
             name: lambda oriented, name=name: self.probabilities(oriented.content)[name]
             for name in self.run.classifiers
         }
-        return Model(self.run, RunClassifiers(classifiers), Gallery("", trained=self.run.classes), self.unknown_below)
+        return Model(self.run, classifiers, Gallery("", trained=self.run.classes), self.unknown_below)
 
     def describe(self, frame: thor2.RGBDFrame) -> Any:
         instances = [

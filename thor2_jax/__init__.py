@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from thor2_jax.descriptor.view_normalization import view_normalize as view_normalize
     from thor2_jax.explanation.explain import Explanation as Explanation
     from thor2_jax.explanation.explain import explain as explain
-    from thor2_jax.frames.color_transform import ColorTransform as ColorTransform
     from thor2_jax.frames.frames import Intrinsics as Intrinsics
     from thor2_jax.frames.frames import RGBDFrame as RGBDFrame
     from thor2_jax.frames.frames import read_frame as read_frame
+    from thor2_jax.model.model import ColorTransform as ColorTransform
     from thor2_jax.model.recognition import Recognition as Recognition
     from thor2_jax.recognizer import Recognizer as Recognizer
     from thor2_jax.segmentation.segmenters import segment as segment
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from thor2_jax.types import Strips as Strips
 else:
     _MODULES = {
-        "frames.color_transform": ("ColorTransform",),
         "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "explanation.explain": ("Explanation", "explain"),
         "frames.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
+        "model.model": ("ColorTransform",),
         "model.recognition": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),

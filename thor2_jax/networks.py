@@ -1,6 +1,7 @@
 """The networks of classifiers and embeddings, their compilation, and their weights as named arrays.
 
-The weights of Flax modules are stored as named arrays in safetensors files.
+A classifier (paper, section "Recognition") is an MLP on one kind of descriptor, a feature, and is named by it. The
+weights of Flax modules are stored as named arrays in safetensors files.
 """
 
 import dataclasses
@@ -8,7 +9,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +18,26 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, square_root
+from thor2_jax.descriptor.looks import N_BALANCED, N_SCALARS, LookDescriptors
+from thor2_jax.descriptor.slicing import square_root
+from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
 __all__ = [
+    "EMBEDDING",
+    "FEATURES",
     "HIDDEN",
     "MLP",
+    "THOR2",
+    "Classifier",
     "EmbeddingNetwork",
     "EmbeddingSizes",
+    "Feature",
+    "check_features",
     "class_cosines",
     "compiled",
+    "feature_of",
+    "input_size",
     "model_arrays",
     "model_from_arrays",
     "projected_features",
@@ -34,6 +45,43 @@ __all__ = [
 ]
 
 Module = TypeVar("Module", bound=nnx.Module)
+
+Feature = Literal["ce", "tops", "tops2"]
+FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
+"""Descriptors that a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
+
+THOR2: tuple[Feature, ...] = ("tops", "tops2")
+"""The two classifiers whose fusion is THOR2."""
+
+EMBEDDING = "embedding"
+"""Name of the class probabilities that the embedding of a run gives, beside those of the MLPs."""
+
+Classifier = Callable[[LookDescriptors], jax.Array]
+"""From the descriptors of K looks at B clouds to class probabilities [B, C], which may sum to less than 1."""
+
+
+def check_features(names: object, argument: str) -> tuple[Feature, ...]:
+    """Return `names` as a tuple of known features in the order of FEATURES.
+
+    Raises:
+        InputError: a name is unknown or given twice, or there is none; the message names `argument`.
+    """
+    values = tuple(names) if isinstance(names, (list, tuple)) else ()
+    if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
+        raise InputError(f"{argument} is {names!r}; expected one or more of {', '.join(FEATURES)}")
+    return tuple(name for name in FEATURES if name in values)
+
+
+def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
+    """Return the flat descriptor [B, F] that the classifier of this name reads."""
+    return {"ce": descriptors.color, "tops": descriptors.tops, "tops2": descriptors.tops2}[name]
+
+
+def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> int:
+    """Return the number of floats in a descriptor."""
+    image, embedding = config.image_size**2, n_regions * config.n_strips
+    return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
+
 
 HIDDEN = (512, 256, 128, 64)
 

@@ -25,28 +25,57 @@ from numpy.typing import NDArray
 
 from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, camera_instances, estimate_transform
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
-from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import with_context
-from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
-from thor2_jax.model.classifier import THOR2
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
 from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows
-from thor2_jax.model.model import Model
-from thor2_jax.model.recognition import AnswerBy, DescribedFrame, Recognition
+from thor2_jax.model.model import ColorTransform, Model
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
 from thor2_jax.tracking.tracker import Tracker
+from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["THOR2", "AnswerBy", "Recognizer"]
+__all__ = ["THOR2", "DescribedFrame", "Recognizer"]
 
 CHUNK = 4
 """Default of `Recognizer.chunk`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DescribedFrame:
+    """The instances of a frame and the descriptors of those that can be used.
+
+    Attributes:
+        instances: every instance, in the order of the label numbers.
+        oriented: descriptors of all looks, as NumPy arrays with one row for each of `usable`, padded to a batch
+            bucket.
+    """
+
+    instances: Sequence[PreparedInstance]
+    oriented: LookDescriptors
+
+    @property
+    def descriptors(self) -> Descriptors:
+        """The descriptors of the first look, the paper's."""
+        return self.oriented.first
+
+    @property
+    def usable(self) -> list[PreparedInstance]:
+        """The instances that were described, in the order of the rows."""
+        return [instance for instance in self.instances if instance.reason is None]
+
+    @property
+    def packed(self) -> PointClouds:
+        """The described clouds in metres, padded as `descriptors` are."""
+        return pack_instances(self.usable, self.oriented.shape[0])
 
 
 class Recognizer:
@@ -261,7 +290,7 @@ class Recognizer:
 
         Args:
             frame: color, depth, labels and intrinsics.
-            classifiers: the classifiers that are fused, see `RunClassifiers.default`; the paper's are `THOR2`.
+            classifiers: the classifiers that are fused, see `Model.chosen_classifiers`; the paper's are `THOR2`.
             answer_by: source of the answers, see `Model.answers_by`.
 
         Raises:
@@ -308,9 +337,8 @@ class Recognizer:
         Raises:
             InputError: a classifier that the run does not have.
         """
-        model = self.model
-        names = model.classifiers.checked(classifiers) if model.answers_by(answer_by) != "gallery" else ()
-        return compute_by_chunks(instances, self.chunk, lambda clouds: infer_clouds(model, clouds, names, answer_by))
+        compute = functools.partial(infer_clouds, self.model, classifiers=classifiers, answer_by=answer_by)
+        return compute_by_chunks(instances, self.chunk, compute)
 
     def track(self) -> Tracker:
         """Return a tracker, which follows the objects of successive frames and fuses the answers for each of them."""

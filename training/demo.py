@@ -16,8 +16,8 @@ import numpy as np
 
 from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import load_run
+from thor2_jax.networks import FEATURES
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
 from training.embedding.samples import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers

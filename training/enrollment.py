@@ -12,9 +12,8 @@ from pathlib import Path
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import enrolled_views
+from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameFolder

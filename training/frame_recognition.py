@@ -18,7 +18,6 @@ from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
-from thor2_jax.model.result_files import instances_as_json
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
@@ -67,7 +66,7 @@ class FrameAnswer:
             return {**line, "error": self.error}
         if self.recorded is not None:
             return {**line, "instances": detections_as_json(self.detections)}
-        return {**line, "instances": instances_as_json(self.recognitions)}
+        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
 
 
 def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:

@@ -7,7 +7,7 @@ from typing import Any
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.model.classifier import EMBEDDING, FEATURES, Feature, check_features
+from thor2_jax.networks import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
 from training.embedding.distractors import Distractors
 from training.embedding.samples import AUGMENTATIONS

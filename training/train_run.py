@@ -27,10 +27,9 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.model.classifier import EMBEDDING, Feature
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE
-from thor2_jax.networks import MLP
+from thor2_jax.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import (
     Distractors,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import colornet
+from colornet.builder import HyabDBSCAN
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, to_lab
-from colornet.mapper import HyabDBSCAN
 
 NETWORK = colornet.load_default()
 BUILD = """

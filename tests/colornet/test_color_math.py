@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from sklearn.cluster import DBSCAN
 
+from colornet.builder import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, to_lab
-from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:

@@ -14,8 +14,7 @@ import thor2_jax as thor2
 from colornet.lab import GRID_WHITE
 from colornet.lab import hyab as exact_hyab
 from colornet.lab import to_lab as exact_lab
-from thor2_jax.descriptor.relaxation import interval_log_weights, soft_regions
-from thor2_jax.descriptor.slicing import region_sets
+from thor2_jax.descriptor.slicing import interval_log_weights, region_sets, soft_regions
 
 NETWORK = colornet.load_default()
 HARD = thor2.DescriptorConfig(homology="closed_form")

@@ -14,8 +14,8 @@ from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_ru
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.export import export_recognizer
-from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import FEATURES
 
 CONFIG = dataclasses.replace(SMALL_CONFIG, homology="gudhi", looks=4)
 

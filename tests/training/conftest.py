@@ -16,8 +16,7 @@ from small_runs import random_classifier
 
 from thor2_jax import figures
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
-from thor2_jax.model.run_directory import input_size
-from thor2_jax.networks import MLP
+from thor2_jax.networks import MLP, input_size
 from training import train_run
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics

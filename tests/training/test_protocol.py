@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from thor2_jax.model.classifier import FEATURES
+from thor2_jax.networks import FEATURES
 from training.embedding.distractors import Distractors
 from training.protocol import DEFAULT, PAPER, QUICK, Protocol
 

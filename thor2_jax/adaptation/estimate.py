@@ -24,18 +24,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
+from colornet.lab import LUMA
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.frames.color_transform import ColorTransform, transform_colors
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, Gallery
-from thor2_jax.model.classifier import EMBEDDING, Classifier
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
-from thor2_jax.model.model import Model
+from thor2_jax.model.model import ColorTransform, Model
+from thor2_jax.networks import EMBEDDING, Classifier
 from thor2_jax.types import PointClouds
 
 __all__ = [
@@ -50,6 +50,7 @@ __all__ = [
     "entropy",
     "estimate_transform",
     "objective",
+    "transform_colors",
 ]
 
 ROWS = 8
@@ -71,6 +72,19 @@ def entropy(probabilities: jax.Array) -> jax.Array:
     rest = jnp.clip(1 - probabilities.sum(axis=-1, keepdims=True), 0, 1)
     every = jnp.clip(jnp.concatenate([probabilities, rest], axis=-1), 1e-12, 1)
     return -(every * jnp.log(every)).sum(axis=-1)
+
+
+def transform_colors(parameters: jax.Array, colors: jax.Array) -> jax.Array:
+    """Return transformed colours [..., 3] in [0, 1].
+
+    Args:
+        parameters: [4], the fields of `ColorTransform` in their order.
+        colors: [..., 3] sRGB in [0, 1].
+    """
+    gamma, gain, saturation, warmth = parameters
+    values = colors ** jnp.exp(gamma) * jnp.exp(gain + warmth * jnp.array([1, 0, -1], jnp.float32))
+    grey = (values * LUMA).sum(axis=-1, keepdims=True)
+    return jnp.clip(grey + jnp.exp(saturation) * (values - grey), 0, 1)
 
 
 @jax.jit

@@ -7,6 +7,10 @@ and cameras differ in colour. Recognition therefore describes and classifies K l
 - 2: also after a half turn about z;
 - 4: as it is; after a half turn, without the points near the contour of its mask (`PointClouds.rim`); after a half
   turn, with warmer colours; and with cooler colours.
+
+Beside the descriptor of a look, networks read statistics of its cloud: side lengths, number of points, colours. The
+histogram of balanced colours among them is only for galleries. It is finer than the colour regions of the network, so
+that objects of one shape with different prints differ, and depends less on the light.
 """
 
 import dataclasses
@@ -16,19 +20,50 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
+from thor2_jax.descriptor.slicing import square_root, to_lab
 from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
-__all__ = ["WARMTH", "LookDescriptors", "aligned_looks", "describe_aligned_looks", "describe_looks"]
+__all__ = [
+    "N_BALANCED",
+    "N_SCALARS",
+    "WARMTH",
+    "LookDescriptors",
+    "aligned_looks",
+    "balanced_histogram",
+    "cloud_statistics",
+    "describe_aligned_looks",
+    "describe_looks",
+    "is_color",
+    "side_lengths",
+]
 
 WARMTH = 1.06
 """Factor of red, and divisor of blue, of the warmer look; the inverse of the cooler one."""
+
+N_SCALARS = 12
+"""Statistics of a cloud before its colour histogram."""
+
+_BINS = 6, 7, 7
+"""Bins of lightness, a* and b* of the balanced histogram."""
+
+N_BALANCED = int(np.prod(_BINS))
+"""Bins of the balanced histogram."""
+
+_CHROMA, _MAX_CHROMA = 10, 60
+"""Bins of a* and b* end at `_MAX_CHROMA`; they are narrow below `_CHROMA`, where most surfaces are."""
+
+_BALANCE = 0.45
+"""Mean of each channel that the balance leaves as it is."""
+
+_COLOR_SCALARS = slice(5, 11)
+"""Mean and standard deviation of the colours."""
 
 
 @jax.tree_util.register_dataclass
@@ -182,3 +217,81 @@ def describe_looks(
         return describe_aligned_looks(aligned, strips(aligned, network, config), network, config, count)
 
     return map_large_chunks(describe_chunk, clouds, count)
+
+
+def is_color(n_regions: int) -> NDArray[np.bool_]:
+    """Return which of the statistics [12 + R] are of colours only."""
+    result = np.arange(N_SCALARS + n_regions) >= N_SCALARS
+    result[_COLOR_SCALARS] = True
+    return result
+
+
+@partial(jax.jit, static_argnums=1)
+def side_lengths(aligned: PointClouds, alpha: float) -> jax.Array:
+    """Return the side lengths [B, 3] of the boxes of aligned clouds before the turn by alpha, longest first."""
+    c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
+    x, y, z = jnp.moveaxis(aligned.points, -1, 0)
+    sides = []
+    for values in (c * x + s * z, y, c * z - s * x):
+        high = jnp.where(aligned.mask, values, -jnp.inf).max(axis=1)
+        sides.append(high - jnp.where(aligned.mask, values, jnp.inf).min(axis=1))
+    lengths = jnp.stack(sides, axis=1)
+    return -jnp.sort(-jnp.where(jnp.isfinite(lengths), lengths, 0), axis=1)
+
+
+@jax.jit
+def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> jax.Array:
+    """Return statistics of clouds, all of order 1.
+
+    Args:
+        sides: [B, 3] side lengths of the bounding box, longest first, scaled units.
+        clouds: [B, N] clouds, of which only colours and mask are used.
+        strips: their strips; the colour vectors give the number of points in each colour region.
+
+    Returns:
+        [B, 12 + R] float32: side lengths, size of the box, number of points, mean and standard deviation of the
+        colours, ratio of the two longest sides, and the square root of the colour histogram, which has unit length.
+    """
+    count = clouds.mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
+    weight = clouds.mask[..., None].astype(jnp.float32) / jnp.maximum(count, 1)[..., None]
+    mean = (clouds.colors * weight).sum(axis=1)
+    deviation = square_root((jnp.square(clouds.colors) * weight).sum(axis=1) - jnp.square(mean))
+    scalars = [
+        2 * sides,
+        3 * jnp.cbrt(sides.prod(axis=1, keepdims=True)),
+        jnp.sqrt(count) / 20,
+        mean,
+        deviation,
+        sides[:, 1:2] / jnp.maximum(sides[:, :1], 1e-6),
+    ]
+    region_points = strips.color.sum(axis=(1, 2))
+    histogram = region_points / jnp.maximum(region_points.sum(axis=1, keepdims=True), 1e-6)
+    return jnp.concatenate([*scalars, square_root(histogram)], axis=1)
+
+
+@jax.jit
+def balanced_histogram(colors: jax.Array, mask: jax.Array) -> jax.Array:
+    """Return histograms of clouds in CIELAB, after half of the colour cast and of the exposure is taken out.
+
+    Each channel is divided by the square root of its mean: with the whole of it, objects of one colour would be grey. A
+    point belongs to neighbouring bins by shares.
+
+    Args:
+        colors: [B, N, 3] sRGB in [0, 1].
+        mask: [B, N] bool.
+
+    Returns:
+        [B, `N_BALANCED`] float32, the square roots of shares that sum to 1; zeros for a cloud without points.
+    """
+    inside = mask[..., None].astype(jnp.float32)
+    weight = inside / jnp.maximum(inside.sum(axis=1, keepdims=True), 1)
+    mean = (colors * weight).sum(axis=1, keepdims=True)
+    lab = to_lab((colors * jnp.sqrt(_BALANCE / (mean + 0.03))).clip(0, 1))
+    chroma = jnp.arcsinh(lab[..., 1:] / _CHROMA) / np.arcsinh(_MAX_CHROMA / _CHROMA)
+    place = jnp.concatenate([lab[..., :1] / 100, (chroma + 1) / 2], axis=-1).clip(0, 1)
+    shares = [
+        jnp.maximum(0, 1 - jnp.abs(place[..., k, None] * (n - 1) - jnp.arange(n, dtype=jnp.float32)))
+        for k, n in enumerate(_BINS)
+    ]
+    joint = jnp.einsum("bnl,bna,bnc->blac", shares[0] * weight, *shares[1:])
+    return square_root(joint.reshape(len(colors), -1))

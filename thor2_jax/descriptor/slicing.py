@@ -1,7 +1,7 @@
 """Slices, strips and their colour vectors (paper, sections "Slicing" and "Colour").
 
-`strips_of_cloud` turns one aligned cloud of any number of points into tables of a fixed size. The paper's rule, and
-that of the authors' released code (`DescriptorConfig.released`), are in this module, and the soft one in `relaxation`.
+`strips_of_cloud` turns one aligned cloud of any number of points into tables of a fixed size, by the paper's rule, that
+of the authors' released code (`DescriptorConfig.released`), or a soft one (`DescriptorConfig.relaxation`).
 
 A colour belongs to one or more regions of the network (paper, "Color network"). The 140,608 colours of the grid have
 only 62 different sets of regions, so a point carries the number of its region set; region weights are applied after
@@ -9,22 +9,40 @@ points have been counted.
 
 The released code rounds x and y to 0.01 and z to 0.1, half to even, in float64. Slices are the levels of z that occur,
 renumbered from 0; a strip is numbered by its upper edge; colour vectors are divided by their strip's number of points.
+
+Hard slices, strips and colour regions are piecewise constant in points and colours, and their gradients vanish. With
+`DescriptorConfig(relaxation=Relaxation(...))` a point has a weight in each of them. As all four temperatures approach
+zero, the results approach the hard ones, for any cloud in the first octant that has no point on a border between two
+slices or strips and no colour halfway between two grid colours.
 """
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from colornet import ColorNetwork
-from colornet.grid import GRID_LEVELS, GRID_STEP
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.relaxation import relaxed_strips
+from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
+from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.descriptor.bounding_box import HIGHEST
 from thor2_jax.types import Strips
 
-__all__ = ["RegionSets", "color_sets", "region_sets", "slices_and_strips", "strip_births", "strips_of_cloud"]
+__all__ = [
+    "RegionSets",
+    "color_sets",
+    "interval_log_weights",
+    "region_sets",
+    "relaxed_strips",
+    "slices_and_strips",
+    "soft_regions",
+    "square_root",
+    "strip_births",
+    "strips_of_cloud",
+    "to_lab",
+]
 
 
 @jax.tree_util.register_dataclass
@@ -145,7 +163,8 @@ def strips_of_cloud(
     inside &= (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
     overflow = (mask & ~inside).sum(dtype=jnp.int32)
     if config.relaxation is not None:
-        return relaxed_strips(points, colors, mask, sets, config, overflow)
+        relaxed = relaxed_strips(points, colors, mask, sets, config)
+        return dataclasses.replace(relaxed, overflow=overflow)
 
     segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # the scatters drop segment `n_segments`
     low, high = _extremes(y, segment, n_segments)
@@ -171,7 +190,7 @@ def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, 
     n_sets = sets.weights.shape[0]
     cell = segment * n_sets + region_set
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
-    return jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
+    return jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=HIGHEST)
 
 
 def _released_values(strips: Strips) -> Strips:
@@ -198,3 +217,172 @@ def _round_scaled(values: jax.Array, scale: int) -> jax.Array:
     past_half = (upper * scale - (whole + 0.5)) + (values - upper) * scale
     round_up = (past_half > 0) | ((past_half == 0) & (whole % 2 == 1))
     return whole + round_up.astype(whole.dtype)
+
+
+_OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+"""[27, 3] offsets, in levels, from the nearest grid colour to itself and its neighbours."""
+
+_WEIGHT_FLOOR = 1e-3
+"""Where the weights in a strip are smaller than this, its mean is pulled to 0, which keeps the quotient bounded."""
+
+
+def interval_log_weights(coordinates: jax.Array, width: float, count: int, temperature: float) -> jax.Array:
+    """Return the logarithms of the weights of coordinates in consecutive intervals that start at 0.
+
+    A weight is sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval is unbounded below: aligned
+    clouds touch 0, and a point on that border belongs to no other interval.
+
+    Args:
+        coordinates: [N].
+        width: width of an interval, in the unit of `coordinates`.
+        count: number C of intervals.
+        temperature: T, in the unit of `coordinates`.
+
+    Returns:
+        [N, C], at most 0. The weights sum to 1 for coordinates well below the last border.
+    """
+    edges = (np.arange(count + 1) * width).astype(np.float32)
+    above = jax.nn.log_sigmoid((coordinates[:, None] - edges[1:-1]) / temperature)
+    below = jax.nn.log_sigmoid((edges[1:] - coordinates[:, None]) / temperature)
+    # Written as a product, the difference loses no digits where both sigmoids are nearly equal.
+    between = above + below[:, 1:] + np.log1p(-np.exp(-width / temperature))
+    return jnp.concatenate([below[:, :1], between], axis=1)
+
+
+def _rise(weight: jax.Array, above: jax.Array, temperature: float) -> jax.Array:
+    """Return T log(1 + sum over points of w (exp(above / T) - 1)): [N, J] and [N, J] to [J].
+
+    This log-sum-exp ignores points of weight 0 and is 0 if `above` is 0 everywhere. It is not negative if the weighted
+    sum of `above` is 0.
+    """
+    scaled = above / temperature
+    top = jax.lax.stop_gradient(jnp.maximum(scaled.max(axis=0), 0))
+    floor = jnp.exp(-jnp.minimum(top, 80.0))
+    terms = (weight * jnp.exp(scaled - top)).sum(axis=0) + (1 - weight.sum(axis=0)) * jnp.exp(-top)
+    return temperature * (top + jnp.log(jnp.maximum(terms, floor)))
+
+
+def relaxed_strips(
+    points: jax.Array,
+    colors: jax.Array,
+    mask: jax.Array,
+    sets: RegionSets,
+    config: DescriptorConfig,
+    point_weights: jax.Array | None = None,
+) -> Strips:
+    """Return the soft extremes and the colour vector of every strip of one aligned cloud (no batch axis).
+
+    Let w be the weight of a point in a strip and m the mean of y with the weights w^2. The upper extreme is
+    m + T log(1 + sum w (exp(w (y - m) / T) - 1)), and the lower one likewise. Deviations are multiplied by w too;
+    otherwise a point high up in the next strip would dominate at any temperature in spite of its small weight. A strip
+    that holds little weight or only one point has little persistence and vanishes from the image.
+
+    Args:
+        points: [3, N], scaled units; points with a negative x or z are ignored, as in hard slices.
+        colors: [N, 3] sRGB in [0, 1].
+        mask: [N] bool.
+        sets: region sets of the colour network.
+        config: its `relaxation` gives the temperatures. Static.
+        point_weights: [N] float32 from 0 to 1, by which each point counts; a point of weight 0 is left out. By default
+            all points count fully. Their gradients attribute an answer to points (`explanation.attributions`).
+
+    Returns:
+        Strips; a strip is occupied if any point has a positive weight in it. Their overflow is 0: `strips_of_cloud`
+        counts that of the hard slices.
+    """
+    relaxation = config.relaxation or Relaxation()
+    x, y, z = points
+    counted = (mask & (x >= 0) & (z >= 0))[:, None]
+    log_slice = interval_log_weights(z, config.sigma_1, config.n_slices, relaxation.slice)
+    log_strip = interval_log_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
+    regions = soft_regions(colors, sets, relaxation.color)
+
+    # With a checkpoint, the gradient recomputes the [N, J] arrays of a slice instead of keeping those of all slices.
+    @jax.checkpoint
+    def one_slice(log_weight: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        weight = jnp.where(counted, jnp.exp(log_weight[:, None] + log_strip), 0)
+        if point_weights is not None:
+            weight = weight * point_weights[:, None]
+        square = weight**2
+        mean = (square * y[:, None]).sum(axis=0) / (square.sum(axis=0) + _WEIGHT_FLOOR**2)
+        above = weight * (y[:, None] - mean)
+        low = mean - _rise(weight, -above, relaxation.extremum)
+        high = mean + _rise(weight, above, relaxation.extremum)
+        return low, high, (weight > 0).any(axis=0), jnp.matmul(weight.T, regions, precision=HIGHEST)
+
+    low, high, occupied, color = jax.lax.map(one_slice, log_slice.T)
+    return Strips(low, high, occupied, color, jnp.zeros((), jnp.int32))
+
+
+def square_root(values: jax.Array) -> jax.Array:
+    """Return the square roots of values; 0, with a gradient of 0, of those that are not positive."""
+    positive = values > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, values, 1)), 0)
+
+
+_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""Matrix from linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
+
+_WHITE = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
+"""XYZ of D65, the white point of the colour grid (`colornet.lab.GRID_WHITE`)."""
+
+
+def to_lab(colors: jax.Array) -> jax.Array:
+    """Convert sRGB colours in [0, 1] to CIELAB (D65): [..., 3] to [..., 3], L* in 0..100."""
+    dark = colors <= 0.04045
+    linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
+    xyz = jnp.matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=HIGHEST)
+    small = xyz <= (6 / 29) ** 3
+    root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.cbrt(jnp.where(small, 1, xyz)))
+    fx, fy, fz = root[..., 0], root[..., 1], root[..., 2]
+    return jnp.stack([116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)], axis=-1)
+
+
+def _hyab(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Return the HyAB difference |dL*| + sqrt(da*^2 + db*^2), [..., 3] to [...]; its gradient is 0 at equal colours."""
+    difference = first - second
+    return jnp.abs(difference[..., 0]) + square_root((difference[..., 1:] ** 2).sum(axis=-1))
+
+
+@functools.cache
+def _grid_lab() -> jax.Array:
+    with jax.ensure_compile_time_eval():
+        return to_lab(jnp.asarray(grid_colors() / 255, jnp.float32))
+
+
+def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax.Array:
+    """Return region weights of colours, averaged over nearby grid colours by a softmax over HyAB distances.
+
+    The 27 grid colours within one level of the nearest one share the weight in proportion to exp(-HyAB / T), times a
+    factor that fades to 0 where a channel is 1/2 + T / (1 + T) levels away. The weights are therefore continuous where
+    the nearest grid colour changes. Towards zero temperature only the colour nearest in every channel remains, as in
+    the hard rule; the colour nearest by HyAB may be another one.
+
+    Args:
+        colors: [N, 3] sRGB, clipped to [0, 1] first.
+        sets: region sets of the colour network.
+        temperature: T, units of HyAB in CIELAB.
+
+    Returns:
+        [N, R]; rows sum to 1.
+    """
+    colors = jnp.clip(colors, 0, 1)
+    scaled = colors * (255 / GRID_STEP)
+    nearest = jnp.floor(scaled + 0.5).astype(jnp.int32)
+    levels = nearest[:, None] + _OFFSETS.astype(np.int32)
+    exists = ((levels >= 0) & (levels < GRID_LEVELS)).all(axis=-1)
+    levels = jnp.clip(levels, 0, GRID_LEVELS - 1)
+    row = (levels[..., 0] * GRID_LEVELS + levels[..., 1]) * GRID_LEVELS + levels[..., 2]
+
+    reach = 0.5 + temperature / (1 + temperature)
+    closeness = 1 - ((scaled[:, None] - levels.astype(scaled.dtype)) / reach) ** 2
+    # The nearest colour always stays; at a tiny temperature rounding could exclude it.
+    chosen = exists & ((closeness > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
+    fade = 2 * jnp.log(jnp.where(closeness > 0, closeness, 1e-7)).sum(axis=-1)
+    distance = _hyab(to_lab(colors)[:, None], _grid_lab()[row])
+    share = jax.nn.softmax(jnp.where(chosen, fade - distance / temperature, -jnp.inf), axis=-1)
+
+    # Summed by region set first: [N, 62] instead of [N, 27, 22].
+    by_set = jnp.zeros((len(colors), sets.weights.shape[0]), share.dtype)
+    by_set = by_set.at[jnp.arange(len(colors))[:, None], sets.of_color[row]].add(share)
+    return jnp.matmul(by_set, sets.weights, precision=HIGHEST)

@@ -20,8 +20,7 @@ from scipy.spatial import KDTree
 from scipy.stats import spearmanr
 
 from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.descriptor.relaxation import relaxed_strips
-from thor2_jax.descriptor.slicing import RegionSets, region_sets, slices_and_strips
+from thor2_jax.descriptor.slicing import RegionSets, region_sets, relaxed_strips, slices_and_strips
 from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
@@ -97,8 +96,7 @@ def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets,
     """Return the relaxed strips [T * K, ...] of K looks at a cloud, whose points have weights [T, N]."""
 
     def one(cloud: PointClouds, weight: jax.Array) -> Strips:
-        overflow = jnp.zeros((), jnp.int32)
-        return relaxed_strips(cloud.points.T, cloud.colors, cloud.mask, sets, config, overflow, weight)
+        return relaxed_strips(cloud.points.T, cloud.colors, cloud.mask, sets, config, weight)
 
     each = jax.lax.map(lambda weight: jax.vmap(one, in_axes=(0, None))(aligned, weight), weights)
     flat: Strips = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each)

@@ -22,10 +22,10 @@ from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.classifier import EMBEDDING
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
+from thor2_jax.networks import EMBEDDING
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["ClassScores", "Unit", "classifier_scores", "gallery_scores"]
@@ -139,7 +139,7 @@ def classifier_scores(model: Model) -> ClassScores:
     Raises:
         InputError: the run's descriptor has the convention of the released code.
     """
-    default = model.classifiers.default
+    default = model.chosen_classifiers()
     names = tuple(name for name in default if name != EMBEDDING) or default
     classes, hidden = model.run.classes, set(model.gallery.hidden)
     columns = np.array([k for k, name in enumerate(classes) if name not in hidden], int)

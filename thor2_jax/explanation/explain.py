@@ -227,7 +227,7 @@ def explained_kinds(model: Model) -> dict[bool, str]:
 
 def _by_classifiers(model: Model) -> NDArray[np.bool_]:
     """Return which names are explained by the classifiers."""
-    return model.union.has_output & (model.answers_by() != "gallery")
+    return model.gallery.has_output & (model.answers_by() != "gallery")
 
 
 def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:

@@ -1,14 +1,17 @@
-"""Views of an object, embedded for a gallery, and queries, embedded in several looks.
+"""Enrolment: how views of an object are augmented and embedded, and a gallery that can be taught, in memory or on disk.
 
 Views, whether a few frames or renderings of a mesh, show little of how another camera sees the object. They get
 augmented copies, made without rendering: light, sensor noise and cut masks. The copies are drawn from the cloud itself,
 so that each copy of a view is the same in every embedding.
 """
 
+import dataclasses
 import datetime
+import functools
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,15 +22,16 @@ from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances
-from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.gallery import CompactClouds, GalleryObject
+from thor2_jax.gallery import store
+from thor2_jax.gallery.embedding import Embedding, load_default
+from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 
 __all__ = [
     "LOOKS",
+    "ObjectGallery",
     "augmented_copies",
     "augmented_view",
     "embed_looks",
-    "embed_views",
     "enrolled_object",
     "enrolled_views",
     "views_to_embed",
@@ -57,12 +61,12 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
-    """Return an object's views and their augmented copies; the arguments are those of `embed_views`."""
+    """Return an object's views and their augmented copies; the arguments are those of `_embed_views`."""
     views = list(clouds.views())
     return views + augmented_copies(views, source)
 
 
-def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float16]:
+def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float16]:
     """Return the embeddings [E, D] of an object's views.
 
     Args:
@@ -83,7 +87,7 @@ def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str
 
 
 def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], source: str) -> GalleryObject:
-    """Return the views of an object as a gallery stores them; the arguments are those of `embed_views`.
+    """Return the views of an object as a gallery stores them; the arguments are those of `_embed_views`.
 
     Raises:
         InputError: there is no view, or one has no points or is too large.
@@ -91,7 +95,7 @@ def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], sour
     clouds = CompactClouds.of(list(views))
     if not len(clouds):
         raise InputError("views is empty; expected at least one view of the object")
-    return enrolled_object(embed_views(embedding, clouds, source), clouds, source)
+    return enrolled_object(_embed_views(embedding, clouds, source), clouds, source)
 
 
 MAX_COPIES = 8
@@ -158,3 +162,168 @@ def _cut(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bo
     along = rays @ np.array([np.cos(angle), np.sin(angle)])
     rank = math.ceil(rng.uniform(0, 0.125) * (len(along) - 1))
     return np.asarray(along < np.partition(along, rank)[rank])
+
+
+FEW = 10
+"""With fewer views of an object, or without a background and with fewer objects, most unknown objects are named."""
+
+
+class ObjectGallery:
+    """Enrolled objects beside the trained classes of a run.
+
+    Each change is one immutable gallery in place of another, so that another thread reads the one or the other. A
+    shallow copy shares the gallery, and neither sees what is changed through the other one before it is refreshed.
+
+    Attributes:
+        gallery: the gallery.
+        directory: directory of the gallery; None if it is in memory. `open` sets it.
+        lock_seconds: time that a change waits for another process that writes to the gallery.
+    """
+
+    def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
+        """Begin with an empty gallery in memory.
+
+        Args:
+            trained: class names of the run.
+            embedding: embedding of the views; by default the packaged one.
+            search: "exact" or "usearch", see `Gallery`.
+
+        Raises:
+            InputError: `search` is unknown.
+        """
+        self._embedding = embedding
+        self.directory: Path | None = None
+        self.gallery = Gallery("", trained=trained, search=search)
+        self.lock_seconds = store.LOCK_SECONDS
+
+    def open(self, directory: Path, *, reembed: bool = False) -> None:
+        """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
+
+        Args:
+            directory: directory of the gallery.
+            reembed: embed all views again, with the embedding of this run, whatever they were embedded by; and rebuild
+                an index that was lost.
+
+        Raises:
+            InputError: see `refresh`.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
+        if reembed and directory.exists():
+            self._change(self._reembedded, rebuild=True)
+        else:
+            store.check_index(directory)
+            self.refresh()
+
+    @property
+    def embedding(self) -> Embedding:
+        """The embedding of the views; the packaged one is read when it is first needed."""
+        if self._embedding is None:
+            self._embedding = load_default()
+        return self._embedding
+
+    @property
+    def weak_rejection(self) -> str:
+        """Why unknown objects are hardly rejected, and what helps, in words; empty if they are not."""
+        objects, references = self.gallery.objects.values(), self.gallery.references
+        few = sum(len(views.clouds) < FEW for views in objects)
+        if few:
+            return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
+        if objects and references is None and not self.gallery.trained and len(objects) < FEW:
+            return f"{len(objects)} objects are enrolled in a run without background views; enroll more of them"
+        return ""
+
+    def refresh(self) -> bool:
+        """Read the gallery again if it has changed on disk, and return whether it has.
+
+        Raises:
+            InputError: it cannot be read, or has another embedding; the gallery in memory stays.
+        """
+        if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
+            return False
+        self._set(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
+        return True
+
+    def _reembedded(self, gallery: Gallery) -> Gallery:
+        objects = {
+            name: dataclasses.replace(
+                views, embeddings=_embed_views(self.embedding, views.clouds, views.source), file=None
+            )
+            for name, views in gallery.objects.items()
+        }
+        return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
+
+    def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
+        if self.directory is None:
+            self._set(change(self.gallery))
+            return
+        trained, embedding = self.gallery.trained, None if rebuild else self.embedding.fingerprint
+
+        def change_stored(stored: Gallery) -> Gallery:
+            return change(dataclasses.replace(stored, trained=trained))
+
+        self._set(
+            store.update_gallery(self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild)
+        )
+
+    def _set(self, gallery: Gallery) -> None:
+        """Keep a gallery, with what the run and the options add to it; references only once it has objects."""
+        self.gallery = dataclasses.replace(
+            gallery,
+            trained=self.gallery.trained,
+            search=self.gallery.search,
+            references=self.embedding.references if gallery.objects else None,
+            version=self.embedding.sizes.version,
+        )
+
+    def enroll(
+        self, name: str, views: Sequence[PreparedInstance], source: str, *, extend: bool = False, replace: bool = False
+    ) -> None:
+        """Enroll an object from prepared views.
+
+        Args:
+            name: name of the object.
+            views: its views.
+            source: "mesh" for views that are rendered from a mesh, or "frames".
+            extend: add the views to those of an object with this name.
+            replace: discard the views, and the output of the classifiers, of an object with this name.
+
+        Raises:
+            InputError: a view cannot be used, or the name exists and neither `extend` nor `replace` is given. Nothing
+                is enrolled.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
+        self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
+
+    def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
+        """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
+
+        def change(gallery: Gallery) -> Gallery:
+            for name, views in objects.items():
+                gallery = gallery.with_object(name, views, extend=extend, replace=replace)
+            return gallery
+
+        self._change(change)
+
+    def forget(self, name: str) -> None:
+        """Remove the views of an object, and never answer its trained class again.
+
+        Raises:
+            InputError: no object has this name.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        if self.directory is not None and store.gallery_stamp(self.directory) is None:
+            self.gallery.without(name)  # a name that is refused leaves nothing behind
+        self._change(lambda gallery: gallery.without(name))
+
+    def undo(self, generation: int) -> None:
+        """Take back the last change of a gallery on disk; `generation` is the one after that change.
+
+        Raises:
+            InputError: the gallery is in memory, or as `store.previous_gallery`.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        if self.directory is None:
+            raise InputError("undo needs a gallery on disk; open one")
+        self._change(functools.partial(store.previous_gallery, self.directory, generation))

@@ -1,4 +1,4 @@
-"""The gallery: embedded views of enrolled objects, and their scores for the views of unknown instances.
+"""The gallery: embedded views of enrolled objects beside the trained classes, and their scores for unknown instances.
 
 The views are kept as compact clouds with a few bytes per point, from which any embedding can be computed again.
 
@@ -9,13 +9,13 @@ A score is a kernel ridge regression on the views that are nearest to the query 
 target of each name: about 1 amid the views of the object, about 0 far from them or amid the views of others. The views
 are those of the enrolled objects and the references of the embedding: views of the trained classes, and of a background
 of objects that are none of the names. The cost does not grow with the gallery, and nothing is fitted when an object is
-enrolled or forgotten.
+enrolled or forgotten. `Gallery.combine` combines the scores with the confidences of the classifiers.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
-from thor2_jax.gallery.union import ClassUnion, score_odds
-from thor2_jax.printable import check_name, find_name
+from thor2_jax.printable import check_name, find_name, first_names
 
 if TYPE_CHECKING:
     from thor2_jax.gallery.embedding import References
@@ -47,6 +46,18 @@ KEPT: tuple[tuple[dict[int, float], dict[int, float]], ...] = (
 )
 """Number of views of an object -> score whose odds give the default threshold, by `EmbeddingSizes.version`, without and
 with reference views; up to ten views from held-out frames, 120 from meshes. 95 % of the correct answers reach it."""
+
+TOYS = frozenset(
+    ("apple banana cereal_box_blue cereal_box_yellow hammer mug_blue mug_white screwdriver soup_can_green soup_can_red "
+     "sponge tennis_ball white_bowl white_cup white_plate wooden_spoon yellow_bottle yellow_box").split()
+)  # fmt: skip
+"""The built-in objects, the classes of the demo's model."""
+
+MAX_LISTED = 6
+"""Names that `Gallery.summary` lists."""
+
+EVEN, STEEPNESS = 0.2, 3
+"""A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
 
 STEP = 5e-5
 """Resolution of the coordinates, metres."""
@@ -146,6 +157,14 @@ class GalleryObject:
         )
 
 
+Values = NDArray[np.floating[Any]]
+
+
+def _score_odds(scores: NDArray[Any]) -> NDArray[Any]:
+    """Return the odds of scores against everything that is not enrolled."""
+    return np.asarray((scores / EVEN) ** STEEPNESS)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Gallery:
     """Enrolled objects; an immutable value.
@@ -181,11 +200,6 @@ class Gallery:
     def names(self) -> tuple[str, ...]:
         """Names of the objects, in the order of the scores."""
         return tuple(self.objects)
-
-    @functools.cached_property
-    def union(self) -> ClassUnion:
-        """The trained classes and the objects."""
-        return ClassUnion(self.trained, self.names, self.hidden)
 
     def name_to_enroll(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
         """Return the name under which `with_object` adds views; the arguments and errors are those of `with_object`."""
@@ -233,19 +247,6 @@ class Gallery:
     def _is_answered_class(self, name: str) -> bool:
         return name in self.trained and name not in self.hidden
 
-    def reembed(self, embedding: str, embed: Callable[[CompactClouds, str], NDArray[np.float16]]) -> "Gallery":
-        """Return the gallery with all views embedded again.
-
-        Args:
-            embedding: fingerprint of the new embedding.
-            embed: function of an object's clouds and their source that returns embeddings [E, D].
-        """
-        objects = {
-            name: dataclasses.replace(views, embeddings=embed(views.clouds, views.source), file=None)
-            for name, views in self.objects.items()
-        }
-        return dataclasses.replace(self, embedding=embedding, objects=objects)
-
     @functools.cached_property
     def regression(self) -> tuple[NDArray[np.float16], NDArray[np.intp], NDArray[np.float64]]:
         """Embeddings [N, D] of all views, the number of the owner of each, and its regularization.
@@ -281,7 +282,7 @@ class Gallery:
         """
         views = [len(views.clouds) for views in self.objects.values()]
         kept = KEPT[self.version][self.references is not None]
-        odds = score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
+        odds = _score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
         return (odds / (1 + odds)).round(3)
 
     @functools.cached_property
@@ -315,3 +316,75 @@ class Gallery:
         if self.references is not None and trained.shape[1]:
             scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)
         return scores.astype(np.float32)
+
+    @functools.cached_property
+    def _outputs(self) -> tuple[str | None, ...]:
+        """The name of each output of the classifiers; None for hidden classes."""
+        hidden = set(self.hidden)
+        return tuple(None if name in hidden else name for name in self.trained)
+
+    @functools.cached_property
+    def answered_names(self) -> tuple[str, ...]:
+        """All names that may be answered: trained classes that are not hidden, then further objects."""
+        return tuple(dict.fromkeys(name for name in (*self._outputs, *self.names) if name is not None))
+
+    @functools.cached_property
+    def has_output(self) -> NDArray[np.bool_]:
+        """[n] bool, whether the classifiers have an output for each of `answered_names`."""
+        outputs = set(self._outputs)
+        return np.array([name in outputs for name in self.answered_names], bool)
+
+    @functools.cached_property
+    def summary(self) -> str:
+        """The names in words, such as "21 objects: mug, bowl, ..."."""
+        toys = [name for name in self.answered_names if name in TOYS] if set(self.trained) == TOYS else []
+        own = [name for name in self.answered_names if name not in toys]
+        listed = first_names(own, MAX_LISTED)
+        if toys:
+            others = f", and {listed}" if own else "; it knows nothing of yours"
+            return f"{len(toys)} toy objects of the demo{others}"
+        return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
+
+    def of_classifiers(self, probabilities: Values) -> Values:
+        """Return class probabilities [B, C] in the order of `answered_names` [B, n]; 0 for names without an output."""
+        return self._spread(probabilities, self._outputs)
+
+    def of_gallery(self, scores: Values) -> Values:
+        """Return scores [B, n_objects] in the order of `answered_names` [B, n]; 0 for names without views."""
+        return self._spread(scores, self.names)
+
+    def _spread(self, values: Values, owners: tuple[str | None, ...]) -> Values:
+        if owners == self.answered_names:
+            return values
+        result = np.zeros((len(values), len(self.answered_names)), values.dtype)
+        column = {name: index for index, name in enumerate(owners)}
+        known = [index for index, name in enumerate(self.answered_names) if name in column]
+        result[:, known] = values[:, [column[self.answered_names[index]] for index in known]]
+        return result
+
+    def combine(self, probabilities: Values | None, scores: Values) -> Values:
+        """Combine the confidences of the classifiers with the scores of the gallery.
+
+        The shares of the names are the confidence of a trained class, and for an enrolled object what the best class
+        leaves to 1, times the odds of the object's score. The largest share is the answer. A class that is the answer
+        keeps its confidence c. If an object is, or has a share in it, the answer has the probability that it is known
+        at all, (c + m) / (1 + m), where c and m are the largest shares of a class and of an object. The values of the
+        others are in proportion. So an enrolled object takes the name only where its score is high.
+
+        Args:
+            probabilities: [B, C], fused; None if the gallery alone answers.
+            scores: [B, n_objects].
+
+        Returns:
+            [B, n] from 0 to 1, in the order of `answered_names`; they need not sum to 1.
+        """
+        nothing: Values = np.zeros((len(scores), len(self.answered_names)))
+        trained = nothing if probabilities is None else self.of_classifiers(probabilities)
+        c = trained.max(axis=1, keepdims=True, initial=0)
+        # Without a score, an object still comes before a class that neither has views nor an output.
+        odds = np.maximum(_score_odds(scores), np.finfo(np.float32).tiny)
+        enrolled = (1 - c).clip(0) * self.of_gallery(odds)
+        shares, m = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
+        largest = shares.max(axis=1, keepdims=True, initial=0)
+        value = np.where(largest > c, (c + m) / (1 + m), c)
+        return shares / np.maximum(largest, np.finfo(np.float32).tiny) * value

@@ -29,7 +29,7 @@ __all__ = [
     "Inference",
     "answers",
     "compute_by_chunks",
-    "gallery_scores",
+    "object_scores",
     "infer",
     "infer_clouds",
     "padded_rows",
@@ -123,7 +123,7 @@ def infer(
         clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
         classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
     """
-    names = model.classifiers.default if classifiers is None else classifiers
+    names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
     if clouds is None:
         return Inference(oriented.overflow, probabilities)
@@ -144,19 +144,22 @@ def infer_clouds(
     Args:
         model: the model.
         clouds: the clouds.
-        classifiers: classifiers to evaluate, if they answer; by default those that do.
+        classifiers: classifiers to evaluate, if they answer, see `Model.chosen_classifiers`.
         answer_by: source of the answers, see `Model.answers_by`.
+
+    Raises:
+        InputError: a classifier that the run does not have.
     """
     source = model.answers_by(answer_by)
     config = model.run.config
     # The gallery alone needs two looks, which `infer` would otherwise describe again.
     count = max(config.looks, LOOKS) if source == "gallery" else config.looks
     oriented = describe_looks(clouds, model.run.network, config, count)
-    names = classifiers if source != "gallery" else ()
+    names = model.chosen_classifiers(classifiers) if source != "gallery" else ()
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
 
 
-def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
+def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
     """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
     if inference.embeddings is None:
         return inference.scores
@@ -165,7 +168,7 @@ def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | 
 
 def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:
     """Return the values [B, n] of all names, whose largest one is the answer and its confidence."""
-    return model.combined(jax.tree.map(np.asarray, inference.probabilities), gallery_scores(model, inference))
+    return model.combined(jax.tree.map(np.asarray, inference.probabilities), object_scores(model, inference))
 
 
 def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:
@@ -178,12 +181,12 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
     """
     n_usable = sum(instance.reason is None for instance in instances)
     inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)
-    names, scores = model.names, gallery_scores(model, inference)
+    names, scores = model.names, object_scores(model, inference)
     combined = model.combined(inference.probabilities, scores)
     thresholds = model.thresholds("both" if inference.probabilities else "gallery")
-    by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}
+    by_source = {name: model.gallery.of_classifiers(p) for name, p in inference.probabilities.items()}
     if scores is not None:
-        by_source["gallery"] = model.union.combine(None, scores)
+        by_source["gallery"] = model.gallery.combine(None, scores)
     rows = iter(range(n_usable))
     result = []
     for instance in instances:

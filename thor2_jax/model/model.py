@@ -3,31 +3,76 @@
 >>> model = Model.of_run(load_run("run"), unknown_below=0.5)                        # doctest: +SKIP
 >>> dataclasses.replace(model, color_transform=transform)                           # doctest: +SKIP
 
-`thor2_jax.model.inference` evaluates it.
+`thor2_jax.model.inference` evaluates it. Its classifiers are compiled functions by name: the MLPs of the run, and the
+embedding if it was fitted on the classes. A colour transform corrects the colours of a camera before recognition.
 """
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar, cast, get_args
 
+import jax
 import numpy as np
+from flax import nnx
 from numpy.typing import NDArray
 
+from colornet.lab import LUMA
+from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.model.classifier import EMBEDDING, RunClassifiers
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
-from thor2_jax.model.recognition import AnswerBy, check_answer_by
+from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.networks import EMBEDDING, MLP, THOR2, Classifier, Feature, compiled, feature_of
 
-__all__ = ["Model"]
+__all__ = ["ColorTransform", "Model"]
 
 T = TypeVar("T")
+
+MAX_PARAMETER = 1.5
+"""Largest absolute value of a parameter: a factor of 4.5 of gamma, gain or saturation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ColorTransform:
+    """Colours c in [0, 1] become exp(gain) exp(warmth [1, 0, -1]) c^exp(gamma), then the distance from grey is scaled.
+
+    With all parameters 0, nothing changes.
+
+    Attributes:
+        gamma: logarithm of the exponent.
+        gain: logarithm of the factor of all channels.
+        saturation: logarithm of the factor of a colour's distance from grey.
+        warmth: logarithm of the factor of red, and of one over the factor of blue.
+
+    Raises:
+        InputError: a parameter is not a finite number, or its absolute value is above `MAX_PARAMETER`.
+    """
+
+    gamma: float = 0.0
+    gain: float = 0.0
+    saturation: float = 0.0
+    warmth: float = 0.0
+
+    def __post_init__(self) -> None:
+        values = dataclasses.astuple(self)
+        if not all(isinstance(value, (int, float)) and abs(value) <= MAX_PARAMETER for value in values):
+            raise InputError(
+                f"color_transform is {values}; expected gamma, gain, saturation and warmth from {-MAX_PARAMETER} to "
+                f"{MAX_PARAMETER}: adapt the run again"
+            )
+
+    def __call__(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the corrected colours of colours [..., 3] uint8 sRGB."""
+        gamma, gain, saturation, warmth = dataclasses.astuple(self)
+        # The channels are powers of 256 values, which a table holds.
+        powers = (np.arange(256) / 255) ** np.exp(gamma)
+        values = powers[colors] * np.exp(gain + warmth * np.array([1, 0, -1]))
+        grey = (values @ LUMA)[..., None]
+        return np.rint(255 * (grey + np.exp(saturation) * (values - grey))).clip(0, 255).astype(np.uint8)
 
 
 def _stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: str) -> T | None:
@@ -52,13 +97,29 @@ def _stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: s
         raise InputError(f"{name} is {stored!r}; expected {fields}; {remedy}") from None
 
 
+def _fused_probabilities(models: Sequence[MLP], oriented: LookDescriptors, name: Feature) -> jax.Array:
+    (model,) = models
+    return oriented.fuse(model(feature_of(oriented.flat[0], name)))
+
+
+def _check_answer_by(value: str | None) -> AnswerBy | None:
+    """Return the source of the answers, or None if it is not given.
+
+    Raises:
+        InputError: it is unknown.
+    """
+    if value not in (None, *get_args(AnswerBy)):
+        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
+    return cast(AnswerBy | None, value)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Model:
     """A trained run and enrolled objects; an immutable value.
 
     Attributes:
         run: the trained run.
-        classifiers: its compiled classifiers.
+        classifiers: its compiled classifiers by name.
         gallery: the enrolled objects.
         unknown_below: least confidence, from 0 to 1, of an answer with any name; None for those of `thresholds`.
         rule: fusion rule of the classifiers, see `fusion`; the paper's is "max".
@@ -67,7 +128,7 @@ class Model:
     """
 
     run: TrainedRun
-    classifiers: RunClassifiers
+    classifiers: Mapping[str, Classifier]
     gallery: Gallery
     unknown_below: float | None = None
     rule: FusionRule = DEFAULT_RULE
@@ -93,8 +154,12 @@ class Model:
         Raises:
             InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
         """
-        wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
-        classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
+        wanted = _check_answer_by(answer_by) or _check_answer_by(run.record.get("answer_by"))
+        classifiers: dict[str, Classifier] = {
+            name: compiled(_fused_probabilities, [nnx.split(each)], name) for name, each in run.classifiers.items()
+        }
+        if run.embedding_classifier is not None:
+            classifiers[EMBEDDING] = run.embedding_classifier
         transform = _stored_value(ColorTransform, "color_transform", run.record, "adapt the run again")
         return cls(run, classifiers, Gallery("", trained=run.classes), unknown_below, rule, wanted, transform)
 
@@ -104,19 +169,30 @@ class Model:
         return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
 
     @property
-    def union(self) -> ClassUnion:
-        """The trained classes and the enrolled objects."""
-        return self.gallery.union
-
-    @property
     def names(self) -> tuple[str, ...]:
         """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
-        return self.union.names
+        return self.gallery.answered_names
 
     @property
     def embedding(self) -> Embedding:
         """The embedding of the enrolled objects: that of the run, or the packaged one."""
         return self.run.embedding or load_default()
+
+    def chosen_classifiers(self, names: Sequence[str] | None = None) -> tuple[str, ...]:
+        """Return the names of the classifiers that are fused, without repetitions.
+
+        Args:
+            names: the wanted ones; by default the paper's two and the embedding, as far as the run has them, and all if
+                it has none of these.
+
+        Raises:
+            InputError: there is no name, or a classifier that the run does not have.
+        """
+        if names is None:
+            return tuple(name for name in (*THOR2, EMBEDDING) if name in self.classifiers) or tuple(self.classifiers)
+        if not isinstance(names, (list, tuple)) or not names or not set(names) <= set(self.classifiers):
+            raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(self.classifiers)}")
+        return tuple(dict.fromkeys(names))
 
     def answers_by(self, answer_by: str | None = None) -> AnswerBy:
         """Return the source of the answers: "classifiers", "gallery" or "both".
@@ -125,7 +201,7 @@ class Model:
             answer_by: the wanted source; by default that of the model. Without classifiers it is always the gallery,
                 with an empty gallery always the classifiers, and otherwise both by default.
         """
-        wanted = check_answer_by(answer_by) or self.answer_by
+        wanted = _check_answer_by(answer_by) or self.answer_by
         if not self.classifiers:
             return "gallery"
         if not self.gallery.objects:
@@ -145,10 +221,12 @@ class Model:
         """
         if self.unknown_below is not None:
             return np.full(len(self.names), self.unknown_below)
-        thresholds = self.union.of_gallery(self.gallery.unknown_below[None])[0]
+        thresholds = self.gallery.of_gallery(self.gallery.unknown_below[None])[0]
         if self.answers_by(answer_by) == "gallery":
             return thresholds
-        return np.where(self.union.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds)
+        return np.where(
+            self.gallery.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds
+        )
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
         """Return an instance with the colours that `color_transform` makes of those of the camera."""
@@ -179,5 +257,5 @@ class Model:
             scores: [B, n_objects] of the gallery; None if the classifiers alone answer.
         """
         if scores is None:
-            return self.union.of_classifiers(self.fused(probabilities))
-        return self.union.combine(self.fused(probabilities) if probabilities else None, scores)
+            return self.gallery.of_classifiers(self.fused(probabilities))
+        return self.gallery.combine(self.fused(probabilities) if probabilities else None, scores)

@@ -1,25 +1,19 @@
-"""Records of recognition: the described instances of a frame, the answers, and where the objects are."""
+"""The answers for the instances of a frame, and where the objects are."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from thor2_jax.descriptor.looks import LookDescriptors
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
     "MAX_OVERFLOW",
     "AnswerBy",
     "Box",
-    "DescribedFrame",
     "Detection",
     "Recognition",
-    "check_answer_by",
     "detections_as_json",
     "detections_of",
 ]
@@ -64,46 +58,6 @@ class Recognition:
     points_used: int = 0
     kept_by_fallback: bool = False
     reason: str | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class DescribedFrame:
-    """The instances of a frame and the descriptors of those that can be used.
-
-    Attributes:
-        instances: every instance, in the order of the label numbers.
-        oriented: descriptors of all looks, as NumPy arrays with one row for each of `usable`, padded to a batch
-            bucket.
-    """
-
-    instances: Sequence[PreparedInstance]
-    oriented: LookDescriptors
-
-    @property
-    def descriptors(self) -> Descriptors:
-        """The descriptors of the first look, the paper's."""
-        return self.oriented.first
-
-    @property
-    def usable(self) -> list[PreparedInstance]:
-        """The instances that were described, in the order of the rows."""
-        return [instance for instance in self.instances if instance.reason is None]
-
-    @property
-    def packed(self) -> PointClouds:
-        """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, self.oriented.shape[0])
-
-
-def check_answer_by(value: str | None) -> AnswerBy | None:
-    """Return the source of the answers, or None if it is not given.
-
-    Raises:
-        InputError: it is unknown.
-    """
-    if value not in (None, *get_args(AnswerBy)):
-        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
-    return cast(AnswerBy | None, value)
 
 
 class Box(NamedTuple):

@@ -26,7 +26,6 @@ __all__ = [
     "category_numbers",
     "check_no_foreign_results",
     "image_numbers",
-    "instances_as_json",
     "is_bop_file",
     "is_coco_file",
     "write_recognitions",
@@ -36,11 +35,6 @@ RESULT_FILES = ("recognition.json", "overlay.png")
 
 BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 _IDENTITY = "1 0 0 0 1 0 0 0 1"
-
-
-def instances_as_json(recognitions: Sequence[Recognition]) -> list[dict[str, Any]]:
-    """Return the answers for the instances of a frame as JSON values, one object per instance."""
-    return [dataclasses.asdict(recognition) for recognition in recognitions]
 
 
 def check_no_foreign_results(out: Path) -> None:
@@ -71,7 +65,8 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
         OSError: A file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / RESULT_FILES[0], json.dumps(instances_as_json(recognitions), indent=1) + "\n")
+    instances = [dataclasses.asdict(recognition) for recognition in recognitions]
+    write_text(out / RESULT_FILES[0], json.dumps(instances, indent=1) + "\n")
     draw_overlay(frame.color, frame.label_image, recognitions, out / RESULT_FILES[1])
 
 

@@ -39,11 +39,18 @@ from thor2_jax.files import (
     unpack_arrays,
 )
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
-from thor2_jax.model.classifier import Classifier, Feature, check_features
 from thor2_jax.model.run_record import RUN_FILE, RUN_FORMAT, read_description
-from thor2_jax.networks import MLP, model_arrays, model_from_arrays
+from thor2_jax.networks import (
+    MLP,
+    Classifier,
+    Feature,
+    check_features,
+    input_size,
+    model_arrays,
+    model_from_arrays,
+)
 
-__all__ = ["EMBEDDING_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
+__all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file"]
 
 EMBEDDING_FILE = "embedding.safetensors"
 """Embedding of a run directory, in place of the packaged one."""
@@ -75,12 +82,6 @@ class TrainedRun:
         if self.embedding is None or not self.classes or self.embedding.classes != self.classes:
             return None
         return self.embedding.class_probabilities
-
-
-def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> int:
-    """Return the number of floats in a descriptor."""
-    image, embedding = config.image_size**2, n_regions * config.n_strips
-    return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
 
 
 def save_run(run: TrainedRun, path: str | Path) -> None:

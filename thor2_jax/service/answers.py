@@ -15,12 +15,12 @@ from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.model.classifier import THOR2
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.networks import THOR2
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
@@ -68,11 +68,11 @@ def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
     """Return the JSON records of all objects that may be answered."""
-    union, enrolled = objects.gallery.union, objects.gallery.objects
+    gallery = objects.gallery
     answers = []
-    for name, is_trained in zip(union.names, union.has_output, strict=True):
+    for name, is_trained in zip(gallery.answered_names, gallery.has_output, strict=True):
         about: dict[str, Any] = {"views": 0, "source": None, "date": None}
-        if (views := enrolled.get(name)) is not None:
+        if (views := gallery.objects.get(name)) is not None:
             about = {"views": len(views.clouds), "source": views.source, "date": views.date}
         answers.append(schemas.ObjectAnswer(name=name, trained=bool(is_trained), **about))
     return answers
@@ -120,7 +120,7 @@ def calibrated_confidence(model: Model, recognition: Recognition, inference: Inf
         recognition: the answer for the cloud.
         inference: the outputs of the model for it, without the axis of the batch.
     """
-    if model.answers_by() != "classifiers" or model.union.hidden:
+    if model.answers_by() != "classifiers" or model.gallery.hidden:
         return None
     if model.calibration is not None:
         return recognition.confidence

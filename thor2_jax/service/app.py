@@ -149,7 +149,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
-            knows=service.engine.model.union.summary,
+            knows=service.engine.model.gallery.summary,
             label_map=prepared.label_map,
             adaptation=adaptation_answer(service.engine.adaptation),
             timings=admitted.milliseconds(),
@@ -205,7 +205,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         current, run = service.engine.model, service.engine.run
         return schemas.ModelAnswer(
             classes=list(current.names),
-            knows=current.union.summary,
+            knows=current.gallery.summary,
             classifiers=list(current.classifiers),
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),

@@ -22,7 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model

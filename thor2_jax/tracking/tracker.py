@@ -30,7 +30,7 @@ from scipy.special import softmax
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
-from thor2_jax.model.inference import Inference, answers, gallery_scores
+from thor2_jax.model.inference import Inference, answers, object_scores
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.viewpoints import (
     NextView,
@@ -318,7 +318,7 @@ class Tracker:
         """Add the rows of an inference to those of the tracks, weighted by the clouds that were described."""
         model = self._recognizer.model
         inference = jax.tree.map(lambda a: np.asarray(a)[: len(tracks)], inference)
-        scores = gallery_scores(model, inference)
+        scores = object_scores(model, inference)
         for row, track in enumerate(tracks):
             track.overflow = int(inference.overflow[row])
             fits = track.overflow <= MAX_OVERFLOW * len(track.instance.points)

@@ -22,9 +22,9 @@ from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import compiled
+from thor2_jax.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step

@@ -45,7 +45,7 @@ def explain(
         frame = source.read()
         labels = frame.instances if instance is None else instance
         if not len(labels):
-            print(escape_characters(f"skipped: {source.name}: it has no instances"), file=sys.stderr)
+            print_note(f"skipped: {source.name}: it has no instances")
         for label in labels:
             directory = out / source.name / str(label)
             check_no_foreign_files(directory)

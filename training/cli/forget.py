@@ -19,5 +19,5 @@ def forget(
 
     recognizer = Recognizer.load(model, gallery=gallery)
     recognizer.forget(name)
-    knows = f"{name} is forgotten; {model} knows {recognizer.model.union.summary}"
+    knows = f"{name} is forgotten; {model} knows {recognizer.gallery.summary}"
     finish(knows, "teach it again", "enroll", name, "FRAME", "--model", model)

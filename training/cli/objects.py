@@ -37,10 +37,10 @@ def objects(
     description = read_description(model)
     trained, embedding = tuple(description["classes"]), description.get("embedding")
     directory = model / GALLERY_DIRECTORY if gallery is None else gallery
-    known = load_gallery(directory, None if embedding is None else str(embedding))
-    union = dataclasses.replace(known, trained=trained).union
+    stored = load_gallery(directory, None if embedding is None else str(embedding))
+    known = dataclasses.replace(stored, trained=trained)
     table = Table("name", "views", "source", "enrolled")
-    for name in union.names:
+    for name in known.answered_names:
         sources, views, date = [], "", ""
         if name in trained and name not in known.hidden:
             sources.append("training")
@@ -49,4 +49,4 @@ def objects(
             sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    finish(f"{model} knows {union.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)
+    finish(f"{model} knows {known.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)

@@ -165,8 +165,8 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.model.classifier import check_features
     from thor2_jax.model.run_record import RUN_FILE
+    from thor2_jax.networks import check_features
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color
 from thor2_jax.descriptor.describe import describe_strips
-from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, is_color
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks import EmbeddingSizes, class_cosines, projected_features

@@ -25,8 +25,8 @@ import thor2_jax
 import training
 from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest

@@ -17,13 +17,12 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
-from thor2_jax.model.classifier import EMBEDDING
-from thor2_jax.model.inference import gallery_scores, infer
+from thor2_jax.model.inference import infer, object_scores
 from thor2_jax.model.model import Model
-from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
-from thor2_jax.recognizer import Recognizer
+from thor2_jax.networks import EMBEDDING
+from thor2_jax.recognizer import DescribedFrame, Recognizer
 from training.baselines.baseline import BaselineInputs, baseline_file
 from training.baselines.image_baselines import TEMPLATES
 from training.baselines.job import NETWORKS, TITLES, TrainedBaseline, load_baselines
@@ -109,16 +108,16 @@ class Run:
         model = self.model
         clouds = described.packed if GALLERY in self.predictors and described.usable else None
         inference = jax.tree.map(np.asarray, infer(model, described.oriented, clouds, tuple(model.classifiers)))
-        default = {name: inference.probabilities[name] for name in model.classifiers.default}
+        default = {name: inference.probabilities[name] for name in model.chosen_classifiers()}
         values = dict(inference.probabilities)
         if EMBEDDING in default:
             column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
             values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}
-        values = {name: model.union.of_classifiers(p) for name, p in values.items()}
+        values = {name: model.gallery.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
-            scores = gallery_scores(model, inference)
+            scores = object_scores(model, inference)
             if scores is None:  # no instance is usable
                 scores = np.zeros((len(inference.overflow), len(model.gallery.names)), np.float32)
             values[GALLERY] = model.combined({}, scores)

@@ -14,12 +14,11 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, logit
 from sklearn.linear_model import LogisticRegression
 
-from thor2_jax.model.classifier import EMBEDDING, feature_of
 from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import MLP
+from thor2_jax.networks import EMBEDDING, MLP, feature_of
 from thor2_jax.types import Cloud
 from training.fitting.fit import FitContext, describe_batch
 from training.fitting.samples import Batch, Samples

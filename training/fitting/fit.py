@@ -25,13 +25,10 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips
-from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
+from thor2_jax.descriptor.describe import BATCH_AXIS, batch_mesh, describe_strips
 from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.errors import InputError
-from thor2_jax.model.classifier import Feature, feature_of
-from thor2_jax.model.run_directory import input_size
-from thor2_jax.networks import MLP
+from thor2_jax.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Descriptors
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
 from training.fitting.samples import Batch, Samples, expand

@@ -26,11 +26,12 @@ from thor2_jax.adaptation.estimate import (
     gallery_classifier,
     objective,
     posterior_mean,
+    transform_colors,
 )
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.frames.color_transform import ColorTransform, transform_colors
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FusionRule, fused_probabilities
+from thor2_jax.model.model import ColorTransform
 from thor2_jax.recognizer import Recognizer
 
 run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), seed=1))

@@ -15,15 +15,15 @@ from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor import sharding
-from thor2_jax.descriptor.sharding import batch_mesh, describe_sharded, shard_clouds
+from thor2_jax.descriptor import describe
+from thor2_jax.descriptor.describe import batch_mesh, describe_sharded, shard_clouds
 
 _CLOUDS = """
 import json, sys
 import numpy as np
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.sharding import batch_mesh, describe_sharded, shard_clouds
+from thor2_jax.descriptor.describe import batch_mesh, describe_sharded, shard_clouds
 import jax
 
 def clouds(count):
@@ -66,7 +66,7 @@ np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.Descriptor
 
 def test_each_device_describes_its_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a function that compiles at once in place of `describe`, and one device."""
-    monkeypatch.setattr(sharding, "describe", lambda clouds, network, config: (clouds.points * config.alpha, clouds))
+    monkeypatch.setattr(describe, "describe", lambda clouds, network, config: (clouds.points * config.alpha, clouds))
     config = dataclasses.replace(SMALL_CONFIG, alpha=0.3)  # of no other test
     network, packed = colornet.load_default(), thor2.PointClouds.pack([aligned_cloud(k, 100) for k in range(3)])
     turned, clouds = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)

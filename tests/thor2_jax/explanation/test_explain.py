@@ -17,8 +17,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.descriptor.relaxation import relaxed_strips
-from thor2_jax.descriptor.slicing import region_sets
+from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
 from thor2_jax.explanation import attributions
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
@@ -188,7 +187,7 @@ def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> f
     config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
     aligned = scores.orient(instance)
     weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
-    constant = region_sets(NETWORK), config, jnp.zeros((), jnp.int32), weights
+    constant = region_sets(NETWORK), config, weights
     cut = [
         relaxed_strips(aligned.points[k].T, aligned.colors[k], aligned.mask[k], *constant) for k in range(scores.count)
     ]
@@ -215,13 +214,13 @@ def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
     aligned = thor2.align(pack_instances([instance], 1), config)
     cloud = jax.tree.map(lambda a: a[0], aligned)
     some = jnp.arange(len(cloud.mask)) % 3 > 0
-    sets, overflow = region_sets(NETWORK), jnp.zeros((), jnp.int32)
+    sets = region_sets(NETWORK)
 
     @jax.jit
     def both(some: jax.Array) -> tuple[thor2.Strips, thor2.Strips]:
         arguments = cloud.points.T, cloud.colors
-        weighted = relaxed_strips(*arguments, cloud.mask, sets, config, overflow, some.astype(jnp.float32))
-        return weighted, relaxed_strips(*arguments, cloud.mask & some, sets, config, overflow)
+        weighted = relaxed_strips(*arguments, cloud.mask, sets, config, some.astype(jnp.float32))
+        return weighted, relaxed_strips(*arguments, cloud.mask & some, sets, config)
 
     weighted, masked = both(some)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), weighted, masked)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from failures import Pickled
 from PIL import Image
+from refusals import assert_refused
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_depth
 from thor2_jax.frames.prepared_instance import instance_cloud
 
@@ -74,20 +74,17 @@ def test_floats_in_exr(tmp_path: Path, channels: dict[str, np.ndarray], expected
 
 def test_invalid_exr_files(tmp_path: Path) -> None:
     write_exr(tmp_path / "two.exr", left=METRES, right=METRES)
-    with pytest.raises(InputError, match=r"^depth: .*two\.exr has the channels left, right"):
-        read_depth(tmp_path / "two.exr")
+    assert_refused(r"^depth: .*two\.exr has the channels left, right", read_depth, tmp_path / "two.exr")
     whole = (tmp_path / "two.exr").read_bytes()
     for content in (b"", b"no EXR", whole[:50], whole[: len(whole) // 2]):
         (tmp_path / "bad.exr").write_bytes(content)
-        with pytest.raises(InputError, match=r"^depth: .*bad\.exr is a damaged EXR file"):
-            read_depth(tmp_path / "bad.exr")
+        assert_refused(r"^depth: .*bad\.exr is a damaged EXR file", read_depth, tmp_path / "bad.exr")
 
 
 def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "d.exr").write_bytes(b"")
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(InputError, match=r"^depth: .*d\.exr is an EXR file; expected .*OpenEXR"):
-        read_depth(tmp_path / "d.exr")
+    assert_refused(r"^depth: .*d\.exr is an EXR file; expected .*OpenEXR", read_depth, tmp_path / "d.exr")
 
 
 @pytest.mark.parametrize(
@@ -104,8 +101,7 @@ def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 )
 def test_arrays_that_are_no_depth(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "d.npy", array)
-    with pytest.raises(InputError, match=r"^depth: .*d\.npy has "):
-        read_depth(tmp_path / "d.npy")
+    assert_refused(r"^depth: .*d\.npy has ", read_depth, tmp_path / "d.npy")
 
 
 def npy_file(array: np.ndarray) -> bytes:
@@ -119,11 +115,9 @@ def test_damaged_npy_files(tmp_path: Path) -> None:
     huge = whole.replace(b"(5, 7), }" + b" " * 12, b"(1048576, 1048576), }")
     for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[Pickled()]], object))):
         (tmp_path / "d.npy").write_bytes(content)
-        with pytest.raises(InputError, match=r"^depth: .*d\.npy "):
-            read_depth(tmp_path / "d.npy")
+        assert_refused(r"^depth: .*d\.npy ", read_depth, tmp_path / "d.npy")
     (tmp_path / "d.npy").write_bytes(huge)
-    with pytest.raises(InputError, match="expected at most"):
-        read_depth(tmp_path / "d.npy")
+    assert_refused("expected at most", read_depth, tmp_path / "d.npy")
 
 
 def frame(depth: np.ndarray, scale: float = 1000.0) -> RGBDFrame:

@@ -148,8 +148,7 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
     path.write_text(json.dumps(entries))
     assert frame_intrinsics(path, tmp_path / "000012.png").fx == 512
     for name in ("000002.png", "color.png"):
-        with pytest.raises(InputError, match="has 2 images and none has the number"):
-            frame_intrinsics(path, tmp_path / name)
+        assert_refused("has 2 images and none has the number", frame_intrinsics, path, tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -198,8 +197,7 @@ def test_invalid_npy_files() -> None:
         as_npy(MATRIX + 0j),
         as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
     ):
-        with pytest.raises(InputError, match=r"^intrinsics[ .]"):
-            parse_intrinsics(content)
+        assert_refused(r"^intrinsics[ .]", parse_intrinsics, content)
 
 
 def test_the_size_of_the_images_is_checked() -> None:
@@ -248,8 +246,7 @@ def test_zero_coefficients_are_no_distortion() -> None:
     ],
 )
 def test_other_distortion_models_are_refused_by_name(values: Any, name: str) -> None:
-    with pytest.raises(InputError, match=rf"^intrinsics has the distortion model .*{name}.*; expected plumb_bob"):
-        Intrinsics.of(values)
+    assert_refused(rf"^intrinsics has the distortion model .*{name}.*; expected plumb_bob", Intrinsics.of, values)
 
 
 @pytest.mark.parametrize("distortion", [(-9.0, 0, 0, 0), (0.0, 0, 80, 0), (0, 0, 0, 0, 0, -5.0, 0, 0)])

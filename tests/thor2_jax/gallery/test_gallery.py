@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import threadpoolctl
+from refusals import assert_refused
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
@@ -124,10 +125,8 @@ def test_scores_of_orientations_are_averaged(gallery: Gallery) -> None:
 
 
 def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
-    with pytest.raises(InputError, match="'bowl'"):
-        gallery.with_object("bowl", enrolled(1))
-    with pytest.raises(InputError, match="extend and replace"):
-        gallery.with_object("bowl", enrolled(1), extend=True, replace=True)
+    assert_refused("'bowl'", gallery.with_object, "bowl", enrolled(1))
+    assert_refused("extend and replace", gallery.with_object, "bowl", enrolled(1), extend=True, replace=True)
     extended = gallery.with_object("bowl", enrolled(1, 5), extend=True)
     replaced = gallery.with_object("bowl", enrolled(1, 5), replace=True)
     assert [len(g.objects["bowl"].embeddings) for g in (gallery, extended, replaced)] == [24, 29, 5]
@@ -137,19 +136,16 @@ def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
 
 def test_a_trained_class_needs_extend_or_replace(gallery: Gallery) -> None:
     gallery = dataclasses.replace(gallery, trained=("a", "b", "c"))
-    with pytest.raises(InputError, match="'a' is a trained class"):
-        gallery.with_object("a", enrolled(1))
+    assert_refused("'a' is a trained class", gallery.with_object, "a", enrolled(1))
     changed = gallery.with_object("a", enrolled(1), extend=True).with_object("b", enrolled(1), replace=True)
-    assert changed.hidden == ("b",) and changed.union.names == ("a", "c", *gallery.names, "b")
+    assert changed.hidden == ("b",) and changed.answered_names == ("a", "c", *gallery.names, "b")
 
 
 def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:
-    with pytest.raises(InputError, match="'cup'"):
-        gallery.without("cup")
+    assert_refused("'cup'", gallery.without, "cup")
     hidden = dataclasses.replace(gallery, trained=("cup",)).without("cup")
     assert hidden.hidden == ("cup",) and hidden.names == gallery.names
-    with pytest.raises(InputError, match="'cup'"):
-        hidden.without("cup")
+    assert_refused("'cup'", hidden.without, "cup")
 
 
 NO_NAMES = ["", " ", "a\nb", "x" * 201, 3, ".", "..", "a/../b", "unknown", " Unknown", "mug\u200b", "\u3164", "\ud800"]
@@ -157,14 +153,12 @@ NO_NAMES = ["", " ", "a\nb", "x" * 201, 3, ".", "..", "a/../b", "unknown", " Unk
 
 @pytest.mark.parametrize("name", NO_NAMES)
 def test_names_are_visible_and_not_reserved(name: str, gallery: Gallery) -> None:
-    with pytest.raises(InputError, match="name is"):
-        gallery.with_object(name, enrolled(0))
+    assert_refused("name is", gallery.with_object, name, enrolled(0))
 
 
 @pytest.mark.parametrize("same", ["mug ", " mug", "m\u0075g\t"])
 def test_names_that_look_alike_are_one_object(same: str, gallery: Gallery) -> None:
-    with pytest.raises(InputError, match="'mug' is enrolled already"):
-        gallery.with_object(same, enrolled(0))
+    assert_refused("'mug' is enrolled already", gallery.with_object, same, enrolled(0))
     cafe = gallery.with_object("cafe\u0301 ", enrolled(0))
     assert cafe.names[-1] == "caf\u00e9"
     assert cafe.with_object("cafe\u0301", enrolled(0), extend=True).names == cafe.names
@@ -184,8 +178,7 @@ def test_compact_clouds_keep_points_to_0_05_mm() -> None:
 
 def test_clouds_without_points_or_too_large_are_refused() -> None:
     empty = dataclasses.replace(view(0), points=np.zeros((0, 3), np.float32), reason="too few")
-    with pytest.raises(InputError, match=r"views\[1\] has no points"):
-        CompactClouds.of([view(0), empty])
+    assert_refused(r"views\[1\] has no points", CompactClouds.of, [view(0), empty])
     with pytest.raises(InputError, match=r"views\[0\] is .* m long"):
         CompactClouds.of([dataclasses.replace(view(0), points=view(0).points * 50)])
 
@@ -208,8 +201,7 @@ def test_exact_search_in_chunks_equals_one_product(monkeypatch: pytest.MonkeyPat
 
 
 def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
-    with pytest.raises(InputError, match="search is 'faiss'"):
-        Gallery("", search="faiss")
+    assert_refused("search is 'faiss'", Gallery, "", search="faiss")
     pytest.importorskip("usearch")
     queries = np.concatenate([views_around(k, 3, seed=2) for k in range(3)]).astype(np.float32)
     indexed = dataclasses.replace(gallery, search="usearch")

@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.testing import assert_array_equal
+from refusals import assert_refused
 
-from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
 
 VIEWS = np.eye(4, dtype=np.float16)[[0, 1, 2]]
@@ -28,14 +27,11 @@ def test_references_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ("other", 4, "of another embedding.*copy both files"),
         ("print", 5, "embeddings are float16"),
     ):
-        with pytest.raises(InputError, match=message):
-            References.load(path, fingerprint, size)
+        assert_refused(message, References.load, path, fingerprint, size)
     path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match="cannot be used"):
-        References.load(path, "print", 4)
+    assert_refused("cannot be used", References.load, path, "print", 4)
     References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(path, "print")
-    with pytest.raises(InputError, match="out of range"):
-        References.load(path, "print", 4)
+    assert_refused("out of range", References.load, path, "print", 4)
 
 
 def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from unittest import mock
 import numpy as np
 import pytest
 import safetensors.numpy
+from refusals import assert_refused
 from written_files import files_of
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
@@ -129,8 +129,7 @@ UNDO_FAULTS: dict[str, Callable[[Path], object]] = {
 def test_undo_refuses_in_one_line_and_changes_nothing(fault: str, directory: Path) -> None:
     UNDO_FAULTS[fault](directory)
     before = files_of(directory)
-    with pytest.raises(InputError, match="generation is 2"):
-        update_gallery(directory, undo(directory, 2), FINGERPRINT)
+    assert_refused("generation is 2", update_gallery, directory, undo(directory, 2), FINGERPRINT)
     assert files_of(directory) == before
 
 
@@ -163,8 +162,7 @@ def test_a_failed_change_leaves_the_gallery_as_it_was(
 def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
     before = files_of(directory)
     for act in (lambda: load_gallery(directory, "0" * 64), lambda: update_gallery(directory, add("x", 1), "0" * 64)):
-        with pytest.raises(InputError, match="embedding ffffffff.*00000000"):
-            act()
+        assert_refused("embedding ffffffff.*00000000", act)
     assert files_of(directory) == before
 
 
@@ -278,8 +276,7 @@ def test_damage_is_refused_in_one_line(damage: str, directory: Path) -> None:
     DAMAGES[damage](directory)
     before = files_of(directory)
     for act in (lambda: load_gallery(directory), lambda: update_gallery(directory, add("new", 5), FINGERPRINT)):
-        with pytest.raises(InputError, match=f"^gallery: .*{directory}"):
-            act()
+        assert_refused(f"^gallery: .*{directory}", act)
     assert files_of(directory) == before
 
 
@@ -366,6 +363,5 @@ def test_a_writer_that_waits_too_long_gives_up(directory: Path) -> None:
         update_gallery(directory, add("inner", 1), FINGERPRINT, lock_seconds=0.1)
         return gallery
 
-    with pytest.raises(InputError, match="another process"):
-        update_gallery(directory, nested, FINGERPRINT, lock_seconds=0.1)
+    assert_refused("another process", update_gallery, directory, nested, FINGERPRINT, lock_seconds=0.1)
     assert files_of(directory) == before

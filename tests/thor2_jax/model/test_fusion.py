@@ -124,7 +124,7 @@ def test_damaged_records_are_refused(record: Any) -> None:
 def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
     run = untrained_embedding_run(("a", "b", "c"), ("tops", "tops2"))
     recognizer = thor2.Recognizer(dataclasses.replace(run, record={"calibration": RECORD}))
-    assert recognizer.model.classifiers.default == ("tops", "tops2", "embedding")
+    assert recognizer.model.chosen_classifiers() == ("tops", "tops2", "embedding")
     np.testing.assert_array_equal(recognizer.model.thresholds(), [0.3] * 3)
     np.testing.assert_array_equal(thor2.Recognizer(recognizer.run, 0.0).model.thresholds(), [0] * 3)
     np.testing.assert_array_equal(thor2.Recognizer(run).model.thresholds(), [0] * 3)
@@ -132,13 +132,13 @@ def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
     np.testing.assert_allclose(recognizer.model.fused(probabilities), CALIBRATION.calibrated(FUSED, EMBEDDED))
     # The embedding of another run is no classifier.
     other = thor2.Recognizer(dataclasses.replace(run, classes=("a", "b", "d")))
-    assert other.model.classifiers.default == ("tops", "tops2")
+    assert other.model.chosen_classifiers() == ("tops", "tops2")
 
 
 @pytest.mark.parametrize("rule", FUSION_RULES)
 def test_an_embedding_alone_answers_alike_under_every_rule(rule: FusionRule) -> None:
     recognizer = thor2.Recognizer(untrained_embedding_run(("a", "b", "c"), record={"calibration": RECORD}), rule=rule)
-    assert tuple(recognizer.model.classifiers) == recognizer.model.classifiers.default == ("embedding",)
+    assert tuple(recognizer.model.classifiers) == recognizer.model.chosen_classifiers() == ("embedding",)
     conditional = EMBEDDED / EMBEDDED.sum(axis=1, keepdims=True)
     expected = CALIBRATION.calibrated(conditional, EMBEDDED)
     np.testing.assert_allclose(recognizer.model.fused({"embedding": EMBEDDED}), expected, rtol=1e-6, atol=1e-12)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from failures import full_disk
+from refusals import assert_refused
 from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import colornet
@@ -71,8 +72,7 @@ def test_an_existing_path_is_refused(saved: Path, tmp_path: Path) -> None:
     before = (saved / "run.json").read_bytes()
     (tmp_path / "file").write_text("x")
     for existing in (saved, tmp_path / "file"):
-        with pytest.raises(thor2.InputError, match=f"out: {existing} "):
-            save_run(make_run(), existing)
+        assert_refused(f"out: {existing} ", save_run, make_run(), existing)
     assert (saved / "run.json").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
@@ -182,17 +182,14 @@ def test_a_run_without_classifiers_needs_its_embedding(tmp_path: Path) -> None:
     save_run(dataclasses.replace(run, classes=("b", "a")), tmp_path / "renamed")
     other = dataclasses.replace(run.embedding, further=())
     other.save(tmp_path / "run" / "embedding.safetensors")
-    with pytest.raises(thor2.InputError, match=r"^model: .*embedding\.safetensors is not the embedding [^\n]*$"):
-        load_run(tmp_path / "run")
+    assert_refused(r"^model: .*embedding\.safetensors is not the embedding [^\n]*$", load_run, tmp_path / "run")
     (tmp_path / "run" / "embedding.safetensors").unlink()
     for name, expected in (("run", "is missing"), ("renamed", "does not recognize the classes")):
-        with pytest.raises(thor2.InputError, match=rf"^model: .*embedding\.safetensors {expected}.*[^\n]*$"):
-            load_run(tmp_path / name)
+        assert_refused(rf"^model: .*embedding\.safetensors {expected}.*[^\n]*$", load_run, tmp_path / name)
     views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
     save_run(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)), tmp_path / "own")
     (tmp_path / "own" / REFERENCES_FILE).unlink()
-    with pytest.raises(thor2.InputError, match=r"^model: .*references\.safetensors is missing; copy [^\n]*$"):
-        load_run(tmp_path / "own")
+    assert_refused(r"^model: .*references\.safetensors is missing; copy [^\n]*$", load_run, tmp_path / "own")
     # Beside classifiers, an embedding is not needed.
     save_run(dataclasses.replace(untrained_run(("a", "b")), embedding=None), tmp_path / "paper")
     assert load_run(tmp_path / "paper").embedding_classifier is None

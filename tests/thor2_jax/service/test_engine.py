@@ -15,10 +15,10 @@ import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
-from thor2_jax.frames.color_transform import ColorTransform
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
+from thor2_jax.model.model import ColorTransform
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
 from thor2_jax.service.engine import CloudResult, InferenceEngine

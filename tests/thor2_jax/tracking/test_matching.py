@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
 from thor2_jax.tracking.viewpoints import check_pose, merge_views
@@ -58,8 +58,7 @@ def test_a_match_has_the_largest_total_overlap() -> None:
     ],
 )
 def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
-    with pytest.raises(InputError, match="camera_pose"):
-        check_pose(pose, "camera_pose")  # type: ignore[arg-type]
+    assert_refused("camera_pose", check_pose, pose, "camera_pose")
 
 
 def test_merged_clouds_coincide_in_space() -> None:

@@ -9,7 +9,7 @@ from commands import Command, Recognize, json_lines
 from small_runs import SMALL_CONFIG, untrained_run
 from small_runs import small_embedding as embedding_of_tests
 
-from thor2_jax.gallery import embedding, objects
+from thor2_jax.gallery import embedding, enrollment
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.networks import EmbeddingSizes
@@ -53,7 +53,7 @@ def small_embedding() -> Iterator[None]:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
     small = embedding_of_tests()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (embedding, objects, models):
+        for module in (embedding, enrollment, models):
             patch.setattr(module, "load_default", lambda: small)
         patch.setattr(mesh_views, "MESH_VIEWS", 1)
         yield

@@ -13,7 +13,7 @@ from small_runs import untrained_run
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.estimate import Adaptation
-from thor2_jax.frames.color_transform import ColorTransform
+from thor2_jax.model.model import ColorTransform
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.runs import load_runs

@@ -16,8 +16,8 @@ from written_files import files_of
 
 import colornet
 from thor2_jax.files import temporary_directory
-from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.networks import FEATURES
 from training import protocol, train_job
 from training.objects.builtin_objects import builtin_objects
 from training.protocol import DEFAULT, PAPER, QUICK

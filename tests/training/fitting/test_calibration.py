@@ -14,11 +14,9 @@ from small_runs import SMALL_CONFIG, untrained_embedding_run
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.model.classifier import Feature, feature_of
 from thor2_jax.model.fusion import Calibration, with_temperature
 from thor2_jax.model.inference import Inference
-from thor2_jax.model.run_directory import input_size
-from thor2_jax.networks import MLP
+from thor2_jax.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.fit import FitContext

@@ -12,8 +12,7 @@ from refusals import assert_refused
 from slow_tier import slow
 
 import thor2_jax as thor2
-from thor2_jax.model.classifier import FEATURES, check_features, feature_of
-from thor2_jax.networks import HIDDEN, MLP, SPARSE_BATCH
+from thor2_jax.networks import FEATURES, HIDDEN, MLP, SPARSE_BATCH, check_features, feature_of
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))
