@@ -7,7 +7,7 @@
 >>> network.similarity.shape
 (22, 22)
 
-`build` makes the same network from scratch (about ten seconds); `colornet.draw` draws it.
+`build` builds the same network from scratch (about ten seconds); `colornet.draw` draws it.
 """
 
 import functools

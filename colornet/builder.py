@@ -46,7 +46,7 @@ _N_CUBES = (3, 8)  # chroma, hue
 _OVERLAP = (0.10, 0.25)
 
 _MIN_SHARED = 0.95
-"""Share of the smaller node's colours above which two nodes can be redundant."""
+"""Fraction of the smaller node's colours above which two nodes can be redundant."""
 
 
 def lens(lab: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,7 +75,7 @@ def hyab_neighbors(lab: NDArray[np.float64], radius: float) -> csr_array:
 
 
 class HyabDBSCAN:
-    """DBSCAN of CIELAB colours with the HyAB distance; has those methods of an estimator that kmapper calls."""
+    """DBSCAN of CIELAB colours with the HyAB distance; it has the methods of an estimator that kmapper calls."""
 
     def get_params(self) -> dict[str, Any]:
         """Return the parameters; kmapper skips cubes with fewer than `min_samples` colours."""
@@ -84,7 +84,7 @@ class HyabDBSCAN:
     def fit_predict(self, lab: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cluster of each colour, [n, 3] CIELAB to [n] int64; -1 for noise."""
         graph = hyab_neighbors(lab, EPS)
-        # Colours are distinct: no other stored distance is 0, and an explicit diagonal completes the graph.
+        # Colours are distinct, so no other stored distance is 0; an explicit diagonal completes the graph.
         graph.setdiag(0.0)
         graph = sort_graph_by_row_values(graph, warn_when_not_sorted=False)
         clusterer = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed")
@@ -111,7 +111,7 @@ def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDAr
 
 
 def _cyclic_pairs(names: list[str], cover: Any, values: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return all pairs of a node in the first and one in the last hue interval of the same chroma interval."""
+    """Return all pairs of nodes in the first and in the last hue interval of the same chroma interval."""
     # Names of nodes (cube3_cluster0) number non-empty cubes only; the position of a cube among all centres gives its
     # intervals.
     rows = np.column_stack([np.arange(len(values)), values])
@@ -160,12 +160,12 @@ def merge_redundant(
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
     """Merge redundant nodes.
 
-    Two nodes are redundant if they share more than 95 % of the members of the smaller one and the HyAB distance of
-    their mean colours is at most `eps`.
+    Two nodes are redundant if they share more than 95 % of the smaller node's members and the HyAB distance of their
+    mean colours is at most `eps`.
 
     Args:
         colors: [n, 3] uint8, sRGB.
-        members: for each node the sorted rows of `colors` in it, int64 [m].
+        members: sorted rows of `colors` in each node, int64 [m].
         eps: largest HyAB distance of mean colours.
 
     Returns:
@@ -208,6 +208,6 @@ def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.f
     """
     graph = csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n_regions, n_regions))
     lengths = dijkstra(graph, directed=False)
-    # Lengths are summed along the path: the minimum of both directions makes the matrix exactly symmetric.
+    # Lengths are summed along the path, so the minimum of both directions makes the matrix exactly symmetric.
     lengths = np.minimum(lengths, lengths.T)
     return np.asarray(1.0 / (1.0 + lengths))

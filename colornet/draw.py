@@ -61,8 +61,8 @@ def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64]
     Args:
         axes: matplotlib axes.
         network: the colour network.
-        weights: [R] points in each region, at least 0. If given, the areas of the discs grow with them, and regions
-            without points, and their edges, are pale.
+        weights: [R] numbers of points in each region, at least 0. If given, they determine the areas of the discs, and
+            regions without points and their edges are pale.
     """
     a, b = to_lab(network.mean_rgb, MEAN_WHITE)[:, 1:].T
     used = np.ones(network.n_regions, bool) if weights is None else weights > 0
@@ -72,10 +72,10 @@ def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64]
         color, style = _EDGE_COLOR if used[i] and used[j] else _PALE_EDGE_COLOR, "--" if cyclic else "-"
         line: dict[str, Any] = {"linestyle": style, "linewidth": _width(weight), "solid_capstyle": "butt"}
         axes.plot(a[[i, j]], b[[i, j]], color=color, zorder=1, **line)
-    # Pale regions are opaque, so that no edge is seen through them.
+    # Pale regions are opaque, so that no edge is visible through them.
     faces = np.where(used[:, None], network.mean_rgb / 255, 0.75 + 0.25 * network.mean_rgb / 255)
     outlines = [_TEXT_COLOR if one else _PALE_EDGE_COLOR for one in used]
-    # The smallest discs last, in front of larger ones.
+    # Draw the smallest discs last, in front of larger discs.
     for r in np.argsort(-area):
         axes.scatter(a[r], b[r], s=area[r], color=faces[r], edgecolors=outlines[r], linewidths=0.8, zorder=2)
         text_color = _contrasting(255 * faces[r]) if used[r] else "#8a8a8a"
@@ -95,7 +95,7 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     n = network.n_regions
     figure = Figure(figsize=(9.6, 8.8))
     axes = figure.add_axes((0.09, 0.09, 0.77, 0.84))
-    # The diagonal is ten times as large as all other entries: masked, so that the colour scale covers the others.
+    # Mask the diagonal, which is ten times as large as the other entries, so that the colour scale covers these.
     off_diagonal = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
     axes.set_facecolor("#e4e4e4")
     image = axes.imshow(off_diagonal, cmap="viridis", norm=LogNorm())

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MAX_ARRAY_BYTES = 2**26
-"""Largest total size of the arrays in a file; compressed zeros need only a thousandth of it on disk."""
+"""Largest total size of the arrays in a file; compressed zeros take only a thousandth of this on disk."""
 
 
 _PREFIX = ".thor2-"
@@ -37,10 +37,10 @@ _MARKER, _MARKER_TEXT = ".thor2", b"Temporary directory of thor2. The next comma
 
 @contextlib.contextmanager
 def errors_name(path: str | Path) -> Iterator[None]:
-    """Name `path` in an OSError raised inside: a write to a full disk names no file.
+    """Add `path` to an OSError raised inside, since a failed write to a full disk names no file.
 
     Raises:
-        OSError: with the file's name.
+        OSError: the original error, with the file's name.
     """
     try:
         yield
@@ -49,7 +49,7 @@ def errors_name(path: str | Path) -> Iterator[None]:
 
 
 def open_file(path: str | Path) -> BinaryIO:
-    """Open a file to read; raise OSError also for a device, pipe or socket: reading it may never end."""
+    """Open a file to read; raise OSError for a device, pipe or socket, too, since reading it may never end."""
     stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
@@ -64,7 +64,7 @@ def read_file(path: str | Path) -> bytes:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise OSError if something other than a file has this name: replacing a device would remove it."""
+    """Raise OSError if something other than a file has this name, since replacing a device would remove it."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():
@@ -73,9 +73,9 @@ def check_replaceable(path: Path) -> None:
 
 @contextlib.contextmanager
 def temporary_directory(parent: str | Path) -> Iterator[Path]:
-    """Remove what killed processes left in `parent`, then yield a new hidden directory there; remove it at the end.
+    """Remove leftovers of killed processes in `parent`, then yield a new hidden directory there; remove it at the end.
 
-    Its name and a file in it, locked while it is in use, identify it as a temporary directory, see `remove_leftovers`.
+    The directory is identified by its name and by a file in it that is locked during use, see `remove_leftovers`.
     """
     remove_leftovers(Path(parent))
     directory = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
@@ -93,11 +93,11 @@ def temporary_directory(parent: str | Path) -> Iterator[Path]:
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary file to write to; on success it replaces `path`, readable by everyone.
 
-    On any error or interrupt the temporary file is removed, and an older file at `path` stays as it was.
+    On any error or interrupt, the temporary file is removed, and an older file at `path` is unchanged.
 
     Raises:
-        OSError: the folder does not exist or cannot be written, or a directory, device, pipe or socket has this name;
-            it names `path`.
+        OSError: the parent directory does not exist or cannot be written, or a directory, device, pipe or socket has
+            this name; the error names `path`.
     """
     path = Path(path)
     with errors_name(path):
@@ -115,12 +115,12 @@ def remove_leftovers(directory: Path) -> None:
     Directories in use and all other files stay, whatever their names.
     """
     for path in directory.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):  # another user's, or in use
+        with contextlib.suppress(OSError):  # owned by another user, or in use
             if not path.is_symlink() and (path / _MARKER).is_file():
-                with open(path / _MARKER, "r+b") as marker:  # network file systems lock no file that is only read
+                with open(path / _MARKER, "r+b") as marker:  # network file systems only lock files open for writing
                     fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_left = marker.read() == _MARKER_TEXT
-                if is_left:  # removed when its file is closed: network file systems keep an open one under another name
+                if is_left:  # remove it after closing the file, which network file systems would rename
                     shutil.rmtree(path)
 
 
@@ -150,6 +150,6 @@ def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
             raise ValueError("a member is not an array")
         return arrays
-    # For damaged bytes zipfile, zlib and NumPy raise a dozen kinds of exceptions; nothing else can fail here.
+    # For damaged bytes, zipfile, zlib and NumPy raise a dozen kinds of exceptions; nothing else can fail here.
     except Exception as error:
         raise ValueError(f"{path} is damaged or not a file of arrays (npz)") from error

@@ -1,9 +1,9 @@
 """Conversion to CIELAB, by colour-science, the HyAB colour difference, and luma.
 
 Reproducing the reference values (golden files) exactly requires two D65 white points: that of colour-science for the
-colours of the grid, and one with a fifth digit for the mean colours of regions. The difference matters for greys: the
-matrix of sRGB is rounded, so that greys have a chroma of up to 0.01 and all the same hue, and the fifth digit moves
-that hue from one interval of the cover to the next.
+colours of the grid, and one with a fifth digit for the mean colours of regions. The difference matters for greys: since
+the sRGB matrix is rounded, all greys have a chroma of up to 0.01 and the same hue, and the fifth digit moves this hue
+from one interval of the cover to the next.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.f
     Returns:
         [..., 3] float64: L* in 0..100, a*, b*.
     """
-    import colour  # here, so that plots without a colour network need no colour-science
+    import colour  # imported here, so that plots without a colour network need no colour-science
 
     xyz = colour.sRGB_to_XYZ(np.asarray(rgb, np.float64) / 255.0)
     return np.asarray(colour.XYZ_to_Lab(xyz, np.array(white)), np.float64)

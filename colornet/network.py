@@ -28,7 +28,7 @@ class ColorNetwork:
     """The colour network, with R regions and E edges. Its arrays are read-only copies.
 
     Networks with the same contents are equal, so that compiled functions are shared between them. Regions are numbered
-    in the order of kmapper's nodes; a merged node has the place of its first one.
+    in the order of kmapper's nodes; a merged region has the place of its first node.
 
     Attributes:
         mean_rgb: [R, 3] float64, arithmetic mean of the sRGB colours of each region, 0..255.
@@ -38,7 +38,7 @@ class ColorNetwork:
         cyclic: [E] bool, edges across the cut of the hue circle; the other edges connect regions that share a colour.
         similarity: [R, R] float64, Delta = 1 / (1 + length of the shortest path), diagonal 1.
         region_bits: [140608] uint32, regions of each grid colour (`colornet.grid_index`): bit r is set for region r.
-        n_raw_nodes: number of Mapper's nodes before redundant ones were merged.
+        n_raw_nodes: number of Mapper's nodes before redundant nodes were merged.
 
     Raises:
         ValueError: an array has another type or shape, or the contents are inconsistent.

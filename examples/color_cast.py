@@ -1,8 +1,8 @@
 """Estimate the gain and the colour cast of a lamp by gradient descent through the colour embedding.
 
-A view of every built-in object is seen once in neutral light and once under a lamp that dims and tints it, by a camera
-with noise. The colour embedding of the relaxed descriptor is differentiable in the colours of the points, so that the
-lamp follows from minimizing the difference of the two embeddings: `python examples/color_cast.py [--out DIRECTORY]`.
+Each built-in object is viewed by a noisy camera once in neutral light and once under a lamp that dims and tints it. The
+colour embedding of the relaxed descriptor is differentiable in the colours of the points, so the lamp can be estimated
+by minimizing the difference of the two embeddings: `python examples/color_cast.py [--out DIRECTORY]`.
 """
 
 import argparse
@@ -34,8 +34,8 @@ NOISE = 0.02
 """Standard deviation of the camera noise, for channels in [0, 1]."""
 
 TEMPERATURE = 20.0
-"""Temperature of the softmax over colours, units of HyAB. At low temperatures descent gets stuck in steps:
-the result is off by 3 % at 5 and by 25 % at 1."""
+"""Temperature of the softmax over colours, units of HyAB. At low temperatures, the descent gets stuck in steps:
+the error of the result is 3 % at 5 and 25 % at 1."""
 
 
 def under(light: jax.Array, clouds: thor2.PointClouds) -> thor2.PointClouds:

@@ -1,7 +1,7 @@
 """THOR2-L: learn parameters of the descriptor together with the classifiers, and compare it with THOR2.
 
 Gradients of the loss of both classifiers update Delta (as a similarity matrix), the variance of the persistence images
-and the exponent of their weight. THOR2 is trained by the same steps with these parameters fixed, on the same synthetic
+and the exponent of their weight. THOR2 is trained in the same way with these parameters fixed, on the same synthetic
 views and with the same seeds and epochs. Both are evaluated on scenes that are not used in training.
 `python examples/learn_descriptor.py [--out DIRECTORY]` trains on built-in objects, and
 
@@ -60,10 +60,10 @@ RATE = 0.01
 """Initial learning rate of the descriptor's parameters (logarithms and logits), with a cosine decay."""
 
 N_SCENES, LIGHT = 20, 0.4
-"""Number of scenes of built-in objects, and their largest relative change of brightness."""
+"""Number of scenes of built-in objects, and largest relative change of brightness in a scene."""
 
 LOOK_ALIKES = sorted({name for pair in COLOR_PAIRS + SHAPE_PAIRS for name in pair})
-"""The built-in objects that differ from another one only in colour or only in shape."""
+"""The built-in objects that differ from another built-in object only in colour or only in shape."""
 
 
 class LearnedValues(NamedTuple):
@@ -136,7 +136,7 @@ def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], 
 
 
 def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
-    """Train both classifiers, and the descriptor too if `learn`."""
+    """Train both classifiers and, with `learn`, the descriptor."""
     graphs: list[Any] = []
     weights: dict[str, Any] = {}
     rest: dict[str, Any] = {}
@@ -164,7 +164,7 @@ def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
             state = train_step(tuple(graphs), state, batch, (rate, decay(step)), jax.random.fold_in(key, step))
 
     parameters = state.free.parameters()
-    # Converted to float32, these are the values that the classifiers were trained with.
+    # After conversion to float32, these are the values with which the classifiers were trained.
     config = dataclasses.replace(
         CONFIG,
         image_variance=float(parameters.image_variance),

@@ -30,13 +30,13 @@ from training.views.mesh_views import view_cloud
 
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SOFT = dataclasses.replace(HARD, relaxation=thor2.Relaxation(slice=0.02, strip=0.01, extremum=0.01, color=10.0))
-"""Higher temperatures than the default: at low ones, the loss is almost a step function, and descent gets stuck."""
+"""Temperatures above the default; at low ones the loss is almost a step function, and the descent gets stuck."""
 
 N_POINTS = 1024
 """Largest number of points of a clean view."""
 
 HIDDEN = 0.1, 0.3
-"""Smallest and largest occluded share of the points of a view."""
+"""Smallest and largest occluded fraction of the points of a view."""
 
 TILT = np.radians(20)
 """Largest angle between the edge of the occluder and the normal of the object's long side, radians."""
@@ -51,7 +51,7 @@ STEPS, RATE = 100, 0.01
 """Number of steps and learning rate of Adam, with a cosine decay; a fifth of the rate is used for the shift."""
 
 PRIOR = 0.1
-"""Weight of the squared rotation, which keeps the frame of the box where few columns can be compared."""
+"""Weight of the squared rotation, which keeps the frame close to that of the box if few columns can be compared."""
 
 ANOTHER_BOX = 45.0
 """Error in degrees beyond which the sides of the box are interchanged, which gradient descent cannot correct."""
@@ -77,7 +77,7 @@ class Columns(NamedTuple):
 
 
 def occlude(clean: tuple[np.ndarray, np.ndarray], far: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Return the cloud (xyz, rgb) with noise without its end in the direction `far`, and a mask of its edge points."""
+    """Return the noisy cloud (xyz, rgb) without its end in the direction `far`, and a mask of its edge points."""
     xyz, rgb = clean
     angle = rng.uniform(-TILT, TILT)
     direction = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ far[:2]
@@ -233,7 +233,7 @@ def draw(
     near: np.ndarray,
     out: Path,
 ) -> None:
-    """Draw one view before and after over the stored one, and the differences of all views."""
+    """Draw one view before and after refinement over the stored view, and the differences of all views."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.1))

@@ -76,7 +76,7 @@ else:
 __version__ = "0.1.0"
 
 NEWEST_SERIES = (0, 10)
-"""Newest series of jax that the tests have run on. pyproject.toml has the same rule; a later upgrade may ignore it."""
+"""Newest series of jax that the tests have run on. pyproject.toml has this rule, too, but an upgrade may ignore it."""
 
 for _package in ("jax", "jaxlib"):
     _version = importlib.metadata.version(_package)

@@ -18,8 +18,8 @@ BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 """Padded numbers of clouds of a batch."""
 
 MIN_BATCH_POINTS = 2048
-"""Least padded number of points in batches of commands and the service: fewer save a tenth of the time, and each size
-compiles for seconds."""
+"""Smallest padded number of points in batches of the commands and the service. Smaller sizes would save only a tenth of
+the time, and each size takes seconds to compile."""
 
 
 def _smallest_bucket(buckets: tuple[int, ...], n: int, name: str, advice: str) -> int:
@@ -50,6 +50,6 @@ def batch_bucket(n_clouds: int) -> int:
 def batch_points(counts: Iterable[int]) -> int:
     """Return the padded number of points for clouds with these numbers of points, in commands and the service.
 
-    It is at most the largest bucket; `PointClouds.pack` names the cloud that has more points.
+    The result is at most the largest bucket; for clouds with more points, `PointClouds.pack` raises an error.
     """
     return point_bucket(min(max([MIN_BATCH_POINTS, *counts]), POINT_BUCKETS[-1]))

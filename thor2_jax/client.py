@@ -5,12 +5,12 @@
 >>> client.recognize(**frame)                                                       # doctest: +SKIP
 [Recognition(label=1, name='mug', confidence=0.98, ...)]
 
-The service segments a frame without labels (`thor2 serve --segment`); `recognize_frame` returns its labels, too:
+With `thor2 serve --segment`, frames need no labels; `recognize_frame` also returns the labels of the segmentation:
 
 >>> del frame["labels"]                                                             # doctest: +SKIP
 >>> recognitions, labels = client.recognize_frame(**frame)                          # doctest: +SKIP
 
-A service that teaches (`thor2 serve --teach`) enrolls and forgets objects:
+With `thor2 serve --teach`, clients can enroll and forget objects:
 
 >>> client.enroll("teapot", **frame, instance=3).views                              # doctest: +SKIP
 1
@@ -52,14 +52,14 @@ class ServiceModel:
     """The model of a service.
 
     Attributes:
-        classes: names that may be answered.
-        knows: the same in words.
-        classifiers: classifiers that answer.
+        classes: names that an answer can have.
+        knows: a description of these names in words.
+        classifiers: names of the classifiers in use.
         descriptor_version: version of the descriptor.
         config: configuration of the descriptor.
         color_network: fingerprint of the colour network.
         teaches: whether objects can be enrolled and forgotten.
-        segmenter: segmenter of frames without labels; None if they are refused.
+        segmenter: segmenter of frames without labels; None if the service rejects such frames.
     """
 
     classes: tuple[str, ...]
@@ -74,7 +74,7 @@ class ServiceModel:
 
 @dataclasses.dataclass(frozen=True)
 class KnownObject:
-    """An object that may be answered.
+    """An object that the service can recognize.
 
     Attributes:
         name: its name.
@@ -126,7 +126,7 @@ def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
 
 
 class _Connection:
-    """Where requests are sent, and how."""
+    """Address of a service, and options of its requests."""
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
         """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
@@ -134,7 +134,7 @@ class _Connection:
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._options: dict[str, Any] = {"base_url": url, "headers": headers, "timeout": timeout}
         self._options["follow_redirects"] = True
-        self._options["verify"] = ssl.create_default_context()  # takes longer to create than a request
+        self._options["verify"] = ssl.create_default_context()  # creating it takes longer than a request
 
     @contextlib.contextmanager
     def _no_answer_named(self) -> Iterator[None]:
@@ -172,10 +172,10 @@ class Client(_Connection):
     def recognize_frame(
         self, *, color: File, depth: File, labels: File | NDArray[Any] | None = None, intrinsics: Any
     ) -> tuple[list[Recognition], NDArray[np.int32] | None]:
-        """Recognize a frame, and return its recognitions and the labels [H, W] that the service made.
+        """Return the recognitions of a frame and the labels [H, W] of the service's segmentation.
 
-        The labels are None if the request had labels. The service halves their size, as often as needed, if a segmenter
-        returns more than 50,000 runs of equal labels. Arguments and exceptions as `recognize`.
+        The labels are None if the request had labels. If a segmenter returns more than 50,000 runs of equal labels, the
+        service halves the size of the labels as often as needed. Arguments and exceptions as `recognize`.
         """
         return self._send("POST", "/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
 
@@ -208,7 +208,7 @@ class Client(_Connection):
         return self._send("GET", "/v1/model", _model)
 
     def objects(self) -> list[KnownObject]:
-        """Return the objects that may be answered. Raises as `describe`."""
+        """Return the objects that the service can recognize. Raises as `describe`."""
         return self._send("GET", "/v1/objects", _objects)
 
     def enroll(
@@ -232,8 +232,8 @@ class Client(_Connection):
             labels: see `recognize`.
             intrinsics: see `recognize`.
             instance: number of the object in `labels`.
-            extend: add the view to those of an object with this name.
-            replace: discard the views, and the output of the classifiers, of an object with this name.
+            extend: add the view to an existing object with this name.
+            replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Returns:
             The object, with the generation of the gallery.
@@ -260,10 +260,10 @@ class Client(_Connection):
         return self._send("DELETE", f"/v1/objects/{urllib.parse.quote(name, safe='')}", _generation)
 
     def undo(self, generation: int) -> int:
-        """Take back the change of the gallery that gave it this generation, and return the new one.
+        """Undo the change that created this generation of the gallery, and return the new generation.
 
         Raises:
-            ServiceError: as `describe`; status 409 if another change was made since.
+            ServiceError: as `describe`; status 409 if the gallery has changed since then.
             OSError: the service cannot be reached.
         """
         return self._send("POST", "/v1/objects/undo", _generation, files={"generation": str(generation).encode()})
@@ -278,7 +278,7 @@ class Client(_Connection):
 def _coroutine(
     method: Callable[Concatenate[Client, P], T],
 ) -> Callable[Concatenate["AsyncClient", P], Coroutine[Any, Any, T]]:
-    """Return a method of `Client` for `AsyncClient`, whose `_send` makes the same function return a coroutine."""
+    """Return a method of `Client` for `AsyncClient`, where it returns a coroutine because `_send` does."""
     return cast(Any, method)
 
 
@@ -357,7 +357,7 @@ def _model(content: bytes) -> ServiceModel:
 
 
 def _known(values: Mapping[str, Any], kind: type[T]) -> T:
-    """Return a record without the entries of later services."""
+    """Return a record; entries that only later versions of the service have are ignored."""
     names = [field.name for field in dataclasses.fields(cast(Any, kind))]
     return kind(**{name: values[name] for name in names})
 
@@ -371,7 +371,7 @@ def _generation(content: bytes) -> int:
 
 
 def _content(response: httpx.Response) -> bytes:
-    """Return the body of an answer; raises ServiceError for one with an error status."""
+    """Return the body of a response; raise ServiceError if its status is an error."""
     if response.is_success:
         return response.content
     retry_after = response.headers.get("Retry-After", "")
@@ -380,5 +380,5 @@ def _content(response: httpx.Response) -> bytes:
         field, message = problem["field"], str(problem["message"])
     except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
         field, message = None, response.reason_phrase
-    # Proxies may give a date.
+    # In responses of proxies, Retry-After may be a date.
     raise ServiceError(response.status_code, field, message, float(retry_after) if retry_after.isdecimal() else None)

@@ -20,7 +20,7 @@ DESCRIPTOR_VERSION = 1
 """Version of the descriptor's values, stored in every run directory; a run of another version is rejected."""
 
 LOOK_COUNTS = (1, 2, 4)
-"""Numbers of looks at a cloud; 1 is the paper's."""
+"""Allowed numbers of looks at a cloud; the paper uses 1."""
 
 _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "released"), "looks": LOOK_COUNTS}
 
@@ -137,7 +137,7 @@ class DescriptorConfig:
 
     @classmethod
     def of_record(cls, constants: Mapping[str, Any]) -> "DescriptorConfig":
-        """Return the config of a stored record, the `dataclasses.asdict` of one; that of version 0.1 has no looks.
+        """Return the config of a stored record (from `dataclasses.asdict`); records of version 0.1 have no looks.
 
         Raises:
             TypeError, KeyError: a constant is unknown or missing.
@@ -145,14 +145,14 @@ class DescriptorConfig:
         """
         stored = dict(constants)
         relaxation = stored.pop("relaxation")
-        if "orientations" in stored:  # by an earlier version; its first two are the first two looks
+        if "orientations" in stored:  # from an earlier version, whose first two orientations are the first two looks
             orientations = stored.pop("orientations")
             stored["looks"] = 2 if orientations == 4 else orientations
         return cls(**stored, relaxation=None if relaxation is None else Relaxation(**relaxation))
 
     @property
     def uses_rim(self) -> bool:
-        """Whether one of the looks is without the points near the contour of the mask."""
+        """Whether one of the looks leaves out the points near the contour of the mask."""
         return self.looks == 4
 
     @property

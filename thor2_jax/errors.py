@@ -6,7 +6,7 @@ from collections.abc import Iterator
 __all__ = ["InputError", "decoding", "needs_extra", "reason_of", "with_context"]
 
 MAX_MESSAGE = 1000
-"""Characters of a message that are kept: a damaged file may have a name or a number of millions."""
+"""Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
 
 
 class InputError(ValueError):
@@ -34,7 +34,7 @@ def with_context(identifier: str) -> Iterator[None]:
     """Prefix the message of an InputError raised inside with `identifier`; a missing file becomes an InputError too.
 
     Raises:
-        InputError: with the prefix.
+        InputError: the original error, with the prefix.
     """
     try:
         yield
@@ -46,7 +46,7 @@ def with_context(identifier: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def decoding(message: str, expected: str) -> Iterator[None]:
-    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
+    """Turn every exception that a decoder raises for a damaged file into an InputError."""
     try:
         yield
     except Exception as error:
@@ -55,10 +55,10 @@ def decoding(message: str, expected: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def needs_extra(subject: str, package: str, extra: str) -> Iterator[None]:
-    """Name the package and the extra that has it if an import inside fails.
+    """Turn a failed import into an InputError that names the package and the extra to install.
 
     Args:
-        subject: beginning of the message, which ends before "needs".
+        subject: beginning of the message, before the word "needs".
         package: name of the package.
         extra: extra of this distribution.
 

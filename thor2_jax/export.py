@@ -2,7 +2,7 @@
 
 >>> blob = export_recognizer(load_run("run"), n_points=2048, n_clouds=8)            # doctest: +SKIP
 
-With jax alone:
+The file runs with jax alone:
 
 >>> exported = jax.export.deserialize(bytearray(blob))                              # doctest: +SKIP
 >>> result = exported.call(points, colors, mask, camera, boundary, rim)              # doctest: +SKIP
@@ -43,8 +43,8 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     Returns:
         Serialized `jax.export.Exported`: a function of the fields of `PointClouds` (points [B, N, 3], colors [B, N, 3],
         mask [B, N], camera [B, 3], boundary [B, N], rim [B, N]) that returns a dictionary with the class probabilities
-        [B, C] of each classifier, also of the embedding if it recognizes the classes (then named "embedding", with
-        probabilities that sum to that of being any class), and overflow [B].
+        [B, C] of each classifier and overflow [B]. An embedding that recognizes the classes is the classifier
+        "embedding"; its probabilities sum to the probability that the object is one of the classes.
 
     Raises:
         InputError: A size is not a bucket, or a platform is unknown.

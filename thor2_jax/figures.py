@@ -1,4 +1,4 @@
-"""Matplotlib figures as PNG files, and names of objects as texts in them."""
+"""Conversion of matplotlib figures to PNG files, and of object names to text in figures."""
 
 import functools
 import io
@@ -16,7 +16,7 @@ __all__ = ["name_style", "plain_text", "png_bytes", "save_figure"]
 _DPI = 130
 
 _FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
-"""Fonts for names, those that are installed; matplotlib has the first one."""
+"""Fonts for names; missing ones are skipped, and the first one comes with matplotlib."""
 
 
 def save_figure(figure: Figure, path: str | Path, *, fit: bool = False) -> None:
@@ -25,7 +25,7 @@ def save_figure(figure: Figure, path: str | Path, *, fit: bool = False) -> None:
     Args:
         figure: the figure.
         path: path of the picture.
-        fit: change the size of the picture so that it contains everything that is drawn.
+        fit: resize the picture so that it contains everything that is drawn.
 
     Raises:
         OSError: the file cannot be written.
@@ -50,7 +50,7 @@ def _installed_fonts() -> tuple[list[str], frozenset[int]]:
 
 
 def plain_text(name: str) -> str:
-    """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
+    """Return a name as text that matplotlib draws literally: no mathtext, and escapes for missing characters."""
     _, characters = _installed_fonts()
     shown = escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters))
     return shown.replace("$", r"\$")

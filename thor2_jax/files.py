@@ -61,11 +61,11 @@ def _refusal_named(message: str) -> Iterator[None]:
 
 
 def check_output_directory(directory: str | Path, marker: str | None = None, resumable: Collection[str] = ()) -> None:
-    """Raise unless a command may write to a directory, so that nothing foreign is overwritten and no work is lost.
+    """Raise unless a command may write to a directory, so that no other files are overwritten and no work is lost.
 
-    The directory may be missing or empty. A command that resumes also accepts what an interrupted run of it leaves: any
-    directory with the file `marker`, and one that holds nothing but `resumable` names and names that begin with a dot
-    (locks and temporary files).
+    The directory may be missing or empty. A command that can resume also accepts the output of an interrupted run: a
+    directory with the file `marker`, or one that contains only `resumable` names and names that begin with a dot (locks
+    and temporary files).
 
     Args:
         directory: output directory of the command.
@@ -73,7 +73,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         resumable: names that this command writes before the marker.
 
     Raises:
-        InputError: if the directory holds anything else, or cannot be written.
+        InputError: if the directory contains anything else, or cannot be written.
     """
     directory = Path(directory)
     with _refusal_named(f"out: {directory} is not a directory"):
@@ -96,10 +96,11 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
     Args:
         name: name of the argument.
         path: the file; None for none.
-        is_own: whether a file that exists is an older output of the command, by its content, and may be replaced.
+        is_own: function that returns whether an existing file has the content of an output of the command, which may
+            be replaced.
 
     Raises:
-        InputError: the path is a directory, a device, pipe or socket, a file that the command has not written, or
+        InputError: the path is a directory, device, pipe or socket, is a file that the command has not written, or
             cannot be written.
     """
     if path is None:
@@ -112,7 +113,7 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
 
 
 def has_json(path: Path, keys: Collection[str]) -> bool:
-    """Return whether a file is JSON: an object with these keys, or a list of such objects."""
+    """Return whether a file contains a JSON object with these keys, or a list of such objects."""
     try:
         content = json.loads(read_file(path))
     except (OSError, ValueError, RecursionError):
@@ -132,8 +133,8 @@ def check_writable(directory: Path) -> None:
 def atomic_directory(path: str | Path) -> Iterator[Path]:
     """Yield a temporary directory that takes the place of `path` if the block ends without an error.
 
-    In a directory that is not empty, files with the names of new ones are replaced, one after the other, and others
-    stay. After an error in the block, or if a directory or a device has one of the names, everything is as before.
+    If `path` is a directory with files, those with the names of new files are replaced one by one, and the others stay.
+    After an error in the block, or if a directory or a device has the name of a new file, nothing has changed.
 
     Args:
         path: the directory; its parents are created.
@@ -165,10 +166,10 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
 
 
 def remove_written(directory: Path, *patterns: str) -> None:
-    """Remove the files in a directory whose relative paths match a regular expression, then what is empty of it.
+    """Remove the files in a directory whose relative paths match a regular expression, then the empty directories.
 
-    All other files stay where they are, also what lies behind symbolic links. If there are none, the directory
-    disappears at once.
+    All other files stay, including the targets of symbolic links. If there are no other files, the directory is removed
+    in one step.
     """
     if not directory.is_dir():
         return
@@ -185,7 +186,7 @@ def remove_written(directory: Path, *patterns: str) -> None:
     for path in written:
         path.unlink(missing_ok=True)
     for folder in reversed(folders):
-        with contextlib.suppress(OSError):  # It has other files.
+        with contextlib.suppress(OSError):  # The directory has other files.
             folder.rmdir()
 
 
@@ -198,7 +199,7 @@ def content_digest(parts: Iterable[str | bytes]) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's content; a file that did not change since the last call is not read again."""
+    """Return the SHA-256 of a file's content; a file that has not changed since the last call is not read again."""
     status = path.stat()
     return _file_digest(path.absolute(), status.st_mtime_ns, status.st_size)
 
@@ -210,7 +211,7 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
 
 
 def json_digest(value: Any) -> str:
-    """Return the SHA-256 of a JSON value, whatever the order of its keys."""
+    """Return the SHA-256 of a JSON value, which does not depend on the order of its keys."""
     return content_digest([json.dumps(value, sort_keys=True)])
 
 
@@ -219,7 +220,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str] 
 
     Equal arrays and texts give equal bytes if there is at most one text: the order of several is random.
     """
-    import safetensors.numpy  # every command would import it at its start
+    import safetensors.numpy  # at the top, every command would import it
 
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     return safetensors.numpy.save(contiguous, None if metadata is None else dict(metadata))
@@ -240,7 +241,7 @@ def unpack_arrays(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, st
 
 
 def safetensors_metadata(content: bytes) -> dict[str, str]:
-    """Return the metadata of a safetensors file from its content, or from the beginning of it with the whole header.
+    """Return the metadata of a safetensors file from its content, or from its first part with the whole header.
 
     Raises:
         ValueError: the header is damaged.
@@ -257,7 +258,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 MAX_YAML_BYTES = 2**24
 MAX_YAML_VALUES = 10**6
-"""Values of a YAML file after its aliases are expanded: a few lines of them can stand for gigabytes."""
+"""Largest number of values in a YAML file after its aliases are expanded; a few lines can expand to gigabytes."""
 
 
 def parse_json(content: bytes) -> Any:
@@ -301,7 +302,7 @@ def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
     """Return the number of values in `value`, counting shared ones each time they occur."""
     if not isinstance(value, (dict, list, set, tuple)):
         if isinstance(value, int):
-            str(value)  # raises ValueError for thousands of digits, as JSON does; no message could show them
+            str(value)  # raises ValueError for integers of thousands of digits, which messages could not show
         return 1
     if id(value) not in sizes:
         sizes[id(value)] = math.inf  # a value that contains itself is infinite
@@ -311,14 +312,14 @@ def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
 
 
 def read_table(path: Path, kinds: tuple[type, ...] = (dict,)) -> Any:
-    """Read a file that holds one table: JSON if its name ends in .json, YAML otherwise.
+    """Read a file with one table: JSON if its name ends in .json, YAML otherwise.
 
     Args:
         path: the file.
         kinds: types of a table; with `list`, a list counts as one.
 
     Raises:
-        InputError: if the file is damaged or holds something else; the message names the file.
+        InputError: if the file is damaged or contains something else; the message names the file.
         OSError: if the file cannot be opened.
     """
     content = read_file(path)

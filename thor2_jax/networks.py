@@ -54,17 +54,17 @@ THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
 
 EMBEDDING = "embedding"
-"""Name of the class probabilities that the embedding of a run gives, beside those of the MLPs."""
+"""Name of the embedding as a classifier, beside the MLPs."""
 
 Classifier = Callable[[LookDescriptors], jax.Array]
-"""From the descriptors of K looks at B clouds to class probabilities [B, C], which may sum to less than 1."""
+"""Function from the descriptors of K looks at B clouds to class probabilities [B, C], with sums of at most 1."""
 
 
 def check_features(names: object, argument: str) -> tuple[Feature, ...]:
     """Return `names` as a tuple of known features in the order of FEATURES.
 
     Raises:
-        InputError: a name is unknown or given twice, or there is none; the message names `argument`.
+        InputError: a name is unknown or given twice, or no name is given; the message names `argument`.
     """
     values = tuple(names) if isinstance(names, (list, tuple)) else ()
     if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
@@ -86,15 +86,16 @@ def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> in
 HIDDEN = (512, 256, 128, 64)
 
 SPARSE_BATCH = 16
-"""Largest batch whose first layer uses `_sparse_matmul`: up to it, a classifier takes as long as reading its weights,
-and about four fifths of them belong to inputs that are zero in every cloud of a frame."""
+"""Largest batch whose first layer uses `_sparse_matmul`. Small batches take as long as reading the weights, about four
+fifths of which belong to inputs that are zero in every cloud of a frame."""
 
 
 @jax.custom_jvp
 def _sparse_matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Return `x @ kernel`, [B, F] times [F, H], reading only the rows of `kernel` where `x` has a non-zero entry.
 
-    The rows are gathered into an array of a tenth or a quarter of F. If more are needed, the plain product is computed.
+    The rows are gathered into an array with a tenth or a quarter of F rows. If this is too small, the full product is
+    computed.
     """
     needed = (x != 0).any(axis=0)
     capacities = [-(-len(needed) // divisor) for divisor in (10, 4)]
@@ -119,8 +120,8 @@ class MLP(nnx.Module):
     """Multi-layer perceptron with 512, 256, 128 and 64 hidden units and one logit for each class.
 
     Each hidden layer is followed by batch normalization, ReLU and dropout of 0.2. Inputs are first multiplied by
-    `input_scale`, fixed numbers computed from the training set: images and colour counts differ a thousandfold, and the
-    first step of Adam would depend on the counts only.
+    `input_scale`, a constant computed from the training set. Without it, the first step of Adam would depend only on
+    the colour counts, which are a thousand times as large as the images.
     """
 
     def __init__(self, n_inputs: int, n_classes: int, *, rngs: nnx.Rngs, dropout: float = 0.2) -> None:
@@ -150,24 +151,24 @@ class MLP(nnx.Module):
 
 IMAGE_SHARE = 0.5
 BLOCK_WEIGHTS = (1.0, 1.0, 1.0), (1.0, 2.0), (0.5, 2 + IMAGE_SHARE)
-"""Shares of the blocks in the similarity by `EmbeddingSizes.version`, before they are divided by their sum; the share
-of the persistence images in the projected block, where each kind of colours has 1. Chosen on held-out frames."""
+"""BLOCK_WEIGHTS: weights of the blocks in the similarity by `EmbeddingSizes.version`, before division by their sum.
+IMAGE_SHARE: weight of the persistence images in the projected block; colours have 1. Chosen on held-out frames."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddingSizes:
-    """Sizes of the network of an embedding, and what its outputs are made of.
+    """Sizes of an embedding's network, and the parts of its output.
 
     Attributes:
         cell: outputs of the layer that is shared by all strip positions.
         hidden: units of the hidden layers.
         learned: length of the network's block of the embedding.
         color: length of the block of projected colours and images.
-        balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
-        shape: whether it has the persistence images; False in embeddings of earlier versions.
-        nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
-            embeddings of earlier versions, where each counts with its own.
-        views: whether the reference views take part in the classification; False in embeddings of earlier versions.
+        balanced: whether that block has the histogram of balanced colours; False in embeddings of earlier versions.
+        shape: whether that block has the persistence images; False in embeddings of earlier versions.
+        nearest: whether every distractor gets the logit of the nearest distractor, for each network and look; False in
+            embeddings of earlier versions, where each distractor keeps its own logit.
+        views: whether classification also uses the reference views; False in embeddings of earlier versions.
     """
 
     cell: int = 20
@@ -181,7 +182,7 @@ class EmbeddingSizes:
 
     @property
     def version(self) -> int:
-        """Version of what is projected: 0 strips, 1 also balanced colours, 2 also persistence images."""
+        """Version of the projected features: 0 for strips, 1 with balanced colours, 2 with persistence images, too."""
         return self.balanced + (self.balanced and self.shape)
 
 
@@ -193,8 +194,8 @@ def to_unit_length(x: jax.Array) -> jax.Array:
 class EmbeddingNetwork(nnx.Module):
     """Network of an embedding: one linear layer on each strip position of each slice, then fully connected layers.
 
-    At a position, the layer reads the row of the persistence image born there and the colour embedding of the strip.
-    Empty positions contribute zero.
+    At each position, the layer reads the row of the persistence image with this birth, and the colour embedding of the
+    strip. Empty positions contribute zero.
     """
 
     def __init__(
@@ -206,7 +207,7 @@ class EmbeddingNetwork(nnx.Module):
             config: descriptor.
             n_regions: number of colour regions.
             sizes: sizes of the layers.
-            n_proxies: number of proxies, which classify; 0 for none.
+            n_proxies: number of proxies for classification; 0 for none.
             rngs: generators of the weights and the dropout.
         """
         self.positions = max(config.image_size, config.n_strips)
@@ -221,12 +222,12 @@ class EmbeddingNetwork(nnx.Module):
         self.dropout = nnx.Dropout(0.15)
         self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
         n_strips, cells = n_regions * config.n_strips, -(-config.image_size // 2)
-        n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # one more in each version
+        n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # each version adds one
         self.color_basis = nnx.BatchStat(jnp.zeros((sum(n_features[: sizes.version + 1]), sizes.color)))
         self.block_weights = nnx.BatchStat(jnp.array(BLOCK_WEIGHTS[sizes.version]))
         if n_proxies:
             self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
-            self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps anew
+            self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps twice
 
     def learned(
         self, descriptors: Descriptors, statistics: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None
@@ -234,8 +235,8 @@ class EmbeddingNetwork(nnx.Module):
         """Return the learned block [B, learned], of unit length.
 
         Args:
-            descriptors: of B clouds.
-            statistics: [B, 12 + R] or more, from `cloud_statistics`; those after the first 12 + R are not read.
+            descriptors: descriptors of B clouds.
+            statistics: [B, 12 + R] or more, from `cloud_statistics`; columns after the first 12 + R are ignored.
             train: normalize by the statistics of the batch, and drop units.
             rngs: generators of the dropout.
         """
@@ -259,7 +260,7 @@ class EmbeddingNetwork(nnx.Module):
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
         """Return the embeddings [B, D], of unit length.
 
-        The arguments are those of `learned`; if the colours are balanced, `balanced_histogram` ends the statistics.
+        The arguments are those of `learned`; with balanced colours, the last statistics are `balanced_histogram`.
         """
         features = projected_features(descriptors, statistics, self.version)
         blocks = [self.learned(descriptors, statistics), to_unit_length(features @ self.color_basis[...])]
@@ -277,8 +278,8 @@ def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
 def projected_features(descriptors: Descriptors, statistics: jax.Array, version: int) -> jax.Array:
     """Return the features [B, F] that are projected to their principal components, by `EmbeddingSizes.version`.
 
-    They are the square roots of the colour embeddings, `balanced_histogram`, with which the statistics end, and
-    the square roots of the persistence images, in cells of 2 x 2 pixels. Each part has a constant length.
+    They are the square roots of the colour embeddings, `balanced_histogram` (the last columns of the statistics), and
+    the square roots of the persistence images, averaged in cells of 2 x 2 pixels. Each part has a constant length.
     """
     count = len(descriptors.embeddings)
     parts = [to_unit_length(square_root(descriptors.embeddings).reshape(count, -1))]
@@ -295,13 +296,13 @@ def compiled(
 ) -> Callable[[Any], jax.Array]:
     """Return the compiled `function(modules, inputs, *static)` as a function of the inputs, a pytree of arrays.
 
-    Models of the same sizes share the programs. JAX would take a state apart and hash each graph, in Python, at every
-    call, which takes 4 % of the time of a frame: the weights are a flat list, and the graphs no argument.
+    Models of the same sizes share compiled programs. The weights are passed as a flat list and the graphs are no
+    arguments, since flattening and hashing them at every call would take 4 % of the time of a frame.
 
     Args:
-        function: of a module.
+        function: function of the modules, the inputs and `static`.
         models: graph and state of each module, from `nnx.split`.
-        static: hashable.
+        static: further arguments, hashable.
     """
     graphs, states = zip(*models, strict=True)
     leaves, structure = jax.tree.flatten(states)
@@ -326,7 +327,7 @@ def _variables(model: nnx.Module) -> tuple[Any, dict[str, Any]]:
 
 
 def model_arrays(model: nnx.Module, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Return the parameters and batch statistics of a model by a prefix and their paths, such as layers/0/kernel."""
+    """Return the parameters and batch statistics of a model by name: `prefix` and a path such as layers/0/kernel."""
     return {prefix + path: np.asarray(variable[...]) for path, variable in _variables(model)[1].items()}
 
 

@@ -11,7 +11,7 @@ and `jax.vmap` on any device, and have gradients.
 >>> images(diagrams, birth_range=(0, 3), persistence_range=(0, 3), pixels=(8, 8), variance=0.1).shape
 (8, 8)
 
-This is no library for simplicial complexes: there are no triangles, no cycles (H1 and above), no Rips or alpha
+This module does not handle simplicial complexes: it has no triangles, no cycles (H1 and above), no Rips or alpha
 complexes, and no distances between diagrams. Use GUDHI for these.
 """
 
@@ -28,29 +28,29 @@ from thor2_jax.types import Diagrams
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
 _Ranges = tuple[jax.Array, jax.Array, jax.Array]
-"""For the range of vertices and edges behind each vertex: lowest vertex, highest edge and its index, each [N]."""
+"""Lowest vertex, highest edge and its index in the range that follows each vertex, each [N]."""
 
 _Walk = tuple[jax.Array, jax.Array, jax.Array]
-"""For the walk from each vertex: the vertex reached so far, the highest edge on the way and its index, each [N]."""
+"""State of the walk from each vertex: the vertex reached, the highest edge on the way and its index, each [N]."""
 
 
 def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Diagrams:
-    """Return the finite H0 pairs of functions on lines, by the height at which components of sublevel sets merge.
+    """Return the finite H0 pairs of functions on lines: births and merges of the components of sublevel sets.
 
-    A component is born at its lowest vertex and dies at the edge over which it reaches a lower one (the elder rule; of
-    equal heights, the first is the older one). The component of the lowest vertex of a line never dies; it has no pair,
-    and its birth is the minimum of the heights. For superlevel sets, negate the heights and the result.
+    A component is born at its lowest vertex and dies at the edge that joins it to a component with a lower vertex (the
+    elder rule; of equal heights, the first is older). The component of the lowest vertex of a line never dies; it has
+    no pair, and its birth is the minimum of the heights. For superlevel sets, negate the heights and the result.
 
     Pairs are found by binary search in tables of ranges, in O(N log N) operations and memory and log2(N) steps for each
-    line. Gradients reach the height of the vertex and of the edge of each pair, hence, without `edges`, that of the
-    higher vertex of the edge. They exist where no two heights are equal.
+    line. Gradients flow to the height of the vertex and of the edge of each pair; without `edges`, to the higher vertex
+    of the edge. They exist where no two heights are equal.
 
     Args:
         heights: [..., N] floating, one height for each vertex. A vertex of height NaN or infinity is absent and its
             neighbours are not connected, so that lines of different lengths are padded with either.
         edges: [..., N - 1] floating, height of the edge between vertices i and i + 1; by default that of the higher
-            vertex. A lower edge is raised to it, since an edge cannot come before its vertices; at NaN or infinity,
-            the line is cut.
+            vertex. A lower edge is raised to that height, since an edge cannot appear before its vertices; NaN or
+            infinity cuts the line.
 
     Returns:
         Diagrams with fields [..., N] of the type of `heights`. Pair i is born at vertex i. The mask is True for pairs
@@ -98,7 +98,7 @@ def _nan_as_infinity(values: jax.Array) -> jax.Array:
 def _death_edges(heights: jax.Array, edges: jax.Array) -> jax.Array:
     """Return the edge at which the component born at each vertex dies, [N] int32; -1 if it never does.
 
-    A component reaches a lower vertex on the side whose highest edge on the way there is lower.
+    There may be a lower vertex on either side; the component merges on the side whose highest edge is lower.
     """
     right, right_index = _edges_to_lower(heights, edges, or_equal=False)
     left, left_index = _edges_to_lower(heights[::-1], edges[::-1], or_equal=True)
@@ -113,7 +113,7 @@ def _edges_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> tup
     The height is infinite if no vertex there is lower (or equal, with `or_equal`).
     """
     vertices = jnp.arange(len(heights), dtype=jnp.int32)
-    # Behind the last vertex stands one that is lower than all, over an edge that is never reached.
+    # A sentinel after the last vertex is lower than all others; the edge to it is infinitely high.
     low = jnp.append(heights[1:], -jnp.inf)  # lowest of the vertices i + 1 .. i + 2^k, for k = 0
     high, at = jnp.append(edges, jnp.inf), vertices  # highest of the edges i .. i + 2^k - 1, and its index
 
@@ -143,7 +143,7 @@ def _edges_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> tup
 
 
 def _higher(state: _Walk, high: jax.Array, at: jax.Array, passed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the highest edge on each walk, with those of the next range if it is passed: height and index."""
+    """Return height and index of the highest edge on each walk, including the next range where `passed` is True."""
     position, highest, index = state
     higher = passed & (high[position] > highest)
     return jnp.where(higher, high[position], highest), jnp.where(higher, at[position], index)
@@ -160,11 +160,11 @@ def images(
 ) -> jax.Array:
     """Return persistence images: the sum over pairs of persistence**n times a Gaussian, integrated over each pixel.
 
-    These are the images of Adams et al. (2017). Pairs outside the ranges contribute what of their Gaussian is inside.
-    Gradients reach the diagrams, `variance` and `exponent`.
+    These are the images of Adams et al. (2017). Gaussians are clipped to the ranges, also those of pairs outside them.
+    Gradients flow to the diagrams, `variance` and `exponent`.
 
     Args:
-        diagrams: fields [..., N], of `sublevel_diagrams` or of any other source; births, deaths and the mask.
+        diagrams: births, deaths and mask [..., N], from `sublevel_diagrams` or any other source.
         birth_range: least and greatest birth of the image. Static, as are the next two.
         persistence_range: least and greatest persistence of the image.
         pixels: number of pixels P along births, and Q along persistence.

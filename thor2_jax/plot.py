@@ -1,12 +1,12 @@
 """Plots on matplotlib axes: clouds, slices, persistence, colour, the colour network and measured accuracy.
 
-Every function draws on the axes `ax` that it is given, which may be part of any figure:
+Every function draws on given axes `ax`, which may be part of any figure:
 
 >>> figure, ax = plt.subplots()                                                    # doctest: +SKIP
 >>> aligned = thor2.align(clouds, config)                                          # doctest: +SKIP
 >>> thor2.plot.slices(ax, *aligned.unpack()[0], config)                            # doctest: +SKIP
 
-Lengths are drawn as they are given: metres for clouds as a camera sees them, scaled units for all that is aligned.
+Lengths keep their unit: metres for clouds in the camera frame, scaled units for aligned clouds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -85,9 +85,9 @@ def _scatter(
     scale: ScalarMappable | None,
     size: float,
 ) -> PathCollection:
-    """Draw near points [n, 2] over far ones; with values, large ones over small ones and up to three times as large."""
+    """Draw points [n, 2], near ones over far ones; with values, large values over small ones and in larger dots."""
     if values is None:
-        ax.set_facecolor("#e4e4e4")  # White points are seen on it.
+        ax.set_facecolor("#e4e4e4")  # White points must be visible.
         order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
         given = np.asarray(values, float)
@@ -115,7 +115,7 @@ def cloud(
         ax: matplotlib axes.
         points: [n, 3] metres, camera frame.
         colors: [n, 3] sRGB, uint8 or floating in [0, 1].
-        values: [n] numbers that are drawn instead of the colours, for example attributions; large ones over small ones.
+        values: [n] numbers that are drawn instead of the colours, such as attributions; large values cover small ones.
         scale: colours of the values; by default `attribution_colors(values)`.
         size: area of a point, points squared.
 
@@ -180,9 +180,9 @@ def slices(
 
 
 def persistence_diagram(ax: Axes, diagrams: Diagrams, config: DescriptorConfig) -> None:
-    """Draw the persistence diagram of a slice, or those of all slices of a cloud with one colour for each.
+    """Draw the persistence diagram of a slice, or the diagrams of all slices of a cloud in one colour each.
 
-    A pair above the diagonal is a strip: born at its position along x, and as persistent as it is wide along y.
+    A pair above the diagonal is a strip: its birth is its position along x, and its persistence is its width along y.
 
     Args:
         ax: matplotlib axes.
@@ -274,15 +274,15 @@ def color_matrix(
 ) -> None:
     """Draw the colour matrix C^i of a slice: strips to the right, colour regions down, in the regions' mean colours.
 
-    A cell is the more opaque the more points of the strip have a colour of the region; the opacity is the square root
-    of the fraction of the largest entry.
+    The opacity of a cell shows how many points of the strip have a colour of the region: it is the square root of the
+    entry divided by the largest entry.
 
     Args:
         ax: matplotlib axes.
         matrix: [J, R] the colour matrix of the slice, `Strips.color` of one slice.
         network: the colour network.
         regions: regions to draw; by default those with an entry.
-        largest: entry that is drawn opaque; by default the largest one.
+        largest: value of an entry that is drawn opaque; by default the largest entry.
 
     Raises:
         InputError: the matrix has another shape.
@@ -310,8 +310,8 @@ def color_network(ax: Axes, network: ColorNetwork, weights: ArrayLike | None = N
     Args:
         ax: matplotlib axes.
         network: the colour network.
-        weights: [R] points of a cloud in each region. If given, discs grow with them instead of with the number of
-            colours of the region, and regions without points are pale.
+        weights: [R] numbers of a cloud's points in each region. If given, they determine the size of the discs instead
+            of the number of colours in the region, and regions without points are pale.
 
     Raises:
         InputError: the weights have another shape, or a negative value.
@@ -327,8 +327,8 @@ def confusion(ax: Axes, counts: ArrayLike, classes: Sequence[str]) -> None:
 
     Args:
         ax: matplotlib axes.
-        counts: [C, C] or [C, C + 1] integers; rows are true classes, columns predicted classes, and the optional last
-            column instances without an answer, which is left out if it is empty.
+        counts: [C, C] or [C, C + 1] integers; rows are true classes, columns are predicted classes. An optional last
+            column counts instances without an answer; it is not drawn if it is empty.
         classes: C class names.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Names of objects, and names as text that terminals and pictures can show."""
+"""Names of objects, and their conversion to text that terminals and pictures can show."""
 
 import re
 import unicodedata
@@ -11,14 +11,14 @@ __all__ = ["check_name", "escape_characters", "find_name", "first_names", "norma
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
 )
-"""Characters that `str.isprintable` accepts, but that show nothing."""
+"""Invisible characters that `str.isprintable` accepts."""
 
 _RESERVED = ("unknown", "unrecognized")
-"""Text in place of the name of an object without one."""
+"""Text that is shown for an object without a name."""
 
 
 def normal_name(name: str) -> str:
-    """Return a name without blanks at its ends and in the Unicode form NFC: equal for names that look alike."""
+    """Return a name in the Unicode form NFC, without blanks at its ends; names that look alike become equal."""
     return unicodedata.normalize("NFC", name).strip()
 
 
@@ -26,10 +26,10 @@ def check_name(name: object) -> str:
     """Return the `normal_name` of an object.
 
     Raises:
-        InputError: it is no text, empty, longer than 200 characters, has characters that cannot be seen, means that an
-            object has no name, or has a part "." or "..", which addresses and paths cannot contain.
+        InputError: the name is not a text, is empty or longer than 200 characters, has invisible characters, is
+            reserved for objects without a name, or has a part "." or "..", which URLs and paths cannot contain.
     """
-    # The normalization of a long text can take a time that grows with the square of its length.
+    # The time to normalize a text can grow with the square of its length.
     normal = normal_name(name) if isinstance(name, str) and len(name) <= 1000 else ""
     if not 1 <= len(normal) <= 200 or not normal.isprintable() or _INVISIBLE.search(normal):
         raise InputError(f"name is {name!a}; expected a printable text of 1 to 200 visible characters")
@@ -39,9 +39,9 @@ def check_name(name: object) -> str:
 
 
 def find_name(name: str, known: Collection[str]) -> str | None:
-    """Return the name among the known ones that is this one or looks like it; None if there is none.
+    """Return the known name that equals `name` or looks like it; None if there is none.
 
-    Runs and galleries of older versions have names that are not normal.
+    Runs and galleries of older versions can contain names that are not normalized.
     """
     if name in known:
         return name

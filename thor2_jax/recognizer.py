@@ -6,8 +6,8 @@
 [(1, 'mug', 0.98), (2, 'bowl', 0.71)]
 
 Each instance of the frame is prepared on the host (`prepare_instance`), described in several looks
-(`describe_looks`), and named by the outputs of the model (`infer`, `answers`). A gallery recognizes
-objects without training:
+(`describe_looks`), and recognized from the outputs of the model (`infer`, `answers`). A gallery
+recognizes objects without training:
 
 >>> recognizer.enroll("teapot", [(frame, 2)])           # the instance with label 2   # doctest: +SKIP
 >>> recognizer.forget("teapot")                                                     # doctest: +SKIP
@@ -51,7 +51,7 @@ CHUNK = 4
 
 @dataclasses.dataclass(frozen=True)
 class DescribedFrame:
-    """The instances of a frame and the descriptors of those that can be used.
+    """The instances of a frame and the descriptors of the usable ones.
 
     Attributes:
         instances: every instance, in the order of the label numbers.
@@ -64,7 +64,7 @@ class DescribedFrame:
 
     @property
     def descriptors(self) -> Descriptors:
-        """The descriptors of the first look, the paper's."""
+        """The descriptors of the first look, which are those of the paper."""
         return self.oriented.first
 
     @property
@@ -83,10 +83,10 @@ class Recognizer:
 
     Attributes:
         objects: the enrolled objects, on disk after `load`.
-        chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
-            next. A large chunk starts sooner, since fewer functions are compiled, and takes longer for each frame.
+        chunk: number of instances that are described and classified in one call. While the device computes a chunk, the
+            host prepares the next one. Larger chunks need fewer compiled functions, but make each frame slower.
 
-    Its functions compile once for each point bucket and number of rows (`inference.padded_rows`); `warm_up` compiles
+    Functions are compiled once for each point bucket and number of rows (`inference.padded_rows`); `warm_up` compiles
     them in advance. Enrolling and forgetting objects compiles nothing.
     """
 
@@ -107,9 +107,9 @@ class Recognizer:
             run: the trained run.
             unknown_below: least confidence, from 0 to 1, of an answer with a name; by default see `Model.thresholds`.
             rule: fusion rule, see `fusion`; the paper's is "max".
-            embedding: embedding of the gallery; by default that of the run, or the packaged one. One that was fitted on
-                the run's classes is also a classifier.
-            answer_by: source of the answers, see `Model.answers_by`; by default that of the run's record.
+            embedding: embedding of the gallery; by default that of the run, or the packaged one. An embedding that was
+                fitted on the run's classes is also a classifier.
+            answer_by: source of the answers, see `Model.answers_by`; by default the source in the run's record.
             search: search in the gallery, "exact" or "usearch" (extra `index`), see `Gallery`.
             chunk: see `Recognizer`.
 
@@ -141,8 +141,8 @@ class Recognizer:
             run_dir: the run directory.
             unknown_below: see `Recognizer`.
             rule: see `Recognizer`.
-            gallery: directory of the gallery; by default `gallery` in the run directory. Objects that are enrolled or
-                forgotten later are written to it.
+            gallery: directory of the gallery; by default `gallery` in the run directory. Later changes (enrolled and
+                forgotten objects) are written to it.
             answer_by: see `Recognizer`.
             search: see `Recognizer`.
             reembed: embed the views of the gallery again, after a change of the run's embedding.
@@ -155,7 +155,7 @@ class Recognizer:
 
     @property
     def model(self) -> Model:
-        """The current model: the run and the enrolled objects. Another one can be set; its gallery is not used."""
+        """The current model: the run and the enrolled objects. It can be replaced; a new model's gallery is ignored."""
         gallery = self.objects.gallery
         if self._model.gallery is not gallery:
             self._model = dataclasses.replace(self._model, gallery=gallery)
@@ -177,12 +177,12 @@ class Recognizer:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
+        """All names that an answer can have: trained classes, without forgotten ones, and enrolled objects."""
         return self.model.names
 
     @property
     def color_transform(self) -> ColorTransform | None:
-        """The correction of the camera's colours; None if there is none."""
+        """The correction of the camera's colours; None if colours are not corrected."""
         return self._model.color_transform
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
@@ -197,7 +197,7 @@ class Recognizer:
         extend: bool = False,
         replace: bool = False,
     ) -> None:
-        """Enroll an object from frames, so that the next frame is recognized with it.
+        """Enroll an object from frames; it can be recognized from the next frame on.
 
         A recognizer from `load` also writes it to the gallery on disk.
 
@@ -205,13 +205,13 @@ class Recognizer:
             name: name of the object.
             frames: frames whose label image has the object as its only instance, or pairs of a frame and the label
                 number of the object.
-            extend: add the views to those of an object with this name.
-            replace: discard the views, and the output of the classifiers, of an object with this name.
+            extend: add the views to an existing object with this name.
+            replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Raises:
-            InputError: a frame has several instances and no number, an instance has too few points, or the name exists
-                and neither `extend` nor `replace` is given. Nothing is enrolled.
-            OSError: the gallery cannot be written; it is as before.
+            InputError: a frame has several instances and no label number is given, an instance has too few points, or
+                the name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         views = []
         for number, item in enumerate(frames):
@@ -227,21 +227,21 @@ class Recognizer:
 
         Raises:
             InputError: no object has this name.
-            OSError: the gallery cannot be written; it is as before.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         self.objects.forget(name)
 
     def adapt(self, frames: Iterable[RGBDFrame], report: Report = lambda done, total: None) -> Adaptation:
-        """Estimate the colours of a camera from frames without names, and correct them from now on.
+        """Estimate the colour transform of a camera from frames without object names, and apply it from now on.
 
-        Objects that this recognizer does not know may be among them.
+        The frames may also show unknown objects.
 
         Args:
             frames: frames of one camera, with instance labels.
-            report: function that shows the progress, called with the steps done and their number.
+            report: function that shows the progress, called with the number of steps done and of all steps.
 
         Returns:
-            The estimate; its `transform` is also that of the new `model`.
+            The estimate, whose `transform` is now part of `model`.
 
         Raises:
             InputError: the frames have different sizes, or fewer than `adaptation.estimate.MIN_INSTANCES` usable
@@ -261,7 +261,7 @@ class Recognizer:
             The number of compiled shapes.
 
         Raises:
-            InputError: `max_points` is past the largest bucket.
+            InputError: `max_points` exceeds the largest bucket.
         """
         points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
         rows = sorted({padded_rows(n, self.chunk) for n in range(1, min(max_instances, self.chunk) + 1)})
@@ -271,14 +271,14 @@ class Recognizer:
         return len(shapes)
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
-        """Prepare instances of a frame, by default all, with corrected colours, one after the other."""
+        """Prepare the given instances of a frame (by default all) one by one, with corrected colours."""
         model, config = self.model, self.run.config
         chosen = frame.instances if labels is None else labels
         prepared = (prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in chosen)
         return map(model.corrected, prepared)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
-        """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
+        """Prepare and describe the instances of a frame; their number may exceed the largest batch bucket."""
         run = self.run
         describe = functools.partial(describe_looks, network=run.network, config=run.config)
         return DescribedFrame(*compute_by_chunks(self.prepare(frame), self.chunk, describe))
@@ -294,16 +294,17 @@ class Recognizer:
             answer_by: source of the answers, see `Model.answers_by`.
 
         Raises:
-            InputError: a classifier that the run does not have. An instance that cannot be described is no error: the
-                `reason` of its answer says why.
+            InputError: the run lacks a classifier of `classifiers`. An instance that cannot be described is not an
+                error: the `reason` of its answer explains why.
         """
         return answers(self.model, *self.infer(self.prepare(frame), classifiers, answer_by))
 
     def segment(self, frame: RGBDFrame) -> NDArray[np.int32]:
-        """Segment a frame by the segmenter "table", and divide and merge its pieces where known objects result.
+        """Segment a frame with the segmenter "table"; split and merge its pieces where the results are known objects.
 
-        Things in a pile touch without an edge; see `segmentation.known_objects`. This is a segmenter:
-        `segmented(frame, recognizer.segment)` has the labels. It needs OpenCV (extra `segment`).
+        This separates objects in a pile, which touch without a visible edge; see `segmentation.known_objects`. The
+        method is a segmenter, so `segmented(frame, recognizer.segment)` returns the frame with labels. It needs OpenCV
+        (extra `segment`).
 
         Returns:
             Labels [H, W]; 0 is background.
@@ -323,19 +324,19 @@ class Recognizer:
         classifiers: Sequence[str] | None = None,
         answer_by: str | None = None,
     ) -> tuple[list[PreparedInstance], Inference]:
-        """Evaluate the model on the instances of a frame, a chunk at a time.
+        """Evaluate the model on the instances of a frame in chunks.
 
         Args:
-            instances: an iterable that prepares them, with corrected colours.
+            instances: an iterable that prepares the instances, with corrected colours.
             classifiers: see `recognize`.
             answer_by: see `recognize`.
 
         Returns:
-            All instances, and the outputs for the usable ones: arrays on the host, whose first rows are theirs, in
-            order.
+            All instances, and the outputs for the usable ones: arrays on the host, whose first rows belong to the
+            usable instances in order.
 
         Raises:
-            InputError: a classifier that the run does not have.
+            InputError: the run lacks a classifier of `classifiers`.
         """
         compute = functools.partial(infer_clouds, self.model, classifiers=classifiers, answer_by=answer_by)
         return compute_by_chunks(instances, self.chunk, compute)

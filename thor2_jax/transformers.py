@@ -26,7 +26,7 @@ from thor2_jax.types import as_array, check_capacity, check_cloud
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 
 MAX_EXTENT = 2.0
-"""Longest side of a cloud, metres, beyond which its unit is likely another one: descriptors cover about 0.3 m."""
+"""Largest extent of a cloud, metres. A larger cloud is probably not in metres, since descriptors cover about 0.3 m."""
 
 
 class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no type hints
@@ -75,7 +75,7 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         config, network = self._check_parameters()
         clouds = self._clouds(X)
         batch = batch_bucket(min(len(clouds), BATCH_BUCKETS[-1]))
-        # Empty clouds fill the last batch, so that what is computed from a batch has few shapes as well.
+        # Empty clouds fill the last batch, so that later computations on it have few shapes, too.
         empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
         padded = itertools.chain(clouds, [empty] * (-len(clouds) % batch))
         described = describe_stream(padded, network, config, self.capacity, batch)

@@ -1,8 +1,8 @@
-"""The records that are passed between the stages of the pipeline, and learnable parameters: frozen pytrees of arrays.
+"""Records passed between the stages of the pipeline, and learnable parameters, all as frozen pytrees of arrays.
 
 Shapes use these letters: B clouds, N points of a cloud after padding, S slices, J strips of a slice, R colour regions,
-P pixels along the side of an image. Compiled functions take parameters as arguments, so that other values need no
-compilation:
+P pixels along the side of an image. Compiled functions take the parameters as arguments, so that new values do not
+cause a compilation:
 
 >>> parameters = Parameters.of(network, config)                               # doctest: +SKIP
 >>> loss = lambda p: (describe(clouds, network, config, p).tops2**2).sum()    # doctest: +SKIP
@@ -107,7 +107,7 @@ class PointClouds:
         return cls(*(fields if on_host else jax.device_put(fields)))
 
     def unpack(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Return the clouds without padding: pairs of points [n, 3], in their unit, and sRGB [n, 3] in [0, 1]."""
+        """Return the clouds without padding: pairs of points [n, 3], in the unit of `points`, and sRGB [n, 3]."""
         points, colors, mask = (np.asarray(array) for array in (self.points, self.colors, self.mask))
         return [(xyz[real], rgb[real]) for xyz, rgb, real in zip(points, colors, mask, strict=True)]
 
@@ -283,12 +283,12 @@ class Descriptors:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """Learnable parameters of a descriptor, which replace the same numbers of the network and the config.
+    """Learnable parameters of a descriptor, which replace the same values of the network and the config.
 
     Attributes:
         similarity: [R, R] float32, the similarity matrix Delta.
-        alpha: [] float32, angle of the turn about y, radians. The hard descriptor depends on it only through the choice
-            of slices and strips, so that its gradient is zero; the gradient of a relaxed descriptor is not.
+        alpha: [] float32, angle of the rotation about y, radians. The gradient of the hard descriptor is zero, since
+            alpha only changes which slice and strip a point is in; the gradient of a relaxed descriptor is not zero.
         sigma_s: [] float32, scaled units per metre.
         image_variance: [] float32, positive; variance of the Gaussian at each point of a diagram.
         persistence_weight: [] float32, exponent n of the weight persistence**n.
@@ -302,9 +302,9 @@ class Parameters:
 
     @classmethod
     def of(cls, network: ColorNetwork, config: DescriptorConfig) -> "Parameters":
-        """Return the values of a network and a config."""
-        # Concrete arrays even while a caller's function is traced, so that they can be cached.
+        """Return the parameters that a network and a config contain."""
+        # The arrays are concrete even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
-            # By NumPy: JAX would compile a program for each conversion.
+            # NumPy converts the values, since JAX would compile a program for each conversion.
             return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))

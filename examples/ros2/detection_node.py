@@ -28,7 +28,7 @@ WARNING_SECONDS = 5.0
 
 
 class DetectionNode(Node):
-    """Sends pairs of colour and depth images to the service, one at a time, and publishes its answers."""
+    """A node that sends pairs of colour and depth images to the service one at a time and publishes its answers."""
 
     def __init__(self) -> None:
         super().__init__("thor2")
@@ -43,7 +43,7 @@ class DetectionNode(Node):
             Subscriber(self, Image, values[topic], qos_profile=qos_profile_sensor_data)
             for topic in ("color_topic", "depth_topic")
         ]
-        # A queue of 2: images that arrive during a request are dropped, all but the newest.
+        # The queue has 2 entries, so of the images that arrive during a request only the newest are kept.
         self.synchronizer = ApproximateTimeSynchronizer(images, queue_size=2, slop=values["max_gap"])
         self.synchronizer.registerCallback(self.recognize)
 

@@ -1,6 +1,6 @@
-"""What the node does between its subscriptions and its publisher: messages to a request, answers to fields.
+"""Conversions of the node between its subscriptions and its publisher: messages to a request, answers to fields.
 
-The functions read attributes of messages only, so they also take those of rosbags.
+The functions only read attributes of messages, so they also accept messages of rosbags.
 """
 
 import io
@@ -17,14 +17,14 @@ from thor2_jax.model.recognition import Detection, detections_of
 from thor2_jax.recordings.messages import color_image, depth_image, detection_array, stamp_of
 
 MILLIMETRES = 1000.0
-"""Depth units per metre of depth that is sent to the service."""
+"""Depth units per metre of the depth images for the service."""
 
 
 def frame_of(color: Any, depth: Any, camera: Any) -> RGBDFrame:
     """Return the frame of a colour image, the depth image that is aligned to it, and their CameraInfo.
 
     Raises:
-        InputError: an encoding that is not supported, or images of different sizes.
+        InputError: an encoding is not supported, or the images have different sizes.
     """
     return RGBDFrame(color_image(color), depth_image(depth), None, Intrinsics.of(camera))
 
@@ -34,7 +34,7 @@ def detect(client: Client, frame: RGBDFrame) -> list[Detection]:
 
     Raises:
         InputError: the service is too old to segment frames.
-        ServiceError: the service refuses the frame.
+        ServiceError: the service rejects the frame.
         OSError: the service cannot be reached.
     """
     millimetres = np.clip(np.round(frame.depth_m * MILLIMETRES), 0, 2**16 - 1).astype(np.uint16)
@@ -50,7 +50,7 @@ def detect(client: Client, frame: RGBDFrame) -> list[Detection]:
     )
     if labels is None:
         raise InputError("the service does not segment frames; update it")
-    # The service halves labels that are large.
+    # The service halves the size of large label images.
     height, width = frame.depth.shape
     factor = -(-height // len(labels))
     labels = labels.repeat(factor, axis=0).repeat(factor, axis=1)[:height, :width]

@@ -1,1 +1,1 @@
-"""Adaptation to a camera: a colour transform, estimated from frames without labels."""
+"""Adaptation to a camera: estimation of a colour transform from frames without object names."""

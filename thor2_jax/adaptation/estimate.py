@@ -1,15 +1,14 @@
-"""The colour transform of a camera from unlabelled instances: the mean of its posterior.
+"""Estimation of a camera's colour transform from unlabelled instances, as the mean of its posterior.
 
 The prior is a normal distribution around no change. The likelihood of an instance is exp(-`EVIDENCE` u), where u is the
-uncertainty of its answer. With few instances, or where colours do not matter, the estimate therefore stays near no
-change.
+uncertainty of its answer. With few instances, or if colours do not matter, the estimate therefore stays near no change.
 
-The uncertainty is the entropy over the classes and over "none of them", whose probability is what the classes lack to
-1. An unknown object that is surely none of the classes is therefore no reason to change the colours. So that it is no
-way out to make all objects unknown, -log of the probability of being known is added, with the weight of that
-probability before any change.
+The uncertainty is the entropy over the classes and "none of them", which has the rest of the probability. An object
+that is certainly none of the classes therefore does not influence the colours. To keep the estimate from making all
+objects unknown, the term -p log(q) is added, where p and q are the probabilities that the object is known before and
+after the change.
 
-While frames arrive, `OnlineAdaptation` estimates the transform again, in a thread, from the latest instances.
+While frames arrive, `OnlineAdaptation` estimates the transform again from the latest instances, in a thread.
 """
 
 import dataclasses
@@ -54,21 +53,21 @@ __all__ = [
 ]
 
 ROWS = 8
-"""Instances that are described in one call."""
+"""Number of instances that are described in one call."""
 
 LOOKS = 2
-"""Looks at an instance; the colours of further ones differ."""
+"""Number of looks at an instance; further looks have other colours."""
 
 MIN_KNOWN = 1e-3
 """Smallest probability of being known that is distinguished from 0."""
 
 
 Criterion = Callable[[PointClouds], jax.Array]
-"""From clouds [B, N] in metres to the probabilities [B, C] of names, whose certainty an estimate increases."""
+"""Function from clouds [B, N] in metres to the probabilities [B, C] of names, which the estimate makes more certain."""
 
 
 def entropy(probabilities: jax.Array) -> jax.Array:
-    """Return the entropy [B] of probabilities [B, C] and of what they lack to 1, in nats."""
+    """Return the entropy [B] of probabilities [B, C] and of the rest to 1, in nats."""
     rest = jnp.clip(1 - probabilities.sum(axis=-1, keepdims=True), 0, 1)
     every = jnp.clip(jnp.concatenate([probabilities, rest], axis=-1), 1e-12, 1)
     return -(every * jnp.log(every)).sum(axis=-1)
@@ -105,9 +104,9 @@ def objective(
 
     Args:
         instances: usable instances with the camera's colours.
-        criterion: what computes the answers.
-        capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default each
-            chunk has the point bucket of its largest cloud.
+        criterion: function that computes the probabilities of the names, see `adaptation_criterion`.
+        capacity: N, padded number of points, so that only one shape is compiled; larger clouds are left out. By default
+            each chunk has the point bucket of its largest cloud.
     """
     fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
     ordered = sorted(fitting, key=lambda each: len(each.points))
@@ -132,23 +131,23 @@ PRIOR = 0.085
 """Standard deviation of the warmth."""
 
 GRID = np.linspace(-0.36, 0.36, 25)[:, None] * np.array([0.0, 0.0, 0.0, 1.0])
-"""[25, 4] transforms over which the mean is taken. Only their warmth differs: training varies brightness, contrast
-and saturation far more than red against blue, so that a search over all of them changes colours that are right."""
+"""[25, 4] transforms over which the mean is taken. Only the warmth differs: in training, brightness, contrast and
+saturation vary far more than red against blue, so that a search over all of them would change correct colours."""
 
 MIN_INSTANCES = 10
-"""Fewest instances; with fewer, the prior decides."""
+"""Smallest number of instances; with fewer, the prior would dominate."""
 
 MAX_INSTANCES = 40
-"""Instances that are used at most; more take longer and change little."""
+"""Largest number of instances in use; more take longer and change little."""
 
 MAX_VIEWS = 1024
-"""Views of a gallery that answer at most, evenly spread; the regression is solved for all of them at once."""
+"""Largest number of views of a gallery in use, evenly spread, since the regression is solved for all views at once."""
 
 EVIDENCE = 0.5
-"""Weight of an instance's uncertainty: instances of the same few objects are not independent. Chosen on real frames."""
+"""Weight of an instance's uncertainty, since instances of a few objects are not independent. Chosen on real frames."""
 
 Report = Callable[[int, int], None]
-"""Called with the number of evaluated colour transforms and of all of them."""
+"""Function that is called with the number of evaluated colour transforms and the total number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,8 +157,8 @@ class Adaptation:
     Attributes:
         transform: the colour transform.
         instances: number of instances that it was estimated from.
-        uncertainty_before: mean uncertainty of their answers without it, nats, as in `objective`.
-        uncertainty_after: mean uncertainty with it.
+        uncertainty_before: mean uncertainty of the answers without the transform, nats, as in `objective`.
+        uncertainty_after: mean uncertainty with the transform.
     """
 
     transform: ColorTransform
@@ -192,13 +191,13 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
 
 
 def adaptation_criterion(model: Model) -> Criterion:
-    """Return the function of clouds whose certainty an estimate increases.
+    """Return the function from clouds to probabilities that an estimate makes more certain.
 
-    It is the class probabilities of the embedding, which also knows what is none of the classes; in runs without one,
-    those of the classifiers, fused by the model's rule; and the scores of the gallery if it answers alone.
+    It returns the class probabilities of the embedding, which allow for unknown objects; in runs without an embedding,
+    those of the classifiers, fused by the model's rule; and if the gallery answers alone, its scores.
 
     Raises:
-        InputError: the model knows no object.
+        InputError: the model has neither classes nor enrolled objects.
     """
 
     def fused(oriented: LookDescriptors) -> jax.Array:
@@ -221,18 +220,18 @@ def adaptation_criterion(model: Model) -> Criterion:
 
 
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
-    """Return at most `most` of the numbers 0 .. count - 1, evenly spread."""
+    """Return up to `most` evenly spread numbers from 0 to count - 1."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.intp))
 
 
 def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
 
-    Reference views take no part: what matters is which colours make the scores certain, not whether objects are known.
+    Reference views are not used, since the colours shall make the scores certain, whether or not objects are known.
 
     Args:
         gallery: a gallery with at least one object.
-        embedding: the embedding of its views.
+        embedding: the embedding of the gallery's views.
     """
     views, owner, ridge = dataclasses.replace(gallery, references=None).regression
     kept = evenly_spread(len(owner), MAX_VIEWS)
@@ -242,7 +241,7 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     fixed = jnp.asarray(views, jnp.float32)
 
     def classify(oriented: LookDescriptors) -> jax.Array:
-        # `adaptation_criterion` adds the balanced colours.
+        # `adaptation_criterion` has already added the balanced colours.
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
         mean = scores.mean(axis=1)
@@ -257,11 +256,11 @@ def estimate_transform(
     report: Report = lambda done, total: None,
     capacity: int | None = None,
 ) -> Adaptation:
-    """Estimate the colour transform with which a recognizer is most certain of its answers.
+    """Estimate the colour transform with which the answers are most certain.
 
     Args:
-        instances: unlabelled instances with the camera's colours; those that cannot be used are left out.
-        criterion: what computes the answers, see `adaptation_criterion`.
+        instances: unlabelled instances with the camera's colours; unusable ones are left out.
+        criterion: function that computes the probabilities of the names, see `adaptation_criterion`.
         report: function that shows the progress.
         capacity: see `objective`.
 
@@ -295,20 +294,20 @@ def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
 log = logging.getLogger(__name__)
 
 CAPACITY = 2048
-"""Most points of an instance that is used, so that one shape is compiled."""
+"""Largest number of points of an instance in use, so that only one shape is compiled."""
 
 EVERY = 20
-"""New instances after which the transform is estimated again."""
+"""Number of new instances after which the transform is estimated again."""
 
 
 class OnlineAdaptation:
-    """The colour transform of one camera, from the instances of its latest frames.
+    """The colour transform of one camera, estimated from the instances of its latest frames.
 
-    The estimate runs in one thread at a time; instances that arrive meanwhile are kept for the next one.
+    Estimates run in a thread, one at a time; instances that arrive during an estimate are kept for the next one.
     """
 
     def __init__(self, criterion: Criterion) -> None:
-        """Start without instances; `criterion` is that of `estimate_transform`."""
+        """Create an adaptation without instances; `criterion` is the argument of `estimate_transform`."""
         self._criterion = criterion
         self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
         self._new = 0
@@ -316,7 +315,7 @@ class OnlineAdaptation:
         self.latest: Adaptation | None = None
 
     def compile(self) -> None:
-        """Compile everything that an estimate needs, by evaluating an instance."""
+        """Compile all functions of an estimate by evaluating an instance."""
         objective([EMPTY_INSTANCE], self._criterion, CAPACITY)(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
@@ -335,4 +334,4 @@ class OnlineAdaptation:
         try:
             self.latest = estimate_transform(instances, self._criterion, capacity=CAPACITY)
         except Exception:
-            log.exception("adaptation failed; the colours are corrected as before")
+            log.exception("adaptation failed; the colour transform is unchanged")

@@ -1,1 +1,1 @@
-"""From point clouds to descriptors: view normalization, slicing, colour, persistence, images."""
+"""Computation of descriptors from point clouds: view normalization, slicing, colour, persistence, images."""

@@ -5,9 +5,9 @@ over the axes: it keeps one axis and rotates the other two to the minimum-area r
 (the vertices of the convex hull that are extreme in a fixed set of directions), so that its cost does not depend on the
 number of points.
 
-XLA keeps the order of a reduction of floats along the last axis and so computes it one number at a time. `fold` and
+XLA keeps the order of a reduction of floats along the last axis, and therefore reduces one number at a time. `fold` and
 `argmax` combine rows of the axis elementwise, which uses vector registers and is several times as fast. They use
-functions of `jax.lax`; indexing and `jnp.where` compute the same, and take a fifth longer to compile.
+functions of `jax.lax`, since indexing and `jnp.where` take a fifth longer to compile.
 """
 
 import functools
@@ -24,26 +24,26 @@ HIGHEST = jax.lax.Precision.HIGHEST
 """Precision of all products; TF32, the default of recent GPUs, would lose three digits of a coordinate."""
 
 ROWS = 16
-"""Number of rows that the last axis is folded into; its length must be a multiple."""
+"""Number of rows into which the last axis is folded; its length must be a multiple of this number."""
 
 _PLAIN_LENGTH = 8
 """Largest length at which a plain argmax is as fast as halving."""
 
 SWEEPS = 6
-"""Minimum-area rectangles for each start, two about each axis; more do not shrink the boxes of real scans."""
+"""Number of minimum-area rectangles for each start, two about each axis; more do not shrink the boxes of real scans."""
 
 LANES = 16
-"""Support points turned at a time."""
+"""Number of support points that are rotated at a time."""
 
 COARSE_ANGLES = 17
-"""Angles tried over a quarter turn; two rounds of 9 finer ones around the best leave a step of 0.33 degrees."""
+"""Number of angles in a quarter turn. Two rounds of 9 finer angles around the best lead to steps of 0.33 degrees."""
 
 
 def _half_sphere(n: int = 4) -> np.ndarray:
     """Return [33, 3] float32 unit vectors, no two of them opposite: integer points with |i| + |j| + |k| = n.
 
-    Up to sign they are closed under reflections of the axes: eigenvectors have arbitrary signs, on which the box must
-    not depend.
+    The set of lines along them does not change if an axis is reflected: eigenvectors have arbitrary signs, and the box
+    must not depend on these signs.
     """
     chosen: list[tuple[int, ...]] = []
     for point in itertools.product(range(-n, n + 1), repeat=3):
@@ -57,7 +57,7 @@ _DIRECTIONS = _half_sphere()
 
 
 def larger(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return `jnp.maximum(a, b)` of numbers other than NaN, in one instruction; passing on NaN takes more."""
+    """Return `jnp.maximum(a, b)` of numbers other than NaN, in one instruction; propagating NaN would take more."""
     return jax.lax.select(jax.lax.gt(a, b), a, b)
 
 
@@ -72,7 +72,7 @@ def rows_of(folded: jax.Array) -> list[jax.Array]:
 
 
 def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array], rows: int = ROWS) -> jax.Array:
-    """Combine the entries k, k + N / rows, k + 2 N / rows, ... by `op` into entry k: [..., N] to [..., N / rows]."""
+    """Combine the entries k, k + N / rows, k + 2 N / rows, ... with `op` into entry k: [..., N] to [..., N / rows]."""
     folded = values.reshape(*values.shape[:-1], rows, values.shape[-1] // rows)
     return functools.reduce(op, rows_of(folded))
 
@@ -82,7 +82,7 @@ def _halves(values: jax.Array, half: int) -> list[jax.Array]:
 
 
 def argmax(values: jax.Array) -> jax.Array:
-    """Return `values.argmax(axis=-1)` as int32, for any length > 0; any of several equal entries may be returned."""
+    """Return `values.argmax(axis=-1)` as int32, for any length > 0; the index may be that of any largest entry."""
     index = jnp.broadcast_to(jnp.arange(values.shape[-1], dtype=jnp.int32), values.shape)
     while values.shape[-1] > _PLAIN_LENGTH and values.shape[-1] % 2 == 0:
         half = values.shape[-1] // 2
@@ -111,7 +111,7 @@ def support_points(points: jax.Array) -> jax.Array:
     spread = jnp.sqrt(functools.reduce(jnp.add, [row * row for row in rows]).sum(axis=-1))
     half = jnp.asarray(_DIRECTIONS) / jnp.where(spread > 0, spread, 1)
 
-    # First find the best residue of the point number modulo N / 16, then the best of the 16 points of that residue.
+    # First find the best point index modulo N / 16, then the best of the 16 points with this residue.
     each = [rotate(half, row) for row in rows]
     extremes = [functools.reduce(larger, each), -functools.reduce(smaller, each)]
     residue = argmax(jnp.concatenate(extremes))
@@ -123,7 +123,7 @@ def support_points(points: jax.Array) -> jax.Array:
 def rotate(axes: jax.Array, points: jax.Array) -> jax.Array:
     """Return the coordinates [K, N] of `points` [3, N] along the rows of `axes` [K, 3].
 
-    `points` may also be [3, K, N], other ones for each row.
+    `points` may also be [3, K, N], with separate points for each row.
     """
     # Explicit sums are float32 on every device and faster than a matmul with a side of 3. They fuse with a reduction,
     # which then stores no [K, N] array.
@@ -158,11 +158,11 @@ def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:
 
 
 def _minimum_area_angle(xy: jax.Array) -> jax.Array:
-    """Return the angle of the minimum-area rectangle of `xy` [2, M], within about an eighth turn, radians."""
+    """Return the angle of the minimum-area rectangle of `xy` [2, M], radians, at most about an eighth turn."""
     step = np.pi / 2 / COARSE_ANGLES
     best = jnp.zeros((), xy.dtype)
-    # The angles are symmetric about 0 and exclude eighth turns: if an axis of the frame changes its sign, the result
-    # only changes its sign. Results a quarter turn apart would exchange two axes.
+    # The angles are symmetric about 0, so that the result only changes its sign if an axis does. They exclude eighth
+    # turns, since results a quarter turn apart would exchange two axes.
     offsets = (np.arange(COARSE_ANGLES) - COARSE_ANGLES // 2) * step
     for _ in range(3):
         angles = best + jnp.asarray(offsets, xy.dtype)
@@ -174,16 +174,16 @@ def _minimum_area_angle(xy: jax.Array) -> jax.Array:
 def _search(support: jax.Array, starts: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Alternate minimum-area rectangles, starting from each of `starts` [K, 3, 3].
 
-    Returns the axes of the boxes [K, 3, 3] as rows and their volumes [K] over `support` [3, M]; M is a multiple of 16.
+    Return the axes of the boxes [K, 3, 3] as rows and their volumes [K] over `support` [3, M]; M is a multiple of 16.
     """
 
     def sweep(axes: jax.Array) -> jax.Array:
         angle = _minimum_area_angle(rotate(axes, support)[:2])
         c, s = jnp.cos(angle), jnp.sin(angle)
-        # The cyclic shift of the rows moves the next axis to the last row, which the rotation keeps.
+        # The cyclic shift moves the next axis to the last row, about which the next rotation is made.
         return jnp.stack([c * axes[1] - s * axes[0], axes[2], c * axes[0] + s * axes[1]])
 
-    # A loop inside `vmap` would be traced again for it.
+    # With the loop inside `vmap`, it would be traced twice.
     axes = jax.lax.fori_loop(0, SWEEPS, lambda _, axes: jax.vmap(sweep)(axes), starts)
     rotated = jax.vmap(lambda each: rotate(each, support))(axes)
     return axes, jnp.prod(rotated.max(axis=2) - rotated.min(axis=2), axis=1)
@@ -192,9 +192,9 @@ def _search(support: jax.Array, starts: jax.Array) -> tuple[jax.Array, jax.Array
 def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the axes of an approximately minimal-volume oriented box, longest side first, and its extents.
 
-    The search has two starts, the principal axes of all points and those of the support points (the released code uses
-    those of the vertices of the convex hull); the smaller box is returned. No gradient flows through the axes, which
-    are discontinuous where another face of the cloud becomes flush with the box.
+    The search starts from the principal axes of all points and from those of the support points (the released code uses
+    the vertices of the convex hull), and the smaller box is returned. No gradient flows through the axes, which are
+    discontinuous where another face of the cloud becomes flush with the box.
 
     Args:
         points: [3, N] float32, mean zero, padding at the origin; N is a multiple of 16.

@@ -63,7 +63,7 @@ MAX_CHUNK_POINTS = 2**17
 """Largest number of points in a chunk, padding included."""
 
 CHUNKS_PER_STEP = 4
-"""Chunks in one step of the loop; XLA can run them concurrently."""
+"""Number of chunks in one step of the loop; XLA can run them concurrently."""
 
 MAX_LARGE_CHUNK_POINTS = 2**19
 """Largest number of points in a large chunk, padding and all looks included."""
@@ -84,7 +84,7 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
     """Return `function(clouds)`, computed `CHUNKS_PER_STEP` chunks at a time. Call it under `jax.jit`.
 
     Args:
-        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud separately.
         clouds: [B, N].
     """
     n_clouds, size = len(clouds.mask), chunk_size(clouds)
@@ -102,10 +102,10 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
 
 
 def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, looks: int) -> T:
-    """Return `function(clouds)`, computed for one large chunk after the other.
+    """Return `function(clouds)`, computed in large chunks.
 
     Args:
-        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud separately.
         clouds: [B, N].
         looks: number of looks at each cloud that the function describes.
     """
@@ -128,7 +128,7 @@ def _concatenate(results: Sequence[T]) -> T:
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 
-# Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.
+# This is compiled separately from `_strips_of`, whose scatter would otherwise repeat the look-up for every number.
 _color_sets = jax.jit(color_sets)
 
 
@@ -160,11 +160,11 @@ def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorC
 
 
 def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
-    """Return the extremes and the colour vector of every strip: all that descriptors need, at a fraction of their size.
+    """Return the extremes and the colour vector of every strip: the input of the descriptors, which is much smaller.
 
     Args:
         aligned: clouds in scaled units, as `align` returns them.
-        network: the colour network, of which only the regions are used.
+        network: the colour network; only its regions are used.
         config: static.
     """
     check_batch(aligned)
@@ -174,7 +174,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
 def describe_strips(
     strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """Return the descriptors of `strips` (fields [B, S, J], scaled units); the rest is as in `describe`."""
+    """Return the descriptors of `strips` (fields [B, S, J], scaled units); otherwise equal to `describe`."""
     return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
@@ -200,15 +200,15 @@ def describe(
 ) -> Descriptors:
     """Return the descriptors TOPS, CE and TOPS2 of a batch of point clouds.
 
-    The stages are, in order: view normalization, the turn by alpha, slices and strips, persistence diagrams,
+    The stages are, in order: view normalization, the rotation by alpha, slices and strips, persistence diagrams,
     persistence images and colour embeddings.
 
     The first call with a new shape [B, N], `config` or `network` compiles; later calls reuse the compiled program. N is
     the padded number of points: `PointClouds.pack` rounds the number of points of the largest cloud up to a point
-    bucket (512, 1024, ..., 8192; see `thor2_jax.capacity`), so that few values of N ever occur. Other values of the
-    clouds or of `parameters` never cause a compilation.
+    bucket (512, 1024, ..., 8192; see `thor2_jax.capacity`), so that few values of N ever occur. New values in the
+    clouds or in `parameters` never cause a compilation.
 
-    Gradients reach the points, the colours and `parameters`; the frame of the view normalization is held constant.
+    Gradients flow to the points, the colours and `parameters`; the frame of the view normalization is held constant.
     The choice of slices, strips and colour regions is piecewise constant, so that the gradient with respect to the
     colours and to alpha is exactly zero unless `config.relaxation` is set.
 
@@ -216,13 +216,13 @@ def describe(
         clouds: [B, N] clouds in metres.
         network: the colour network; it gives the colour regions and their similarity.
         config: static.
-        parameters: replace the corresponding numbers of `network` and `config`.
+        parameters: replace the corresponding values of `network` and `config`.
 
     Returns:
         Descriptors of the B clouds, in the order of the batch. `images` [B, S, P, P] and `embeddings` [B, S, R, J] hold
         one entry for each slice, the lowest first. `tops` [B, S * P * P] are the images, `color` [B, S * R * J] the
-        embeddings, and `tops2` has both, as one block [image | embedding] for each slice; each of them is flattened in
-        C order. `overflow` [B] counts the points outside the grid of slices and strips plus the strips whose
+        embeddings, and `tops2` has both, as one block [image | embedding] for each slice; all are flattened in C
+        order. `overflow` [B] counts the points outside the grid of slices and strips plus the strips whose
         persistence exceeds the image window; it is 0 if the descriptor covers the whole cloud. An empty cloud has a
         descriptor of zeros.
 
@@ -258,7 +258,7 @@ def describe_stream(
         network: the colour network.
         config: static.
         capacity: padded number of points; by default the bucket of each batch's largest cloud.
-        batch: number of clouds described together. Each number compiles once.
+        batch: number of clouds described together; each value compiles once.
 
     Yields:
         Descriptors of up to `batch` clouds, as NumPy arrays.
@@ -298,7 +298,7 @@ def shard_clouds(clouds: PointClouds, mesh: Mesh) -> PointClouds:
     """Distribute a batch over the devices of `mesh`.
 
     Args:
-        clouds: [B, N]. With several processes, the clouds of this process; B and N must be equal in all of them.
+        clouds: [B, N]. With several processes, the clouds of this process; B and N must be equal in all processes.
         mesh: as `batch_mesh` returns it.
 
     Returns:
@@ -331,7 +331,7 @@ def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: Descrip
         config: static.
 
     Returns:
-        Descriptors sharded like the clouds; a process reads its own ones through `addressable_shards`.
+        Descriptors sharded like the clouds; a process reads its own descriptors through `addressable_shards`.
 
     Raises:
         InputError: `clouds` does not come from `shard_clouds`.

@@ -1,9 +1,9 @@
-"""Looks: several ways to see one instance, whose answers are fused so that they depend less on any one of them.
+"""Looks: several versions of one instance, whose answers are fused so that the result depends less on any of them.
 
-The view normalization chooses between two half turns by small differences, masks reach over the edges of their objects,
-and cameras differ in colour. Recognition therefore describes and classifies K looks at each cloud:
+Small differences decide about half turns in the view normalization, masks extend past the edges of their objects, and
+cameras differ in colour. Recognition therefore describes and classifies K looks at each cloud:
 
-- 1: as it is, which is the paper;
+- 1: the cloud as it is, as in the paper;
 - 2: also after a half turn about z;
 - 4: as it is; after a half turn, without the points near the contour of its mask (`PointClouds.rim`); after a half
   turn, with warmer colours; and with cooler colours.
@@ -45,25 +45,25 @@ __all__ = [
 ]
 
 WARMTH = 1.06
-"""Factor of red, and divisor of blue, of the warmer look; the inverse of the cooler one."""
+"""Factor of red and divisor of blue in the warmer look; the cooler look has the inverse."""
 
 N_SCALARS = 12
-"""Statistics of a cloud before its colour histogram."""
+"""Number of statistics of a cloud before its colour histogram."""
 
 _BINS = 6, 7, 7
-"""Bins of lightness, a* and b* of the balanced histogram."""
+"""Numbers of bins of L*, a* and b* in the balanced histogram."""
 
 N_BALANCED = int(np.prod(_BINS))
-"""Bins of the balanced histogram."""
+"""Number of bins of the balanced histogram."""
 
 _CHROMA, _MAX_CHROMA = 10, 60
 """Bins of a* and b* end at `_MAX_CHROMA`; they are narrow below `_CHROMA`, where most surfaces are."""
 
 _BALANCE = 0.45
-"""Mean of each channel that the balance leaves as it is."""
+"""Mean of a channel that the balance does not change."""
 
 _COLOR_SCALARS = slice(5, 11)
-"""Mean and standard deviation of the colours."""
+"""Indices of the mean and the standard deviation of the colours."""
 
 
 @jax.tree_util.register_dataclass
@@ -86,7 +86,7 @@ class LookDescriptors:
 
     @property
     def first(self) -> Descriptors:
-        """The descriptors [B, ...] of the first look, the paper's."""
+        """The descriptors [B, ...] of the first look, which are those of the paper."""
         return jax.tree.map(lambda a: a[:, 0], self.each)
 
     @property
@@ -97,13 +97,13 @@ class LookDescriptors:
     def fuse(self, logits: jax.Array) -> jax.Array:
         """Return class probabilities [B, n] from the logits [B * K, n] of `flat`.
 
-        They are the geometric mean over the looks, normalized to sum to 1.
+        The probabilities are the geometric mean over the looks, normalized to sum to 1.
         """
         return jax.nn.softmax(jax.nn.log_softmax(logits).reshape(*self.shape, -1).mean(axis=1))
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
-        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
+        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; the looks at a cloud are consecutive."""
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics))
 
     @jax.jit
@@ -124,10 +124,10 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
     warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
 
     def placed(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
+        """Return points [2, N, 3] and cameras [2, 3], without and with a half turn."""
         normalization = normalization_of(cloud, sigma_s)
         rotation = normalization.rotation
-        # Where the occlusion boundary decides which end comes first, there is no half turn.
+        # If the occlusion boundary decides which end comes first, there is no half turn.
         both = jnp.stack([rotation, jnp.where(normalization.end_is_occluded, rotation, half_turn @ rotation)])
         return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
@@ -137,7 +137,7 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
         masks += [] if clouds.rim is None else [clouds.mask & ~clouds.rim]
         warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
         looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
-    # One batch of all masks: tracing takes a fourth longer for a further `vmap` over the masks.
+    # All masks are one batch, since tracing takes a fourth longer with a further `vmap` over the masks.
     masked = [dataclasses.replace(clouds, mask=mask, rim=None) for mask in masks]
     batch = jax.tree.map(lambda *a: jnp.concatenate(a), *masked)
     n_clouds, n_points = clouds.mask.shape
@@ -150,20 +150,20 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
 
 
 def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> PointClouds:
-    """Return the aligned clouds of `count` looks at each cloud, that of `align` first.
+    """Return the aligned clouds of `count` looks at each cloud; the first one is the result of `align`.
 
-    A half turn is left out where the occlusion boundary decides which end comes first.
+    There is no half turn if the occlusion boundary decides which end comes first.
 
     Args:
         clouds: [B, N] clouds in metres.
-        config: only `sigma_s` and `alpha` are used; other values of them do not compile again.
+        config: only `sigma_s` and `alpha` are used; changing them does not cause a compilation.
         count: K, one of `LOOK_COUNTS`. Static.
 
     Returns:
-        [B * K, N] aligned clouds in scaled units, those of a cloud consecutive.
+        [B * K, N] aligned clouds in scaled units; the looks at a cloud are consecutive.
 
     Raises:
-        InputError: `count` is none of `LOOK_COUNTS`.
+        InputError: `count` is not in `LOOK_COUNTS`.
     """
     if count not in LOOK_COUNTS:
         raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
@@ -179,7 +179,7 @@ def describe_aligned_looks(
 
     Args:
         aligned: [B * K, N] clouds, from `aligned_looks`.
-        strips: their strips.
+        strips: strips of the clouds.
         network: colour network.
         config: static.
         count: K. Static.
@@ -220,7 +220,7 @@ def describe_looks(
 
 
 def is_color(n_regions: int) -> NDArray[np.bool_]:
-    """Return which of the statistics [12 + R] are of colours only."""
+    """Return which of the statistics [12 + R] depend on colours only."""
     result = np.arange(N_SCALARS + n_regions) >= N_SCALARS
     result[_COLOR_SCALARS] = True
     return result
@@ -228,7 +228,7 @@ def is_color(n_regions: int) -> NDArray[np.bool_]:
 
 @partial(jax.jit, static_argnums=1)
 def side_lengths(aligned: PointClouds, alpha: float) -> jax.Array:
-    """Return the side lengths [B, 3] of the boxes of aligned clouds before the turn by alpha, longest first."""
+    """Return the side lengths [B, 3] of the boxes of aligned clouds before the rotation by alpha, longest first."""
     c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
     x, y, z = jnp.moveaxis(aligned.points, -1, 0)
     sides = []
@@ -245,8 +245,8 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
 
     Args:
         sides: [B, 3] side lengths of the bounding box, longest first, scaled units.
-        clouds: [B, N] clouds, of which only colours and mask are used.
-        strips: their strips; the colour vectors give the number of points in each colour region.
+        clouds: [B, N] clouds; only colours and mask are used.
+        strips: strips of the clouds, whose colour vectors give the number of points in each colour region.
 
     Returns:
         [B, 12 + R] float32: side lengths, size of the box, number of points, mean and standard deviation of the
@@ -271,17 +271,17 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
 
 @jax.jit
 def balanced_histogram(colors: jax.Array, mask: jax.Array) -> jax.Array:
-    """Return histograms of clouds in CIELAB, after half of the colour cast and of the exposure is taken out.
+    """Return CIELAB histograms of clouds after half of the colour cast and of the exposure is removed.
 
-    Each channel is divided by the square root of its mean: with the whole of it, objects of one colour would be grey. A
-    point belongs to neighbouring bins by shares.
+    Each channel is divided by the square root of its mean, since division by the mean would make objects of one colour
+    grey. A point is shared between neighbouring bins.
 
     Args:
         colors: [B, N, 3] sRGB in [0, 1].
         mask: [B, N] bool.
 
     Returns:
-        [B, `N_BALANCED`] float32, the square roots of shares that sum to 1; zeros for a cloud without points.
+        [B, `N_BALANCED`] float32, the square roots of fractions that sum to 1; zeros for a cloud without points.
     """
     inside = mask[..., None].astype(jnp.float32)
     weight = inside / jnp.maximum(inside.sum(axis=1, keepdims=True), 1)

@@ -1,10 +1,10 @@
 """Persistence diagrams of slices and their images (paper, sections "Filtration" and "TOPS"; Adams et al. 2017).
 
-They come from gudhi, through one host callback for a batch, or from a closed form.
+The diagrams are computed by gudhi, in one host callback for a batch, or by a closed form.
 
 In the filtration of a slice, strip j adds two vertices, its points of least and greatest y, at j s2, and the edge
-between them at j s2 + (y_max - y_min). Each strip is a connected component of its own: one vertex dies when the edge
-is added, the other one never dies. The finite H0 pairs are therefore (j s2, j s2 + y_max - y_min), one for each strip;
+between them at j s2 + (y_max - y_min). Each strip is a separate connected component: one vertex dies when the edge is
+added, the other one never dies. The finite H0 pairs are therefore (j s2, j s2 + y_max - y_min), one for each strip;
 this is the closed form.
 """
 
@@ -49,7 +49,7 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
         birth_index, death_index = jax.pure_callback(
             _gudhi_pairs, (out, out), *values, strips.occupied, vmap_method="expand_dims"
         )
-        # gudhi returns which vertex and edge form a pair. JAX gathers the values, so that gradients reach them.
+        # gudhi returns which vertex and edge form a pair. JAX gathers their values, so that gradients flow to them.
         mask = death_index >= 0
         birth = jnp.take_along_axis(births, jnp.maximum(birth_index, 0), axis=-1)
         death = jnp.take_along_axis(edges, jnp.maximum(death_index, 0), axis=-1)
@@ -57,7 +57,7 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
 
 
 def _load_gudhi() -> Any:
-    # It has no wheels for ARM, where the closed form is used.
+    # gudhi has no wheels for ARM, where the closed form is used.
     try:
         return importlib.import_module("gudhi")
     except ModuleNotFoundError:
@@ -92,7 +92,7 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
 
 def cumulative_at_edges(centres: jax.Array, variance: ArrayLike, edges: jax.Array) -> jax.Array:
     """Return 2 CDF - 1 of the normal distributions at `centres` [..., J] at `edges` [P + 1], [..., P + 1, J]."""
-    # `ndtr` costs four times as much, for digits of far tails that an image does not need.
+    # `ndtr` takes four times as long, for a precision in the far tails that an image does not need.
     return erf((edges[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance))
 
 
@@ -124,7 +124,7 @@ def persistence_images(
     """
     persistence = jnp.where(diagrams.mask, diagrams.deaths - diagrams.births, 0)
     births = strip_births(config)
-    # Fill whole vector registers; a pair without persistence has no weight, so the padding adds nothing.
+    # Pad to whole vector registers; the padding adds nothing, since a pair without persistence has no weight.
     padding = -len(births) % 8
     persistence = jnp.pad(persistence, [(0, 0)] * (persistence.ndim - 1) + [(0, padding)])
     births = jnp.pad(births, (0, padding))
@@ -135,7 +135,7 @@ def persistence_images(
     edges = (jnp.arange(config.image_size + 1, dtype=births.dtype) - 1) * config.sigma_2
     by_persistence = cumulative_at_edges(persistence, variance, edges) * weight[..., None, :]
     by_birth = jnp.diff(cumulative_at_edges(births, variance, edges), axis=-2)
-    # Differences along persistence come after the product: before it, XLA evaluates each edge's `erf` twice.
+    # Take differences along persistence after the product; before it, XLA would evaluate each edge's `erf` twice.
     images = jnp.diff(jnp.matmul(by_persistence, by_birth.T, precision=jax.lax.Precision.HIGHEST), axis=-2) / 4
     return jnp.swapaxes(images, -1, -2)
 

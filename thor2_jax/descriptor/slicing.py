@@ -69,14 +69,14 @@ def region_sets(network: ColorNetwork) -> RegionSets:
     fields = of_color.astype(np.min_scalar_type(len(bits))), weights.astype(np.float32)
     # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
     with jax.ensure_compile_time_eval():
-        return RegionSets(*jax.device_put(fields))  # of NumPy arrays: JAX would compile a program for each conversion
+        return RegionSets(*jax.device_put(fields))  # from NumPy arrays, since JAX would compile each conversion
 
 
 def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
-    """Return the region set of each colour, that of the nearest grid colour.
+    """Return the region set of each colour, which is that of the nearest grid colour.
 
     Args:
-        colors: [..., 3] float32 sRGB in [0, 1]; rounded to 8 bits first, halves up.
+        colors: [..., 3] float32 sRGB in [0, 1]; they are rounded to 8 bits first, halves up.
         sets: region sets of the network.
 
     Returns:
@@ -89,12 +89,12 @@ def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
 
 
 _COORDINATE_LIMIT = 2.0**20
-"""Coordinates are clipped to this, far beyond any descriptor, so that hundredths of them fit into int32."""
+"""Bound to which coordinates are clipped, far beyond any descriptor, so that their hundredths fit into int32."""
 
 
 def strip_births(config: DescriptorConfig) -> jax.Array:
     """Return the filtration values at which the strips' vertices enter, j * sigma_2: [J] float32, scaled units."""
-    # Computed by NumPy: XLA may fuse a product on the device with a sum, and programs would differ in the last bit.
+    # NumPy computes the product: XLA may fuse it with a sum, and programs would differ in the last bit.
     return jnp.asarray(np.arange(config.n_strips) * config.sigma_2, jnp.float32)
 
 
@@ -112,14 +112,14 @@ def slices_and_strips(
         config: static.
 
     Returns:
-        Two [N] int32 arrays. Numbers may lie outside the descriptor; those of padding are meaningless.
+        Two [N] int32 arrays. Numbers may lie outside the descriptor; the numbers of padding are meaningless.
     """
     if config.convention == "paper":
         return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
-    # Rounded to 0.01, x is k / 100. The first edge j / 40 at or above it has j = ceil(2 k / 5), in integer arithmetic.
+    # After rounding to 0.01, x is k / 100. The first edge j / 40 at or above x has j = ceil(2 k / 5), in integers.
     strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
     level = _round_scaled(z, 10).astype(jnp.int32)
-    # Levels from twice the number of slices on keep their own number, which is outside the descriptor.
+    # Levels above twice the number of slices are not renumbered, since they are outside the descriptor.
     n_levels = 2 * config.n_slices
     ranked = (level >= 0) & (level < n_levels)
     occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")
@@ -130,7 +130,7 @@ def slices_and_strips(
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
     """Return the least and the greatest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
 
-    Points whose segment number is `n_segments` or more are dropped. Points that tie share the gradient of an extreme.
+    Points whose segment number is `n_segments` or more are dropped. Tied points share the gradient of an extreme.
     """
     keys = jnp.stack([-y, y], axis=-1)
     best = jnp.full((n_segments, 2), -jnp.inf, y.dtype).at[segment].max(keys, mode="drop")
@@ -149,7 +149,7 @@ def strips_of_cloud(
 
     Args:
         points: [3, N], scaled units, first octant.
-        colors: [N, 3] sRGB in [0, 1]; only a relaxation reads them.
+        colors: [N, 3] sRGB in [0, 1]; used only with a relaxation.
         mask: [N] bool.
         region_set: [N] int32, row of `sets.weights` for each point, as `color_sets` returns it.
         sets: the region sets of the colour network.
@@ -158,7 +158,7 @@ def strips_of_cloud(
     n_segments = config.n_slices * config.n_strips
     x, y, z = points
     i, j = slices_and_strips(x, z, mask, config)
-    # NaN and infinity would be converted to valid slice and strip numbers.
+    # NaN and infinity must be excluded, since they would be converted to valid slice and strip numbers.
     inside = mask & jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(z)
     inside &= (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
     overflow = (mask & ~inside).sum(dtype=jnp.int32)
@@ -186,7 +186,7 @@ def strips_of_cloud(
 
 def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, n_segments: int) -> jax.Array:
     """Return the sums of the points' region weights in each segment, [n_segments, R]."""
-    # Points are counted by region set first: one addition a point instead of one for each point and region.
+    # Points are counted by region set first, which needs one addition per point instead of one per point and region.
     n_sets = sets.weights.shape[0]
     cell = segment * n_sets + region_set
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
@@ -223,14 +223,14 @@ _OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 """[27, 3] offsets, in levels, from the nearest grid colour to itself and its neighbours."""
 
 _WEIGHT_FLOOR = 1e-3
-"""Where the weights in a strip are smaller than this, its mean is pulled to 0, which keeps the quotient bounded."""
+"""Floor of the weights in a strip's mean, which keeps the quotient bounded; for smaller weights the mean tends to 0."""
 
 
 def interval_log_weights(coordinates: jax.Array, width: float, count: int, temperature: float) -> jax.Array:
     """Return the logarithms of the weights of coordinates in consecutive intervals that start at 0.
 
-    A weight is sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval is unbounded below: aligned
-    clouds touch 0, and a point on that border belongs to no other interval.
+    A weight is sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval has no lower bound, since
+    aligned clouds touch 0, and a point on that border belongs to no other interval.
 
     Args:
         coordinates: [N].
@@ -244,7 +244,7 @@ def interval_log_weights(coordinates: jax.Array, width: float, count: int, tempe
     edges = (np.arange(count + 1) * width).astype(np.float32)
     above = jax.nn.log_sigmoid((coordinates[:, None] - edges[1:-1]) / temperature)
     below = jax.nn.log_sigmoid((edges[1:] - coordinates[:, None]) / temperature)
-    # Written as a product, the difference loses no digits where both sigmoids are nearly equal.
+    # A product instead of the difference loses no digits where both sigmoids are nearly equal.
     between = above + below[:, 1:] + np.log1p(-np.exp(-width / temperature))
     return jnp.concatenate([below[:, :1], between], axis=1)
 
@@ -273,9 +273,9 @@ def relaxed_strips(
     """Return the soft extremes and the colour vector of every strip of one aligned cloud (no batch axis).
 
     Let w be the weight of a point in a strip and m the mean of y with the weights w^2. The upper extreme is
-    m + T log(1 + sum w (exp(w (y - m) / T) - 1)), and the lower one likewise. Deviations are multiplied by w too;
-    otherwise a point high up in the next strip would dominate at any temperature in spite of its small weight. A strip
-    that holds little weight or only one point has little persistence and vanishes from the image.
+    m + T log(1 + sum w (exp(w (y - m) / T) - 1)), and the lower one is computed likewise. Deviations are multiplied by
+    w, too; otherwise a point high up in the next strip would dominate at any temperature despite its small weight. A
+    strip with little weight or only one point has little persistence and vanishes from the image.
 
     Args:
         points: [3, N], scaled units; points with a negative x or z are ignored, as in hard slices.
@@ -283,8 +283,8 @@ def relaxed_strips(
         mask: [N] bool.
         sets: region sets of the colour network.
         config: its `relaxation` gives the temperatures. Static.
-        point_weights: [N] float32 from 0 to 1, by which each point counts; a point of weight 0 is left out. By default
-            all points count fully. Their gradients attribute an answer to points (`explanation.attributions`).
+        point_weights: [N] float32 from 0 to 1, weight of each point; a point of weight 0 is left out. By default all
+            weights are 1. Gradients of the weights attribute an answer to points (`explanation.attributions`).
 
     Returns:
         Strips; a strip is occupied if any point has a positive weight in it. Their overflow is 0: `strips_of_cloud`
@@ -297,7 +297,7 @@ def relaxed_strips(
     log_strip = interval_log_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
     regions = soft_regions(colors, sets, relaxation.color)
 
-    # With a checkpoint, the gradient recomputes the [N, J] arrays of a slice instead of keeping those of all slices.
+    # With a checkpoint, the gradient recomputes the [N, J] arrays of each slice instead of storing them for all slices.
     @jax.checkpoint
     def one_slice(log_weight: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         weight = jnp.where(counted, jnp.exp(log_weight[:, None] + log_strip), 0)
@@ -315,7 +315,7 @@ def relaxed_strips(
 
 
 def square_root(values: jax.Array) -> jax.Array:
-    """Return the square roots of values; 0, with a gradient of 0, of those that are not positive."""
+    """Return the square roots of values; 0 with a gradient of 0 where a value is not positive."""
     positive = values > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, values, 1)), 0)
 
@@ -353,10 +353,10 @@ def _grid_lab() -> jax.Array:
 def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax.Array:
     """Return region weights of colours, averaged over nearby grid colours by a softmax over HyAB distances.
 
-    The 27 grid colours within one level of the nearest one share the weight in proportion to exp(-HyAB / T), times a
-    factor that fades to 0 where a channel is 1/2 + T / (1 + T) levels away. The weights are therefore continuous where
-    the nearest grid colour changes. Towards zero temperature only the colour nearest in every channel remains, as in
-    the hard rule; the colour nearest by HyAB may be another one.
+    The 27 grid colours within one level of the nearest one have weights in proportion to exp(-HyAB / T) times a factor.
+    This factor decreases to 0 where a channel is 1/2 + T / (1 + T) levels away, so that the weights are continuous
+    where the nearest grid colour changes. As the temperature approaches zero, only the colour that is nearest in every
+    channel remains, as in the hard rule; the nearest colour by HyAB may be another one.
 
     Args:
         colors: [N, 3] sRGB, clipped to [0, 1] first.
@@ -376,13 +376,13 @@ def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax
 
     reach = 0.5 + temperature / (1 + temperature)
     closeness = 1 - ((scaled[:, None] - levels.astype(scaled.dtype)) / reach) ** 2
-    # The nearest colour always stays; at a tiny temperature rounding could exclude it.
+    # The nearest colour is always included; at a tiny temperature, rounding could exclude it.
     chosen = exists & ((closeness > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
     fade = 2 * jnp.log(jnp.where(closeness > 0, closeness, 1e-7)).sum(axis=-1)
     distance = _hyab(to_lab(colors)[:, None], _grid_lab()[row])
     share = jax.nn.softmax(jnp.where(chosen, fade - distance / temperature, -jnp.inf), axis=-1)
 
-    # Summed by region set first: [N, 62] instead of [N, 27, 22].
+    # Weights are summed by region set first: [N, 62] instead of [N, 27, 22].
     by_set = jnp.zeros((len(colors), sets.weights.shape[0]), share.dtype)
     by_set = by_set.at[jnp.arange(len(colors))[:, None], sets.of_color[row]].add(share)
     return jnp.matmul(by_set, sets.weights, precision=HIGHEST)

@@ -1,6 +1,6 @@
-"""View normalization and the turn by alpha (paper, sections "View normalization" and "Slicing").
+"""View normalization and the rotation by alpha (paper, sections "View normalization" and "Slicing").
 
-View normalization rotates a cloud to a pose that does not depend on the pose of the camera; the turn prepares slicing.
+View normalization rotates a cloud to a pose that does not depend on the camera's pose; `turn` prepares slicing.
 
 >>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
 >>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
@@ -48,11 +48,11 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
 
 
 class Normalization(NamedTuple):
-    """The rotation of the view normalization of one cloud, and the cloud before it.
+    """The rotation of the view normalization of one cloud, and the cloud before this rotation.
 
     Attributes:
         rotation: [3, 3], axes of the minimal box with their signs as rows, the longest side first.
-        end_is_occluded: [] bool, whether an occluded end decided the half turn about z.
+        end_is_occluded: [] bool, whether an occluded end caused the half turn about z.
         points: [3, M], scaled units, mean zero; padding is 0.
         mask: [M] bool, False on padding.
         camera: [3], position of the camera relative to the mean.
@@ -76,7 +76,7 @@ def normalization_of(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
     axes, low, high = minimal_box(centred)
     middle = (low + high) / 2
 
-    # The mean is the origin: if the middle is positive, the mean lies below the middle.
+    # The mean is the origin, so a positive middle means that the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
     # A half turn about x moves a camera from +z to -z.
     camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
@@ -104,18 +104,18 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
     2. If the camera is on the +z side of the middle of the box, apply a half turn about x.
     3. If the mean of the points is above the middle of the box along x, apply a half turn about z, so that the end with
        more points comes first.
-    4. If the first two bins of 0.01 along x then hold more points of the occlusion boundary than the last two, apply a
-       half turn about z, so that the occluded end is not in the first slice.
+    4. If the first two bins of 0.01 along x then contain more points of the occlusion boundary than the last two, apply
+       a half turn about z, so that the occluded end is not in the first slice.
     5. Translate the cloud to the first octant.
 
-    A rigid motion of cloud and camera together does not change the result. Cubes and balls have no unique box; any of
-    the equal ones may be chosen. Gradients treat the rotation as a constant, because it is discontinuous where another
+    A rigid motion of cloud and camera together does not change the result. Cubes and balls have no unique box; any
+    minimal box may be chosen. Gradients treat the rotation as a constant, because it is discontinuous where another
     face becomes flush with the box and has no derivative where eigenvalues are equal.
 
     Args:
         clouds: metres, in any frame; the camera is in the same frame.
         config: only `sigma_s` is used. Static.
-        parameters: if given, replace the values of `config`. Other values do not compile again.
+        parameters: if given, replace the values of `config`. New values do not cause a compilation.
 
     Returns:
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
@@ -142,12 +142,12 @@ def _turn(normal: PointClouds, alpha: ArrayLike) -> PointClouds:
 
 
 def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """Turn normalized clouds by -alpha about y, so that the long axis is at alpha to the x-y plane (paper, "Slicing").
+    """Rotate normalized clouds by -alpha about y; the long axis then has the angle alpha to the x-y plane ("Slicing").
 
     Args:
         normal: clouds as `view_normalize` or `mirror` return them.
         config: only `alpha` is used. Static.
-        parameters: if given, replace the values of `config`. Other values do not compile again.
+        parameters: if given, replace the values of `config`. New values do not cause a compilation.
 
     Returns:
         Aligned clouds in scaled units, in the first octant.
@@ -160,8 +160,8 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 
 
 def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    """Rotate one cloud, turn it by alpha and translate it to the first octant; return points [M, 3] and camera [3]."""
-    # One rotation suffices: the translation between the two would cancel.
+    """Rotate one cloud, also by alpha, and translate it to the first octant; return points [M, 3] and camera [3]."""
+    # One rotation suffices, since the translation between the two rotations would cancel.
     turned = jnp.matmul(_about_y(alpha), rotation, precision=HIGHEST)
     points, camera = _place(turned, normalization.points, normalization.mask, normalization.camera)
     return points.T, camera

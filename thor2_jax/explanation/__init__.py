@@ -1,1 +1,1 @@
-"""Explanations of answers: the points that decided, slices and strips left out, smallest changes, nearest views."""
+"""Explanations of answers: attributions of points, omission of slices and strips, smallest changes, nearest views."""

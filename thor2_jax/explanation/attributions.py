@@ -1,12 +1,12 @@
 """Attributions: how much each point of a cloud contributes to an answer (Sundararajan et al. 2017).
 
 Every point has a weight in the relaxed descriptor. The attribution of a point is the gradient of the answer's margin
-with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients); the
-frames of the looks, and the histogram of balanced colours that galleries compare, are held constant. To first order, it
-is the decrease of the margin when the point is removed.
+with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients). The
+frames of the looks, and the histogram of balanced colours in galleries, are held constant. To first order, the
+attribution is the decrease of the margin when the point is removed.
 
-`leave_out` is their exact check: the decrease of the margin without each slice and strip of the first look. Its
-points are removed from all looks, and the frames remain those of the whole cloud, as for the attributions.
+`leave_out` checks the attributions exactly: it computes the decrease of the margin without each slice and strip of the
+first look. The points are removed from all looks, whose frames remain those of the whole cloud, as for attributions.
 """
 
 import dataclasses
@@ -28,27 +28,27 @@ from thor2_jax.types import PointClouds, Strips
 __all__ = ["Attributions", "Faithfulness", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
 
 RELAXATION = Relaxation(slice=0.001, strip=0.00025, extremum=0.005, color=0.1)
-"""Weights of points have gradients in hard slices, strips and colour regions too; only the extremes need a temperature.
-Chosen on tuning frames."""
+"""Temperatures, chosen on tuning frames. They are small except for the extremes, since the weights of points have
+gradients even with hard slices, strips and colour regions."""
 
 STEPS = 8
-"""Points of the path from half of the weights to all of them."""
+"""Number of steps on the path, on which the weights increase from 1/2 to 1."""
 
 PATHS = (8, 3, 1)
-"""Numbers of the last steps that are averaged: from half of the weights, from four fifths, and at the end."""
+"""Numbers of last steps over which gradients are averaged: from weights of 1/2, from weights of 4/5, and at the end."""
 
 SMOOTHING = (0.0, 0.005, 0.015)
 """Standard deviations of the Gaussians with which attributions are averaged over neighbouring points, metres. A strip
-depends on its outermost points only, and without them the next ones take their place; smoothed attributions belong to
-patches of the surface. Of all paths and smoothings, those are chosen whose most attributed tenth lowers the exact
-margin most."""
+depends only on its outermost points, but without them the next points replace them, so smoothing spreads attributions
+over patches of the surface. The path and smoothing are chosen whose most attributed tenth lowers the exact margin
+most."""
 
 RANDOM_TENTHS = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Faithfulness:
-    """Losses of the exact margin with a tenth of the points, all of recognition computed again.
+    """Losses of the exact margin without a tenth of the points, for which recognition is repeated completely.
 
     Attributes:
         margin: margin with all points.
@@ -71,8 +71,8 @@ class Attributions:
     """The attributions of a cloud's points to its answer.
 
     Attributes:
-        values: [n] float32; the margin lost with each point, to first order. Negative values speak against the answer.
-        faithfulness: exact check.
+        values: [n] float32, loss of margin without each point, to first order; negative values oppose the answer.
+        faithfulness: exact check of the values.
     """
 
     values: NDArray[np.float32]
@@ -85,7 +85,7 @@ def tenth_of(n_points: int) -> int:
 
 
 def select_points(instance: PreparedInstance, kept: NDArray[np.bool_]) -> PreparedInstance:
-    """Return the instance with some of its points only, `kept` [n]."""
+    """Return the instance with only the points in the mask `kept` [n]."""
     points, colors = instance.points[kept], instance.colors[kept]
     rim = None if instance.rim is None else instance.rim[kept]
     return dataclasses.replace(instance, points=points, colors=colors, boundary=instance.boundary[kept], rim=rim)
@@ -104,7 +104,7 @@ def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets,
 
 
 def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArray[np.float32]:
-    """Return the gradients [STEPS, N] of the relaxed margin of a name with respect to the points' weights on the path.
+    """Return the gradients [STEPS, N] of a name's relaxed margin with respect to the points' weights along the path.
 
     Args:
         scores: class scores.
@@ -130,13 +130,13 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     Args:
         points: [n, 3] metres.
         values: [m, n].
-        deviation: standard deviation of the Gaussian, metres; neighbours are at most two of them away. 0: no average.
+        deviation: standard deviation of the Gaussian, metres; neighbours are at most twice as far. 0: no average.
     """
     if deviation == 0:
         return values
     tree = KDTree(points)
     near = tree.sparse_distance_matrix(tree, 2 * deviation, output_type="coo_matrix").tocsr()
-    # A distance of 0, to the point itself, is stored too.
+    # The distance of each point to itself, 0, is stored, too.
     near.data = np.exp(-np.square(near.data / deviation) / 2)
     sums = near @ np.vstack([values, np.ones(len(points))]).T
     return (sums[:, :-1] / sums[:, -1:]).T.astype(np.float32)
@@ -176,9 +176,9 @@ class LeftOut:
     Attributes:
         slices: [S] float32, loss without the slice; NaN if it is empty.
         strips: [S, J] float32, loss without the strip; NaN if it is empty.
-        predicted: [S, J] float32, sum of the attributions of the strip; NaN if it is empty.
+        predicted: [S, J] float32, sum of the attributions in the strip; NaN if it is empty.
         agreement: rank correlation (Spearman) of the losses of the strips with their predictions; None if
-            there are fewer than three strips or all are equal.
+            there are fewer than three strips or all values are equal.
     """
 
     slices: NDArray[np.float32]
@@ -188,7 +188,7 @@ class LeftOut:
 
 
 def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions: NDArray[np.float32]) -> LeftOut:
-    """Leave out each slice and each strip of an instance in turn.
+    """Compute the margin without each slice and without each strip of an instance.
 
     Args:
         scores: class scores.

@@ -1,7 +1,7 @@
-"""Smallest changes: how little the colour or the extents of an object would have to change for another answer.
+"""Smallest changes of the colour or the extents of an object that lead to another answer.
 
 Steps along the gradient of the relaxed descriptor give directions of change. Along each direction, the smallest change
-with another answer is searched for with the exact descriptor, whose frames are computed again for every change.
+with another answer is searched for with the exact descriptor, whose frames are recomputed for every change.
 """
 
 import dataclasses
@@ -28,10 +28,10 @@ CHANGES: tuple[Kind, ...] = ("color", "extent")
 """Kinds of changes."""
 
 RELAXATION = Relaxation(slice=0.01, strip=0.0025, extremum=0.005, color=4.0)
-"""Wide enough that gradients tell of borders of slices, strips and colour regions at some distance."""
+"""Temperatures at which gradients reflect borders of slices, strips and colour regions at some distance."""
 
 STEPS = 8
-"""Steps along the gradient."""
+"""Number of steps along the gradient."""
 
 STEP = {"color": 0.04, "extent": 0.05}
 """Length of the longest step: of a shift of sRGB in [0, 1], and of logarithms of factors."""
@@ -40,17 +40,17 @@ LARGEST = {"color": 0.5, "extent": float(np.log(2))}
 """Largest change that is tried, in the same units."""
 
 SCALES = 24
-"""Changes that are tried along a direction, equally spaced up to the largest."""
+"""Number of changes that are tried along a direction, equally spaced up to the largest one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """The smallest change of one kind that was found to give another answer.
+    """The smallest change of one kind with another answer, as far as the search has found it.
 
     Attributes:
-        kind: "color" is a shift of the sRGB colour of all points, "extent" a factor for each side of the box.
+        kind: "color" for a shift of the sRGB colour of all points, "extent" for a factor for each side of the box.
         values: the shift of red, green and blue in units of 255, or the factors of the sides, longest first.
-        size: length of the shift, in units of 255, or the largest change of a side as a fraction of it.
+        size: length of the shift, in units of 255, or the largest relative change of a side.
         answer: the other answer.
         margin: margin of the first answer after the change.
     """
@@ -88,7 +88,7 @@ def changed_instance(
         instance: the instance.
         kind: kind of the change.
         parameters: [3] shift of sRGB in [0, 1], or logarithms of factors along the axes.
-        axes: [3, 3] axes of its box as rows.
+        axes: [3, 3] axes of the instance's box as rows.
     """
     if kind == "color":
         shifted = np.clip(instance.colors / 255 + parameters, 0, 1)
@@ -100,7 +100,7 @@ def changed_instance(
 
 
 def apply_change(instance: PreparedInstance, change: Change, config: DescriptorConfig) -> PreparedInstance:
-    """Return an instance after a change that was found for it; `config` is the descriptor's configuration."""
+    """Return an instance after a change from `smallest_change`; `config` is the descriptor's configuration."""
     values = np.array(change.values)
     parameters = values / 255 if change.kind == "color" else np.log(values)
     return changed_instance(instance, change.kind, parameters, np.asarray(_axes(packed(instance), config), np.float64))
@@ -137,12 +137,13 @@ def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int,
 
     Args:
         scores: class scores.
-        instance: an instance whose best score is that of the name.
+        instance: an instance for which the name has the best score.
         index: number of the name in `scores.names`.
         kind: kind of the change.
 
     Returns:
-        The change; None if there is no other name, or none was found up to a shift of 127 of 255, or a factor of 2.
+        The change; None if there is no other name, or if no change is found up to a shift of 127 of 255 or a factor
+        of 2.
     """
     if len(scores.names) < 2:
         return None
@@ -160,7 +161,7 @@ def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int,
     changed = first_change((lengths[:, None, None] * directions).reshape(-1, 3))
     if changed is None:
         return None
-    # Between the last length that was tried and the one that was found.
+    # Refine the length between the last one with the same answer and the first one with another answer.
     step = lengths[0] / np.linalg.norm(changed[0])
     finer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
     parameters, values = finer or changed

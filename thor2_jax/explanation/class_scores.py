@@ -1,8 +1,8 @@
 """Class scores: the quantity that an explanation explains, as a differentiable function of descriptors.
 
-The classifiers' answer is explained by its log-odds, that of a gallery by its similarity to the enrolled views. Both
-are fused over the looks at an instance, as recognition fuses them. Where the paper's classifiers choose the answer, the
-embedding, which then gives only its confidence, is not explained.
+An answer of the classifiers is explained by its log-odds, an answer of a gallery by its similarity to the enrolled
+views. Both are fused over the looks at an instance, as in recognition. If the paper's classifiers choose the answer,
+the embedding determines only the confidence and is not explained.
 """
 
 import dataclasses
@@ -33,12 +33,12 @@ __all__ = ["ClassScores", "Unit", "classifier_scores", "gallery_scores"]
 Unit = Literal["log-odds", "similarity"]
 
 ROWS = 8
-"""Variants of a cloud that are described in one call."""
+"""Number of versions of a cloud that are described in one call."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ClassScores:
-    """Scores of all names that an instance may have.
+    """Scores of all names that an answer can have.
 
     Attributes:
         names: n names.
@@ -60,8 +60,8 @@ class ClassScores:
     def margin(self, scores: jax.Array, index: int) -> jax.Array:
         """Return the margins [B] of the name `index` from scores [B, n], the quantity that is explained.
 
-        For classifiers it is the log-odds log(p / (1 - p)) of the name, for a gallery the difference to the most
-        similar other object. A single name has a margin of its own score.
+        For classifiers, the margin is the log-odds log(p / (1 - p)) of the name; for a gallery, it is the difference to
+        the score of the most similar other object. If there is only one name, the margin is its score.
         """
         own, others = scores[:, index], jnp.delete(scores, index, axis=1, assume_unique_indices=True)
         if not others.shape[1]:
@@ -69,11 +69,11 @@ class ClassScores:
         return own - (jax.nn.logsumexp(others, axis=1) if self.unit == "log-odds" else others.max(axis=1))
 
     def orient(self, instance: PreparedInstance) -> PointClouds:
-        """Return the K looks at an instance, [K, N] aligned clouds, that of the paper first; each has its own mask."""
+        """Return the K looks at an instance, [K, N] aligned clouds, the paper's look first; each has its own mask."""
         return aligned_looks(packed(instance), self.config, self.count)
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
-        """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
+        """Return the scores [B, n] of instances, each in its own frames, as in recognition."""
         capacity = batch_points(len(instance.points) for instance in instances)
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
@@ -83,7 +83,7 @@ class ClassScores:
         return self._of_rows(instances, describe)
 
     def of_masks(self, looks: PointClouds, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return the exact scores [B, n] of parts of a cloud; its frames are those of the whole cloud.
+        """Return the exact scores [B, n] of parts of a cloud in the frames of the whole cloud.
 
         Args:
             looks: [K, N] looks at the cloud, from `orient`.
@@ -134,7 +134,7 @@ def _checked(config: DescriptorConfig) -> DescriptorConfig:
 
 
 def classifier_scores(model: Model) -> ClassScores:
-    """Return the fused log-probabilities of the classifiers, for all classes that are not forgotten.
+    """Return the fused log-probabilities of the classifiers for all classes that have not been forgotten.
 
     Raises:
         InputError: the run's descriptor has the convention of the released code.
@@ -154,10 +154,10 @@ def classifier_scores(model: Model) -> ClassScores:
 
 
 def gallery_scores(model: Model) -> ClassScores:
-    """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each.
+    """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each object.
 
     Args:
-        model: at least one object is enrolled.
+        model: model with at least one enrolled object.
 
     Raises:
         InputError: the embedding's descriptor has the convention of the released code.

@@ -4,8 +4,8 @@
 >>> explanation.name, explanation.attributions.values.argmax()                      # doctest: +SKIP
 ('mug', 1204)
 
-The fused answer of all looks is explained, since it is the one that recognition gives. Slices, strips, diagrams and
-colour matrices are those of the first look, which is the paper's.
+The explained answer is the one of recognition, which fuses all looks. Slices, strips, diagrams and colour matrices are
+those of the first look, which is the paper's.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ __all__ = [
 
 
 OBJECTS = 3
-"""Objects of which the nearest view is shown."""
+"""Number of objects whose nearest view is shown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,9 +72,9 @@ class NearestView:
 
     Attributes:
         name: name of the object.
-        number: number of the view among those of the object, in the order of enrolment.
-        similarity: largest cosine of the embeddings of the looks at both, at most 1.
-        view: its cloud.
+        number: number of the view of the object, in the order of enrolment.
+        similarity: largest cosine between embeddings of the looks at the instance and at the view, at most 1.
+        view: cloud of the view.
     """
 
     name: str
@@ -85,18 +85,18 @@ class NearestView:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
-    """Why an instance has its answer.
+    """Explanation of the answer for an instance.
 
     Attributes:
         recognition: the answer.
-        name: the name that is explained: the most probable one, also of an unknown object.
-        runner_up: the name with the second best score; None if there is no other.
+        name: the explained name, which is the most probable one, also for an unknown object.
+        runner_up: the name with the second best score; None if there is no other name.
         scores: the explained quantity.
         instance: the cloud, n points.
-        described: its descriptor.
-        attributions: which points decided.
+        described: descriptor of the cloud.
+        attributions: contributions of the points to the answer.
         left_out: contributions of slices and strips, as the exact check of the attributions.
-        changes: the smallest changes that give another answer, one for each kind for which one was found.
+        changes: the smallest changes that lead to another answer, one for each kind with a result.
         nearest: nearest enrolled views; empty without a gallery.
     """
 
@@ -113,7 +113,7 @@ class Explanation:
 
     @property
     def title(self) -> str:
-        """The answer in words."""
+        """The answer as a phrase."""
         return self.name if self.recognition.name is not None else f"unknown, most like {self.name}"
 
     @property
@@ -122,7 +122,7 @@ class Explanation:
         return self.scores.config
 
     def as_json(self) -> dict[str, Any]:
-        """Return the explanation as JSON values; lengths are in metres, colours in 0..255."""
+        """Return the explanation as JSON values, with lengths in metres and colours in 0..255."""
         answer, check, left = self.recognition, self.attributions.faithfulness, self.left_out
         cells = np.argwhere(np.isfinite(left.strips))
         return {
@@ -154,7 +154,7 @@ class Explanation:
 def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation:
     """Explain the answer for one instance of a frame.
 
-    The first call with a new size of clouds compiles for some seconds; later ones take one to a few seconds.
+    The first call with a new size of clouds compiles for some seconds; later calls take one to a few seconds.
 
     Args:
         recognizer: the recognizer.
@@ -162,8 +162,8 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
         label: number of the instance, one of `frame.instances`.
 
     Raises:
-        InputError: there is no such instance, it cannot be described, no object is known, or the run's descriptor has
-            the convention of the released code.
+        InputError: there is no such instance, it cannot be described, the model has no object, or the run's descriptor
+            has the convention of the released code.
     """
     model = recognizer.model
     return explain_instance(model, model.corrected(instance_view(frame, label, model.run.config.sigma_s)))
@@ -178,7 +178,7 @@ def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
 
 
 def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index: int) -> Iterator[tuple[str, Any]]:
-    """Yield the further fields of an explanation, most of which compile for seconds."""
+    """Yield the further fields of an explanation with their values; most of them compile for seconds."""
     scored = scores.of_instances([instance])[0]
     others = [k for k in np.argsort(-scored, kind="stable") if k != index]
     yield "runner_up", scores.names[others[0]] if others else None
@@ -186,7 +186,7 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
     attributions = attribute_points(scores, looks, instance, index)
     yield "attributions", attributions
     yield "left_out", leave_out(scores, looks, index, attributions.values)
-    # Where classifiers and gallery answer together, the best score need not be that of the answer.
+    # If classifiers and gallery answer together, the best score may belong to another name than the answer.
     kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)
@@ -195,19 +195,19 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
 
 
 def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
-    """Compile what explanations of clouds of a padded size need.
+    """Compile the functions for explanations of clouds of a padded size.
 
     Args:
         model: the model.
         n_points: padded size.
-        by_classifiers: kind of scores, one of `explained_kinds`.
-        is_stopped: asked between the steps, each of which takes seconds, whether to end early.
+        by_classifiers: kind of scores, a key of `explained_kinds`.
+        is_stopped: function that returns whether to end early; called between steps, which take seconds.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform(0, (0.12, 0.08, 0.05), (n_points, 3)).astype(np.float32)
     instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
     name = explained_kinds(model).get(by_classifiers)
-    if name is None:  # The last such object has been forgotten.
+    if name is None:  # The last object of this kind has been forgotten.
         return
     _answer(model, instance)
     scores = _scores_of(model, name)
@@ -218,9 +218,9 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
 
 
 def explained_kinds(model: Model) -> dict[bool, str]:
-    """Return a name that is explained by the classifiers (key True) and one that is explained by the gallery (False).
+    """Return a name that the classifiers explain (key True) and a name that the gallery explains (key False).
 
-    A kind that no name has is left out.
+    A key without such a name is left out.
     """
     return dict(zip(_by_classifiers(model).tolist(), model.names, strict=True))
 
@@ -252,10 +252,10 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
 
 
 def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:
-    """Return the nearest view of each of the most similar enrolled objects, the most similar one first.
+    """Return the nearest view of each of the most similar enrolled objects, the most similar object first.
 
     Args:
-        model: its gallery may be empty; the result then is, too.
+        model: the model; if its gallery is empty, so is the result.
         instance: the instance.
     """
     objects = model.gallery.objects
@@ -276,7 +276,7 @@ def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView
 def pixel_attributions(explanation: Explanation, frame: RGBDFrame) -> NDArray[np.float32]:
     """Return the attribution of the nearest point of the cloud for each pixel of the instance, [H, W].
 
-    Pixels of the background are NaN, and pixels whose depth is not in the cloud, for example outliers.
+    Pixels of the background and pixels whose depth is not in the cloud, such as outliers, are NaN.
     """
     pixels = frame.instance_pixels[explanation.instance.label]
     points = frame.points(pixels)

@@ -1,4 +1,4 @@
-"""Pictures of an explanation: matplotlib figures with captions, made of the plots of `thor2_jax.plot`."""
+"""Pictures of an explanation: matplotlib figures with captions, which use the plots of `thor2_jax.plot`."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 __all__ = ["ExplanationPicture", "change_text", "main_pictures", "pictures"]
 
 _SIZE = (5.2, 4.4)
-"""Inches; with 130 pixels each, a picture is legible on a telephone too."""
+"""Size in inches; with 130 pixels per inch, a picture is legible on a telephone, too."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class ExplanationPicture:
     """A picture of an explanation.
 
     Attributes:
-        name: name of its file, without ending.
+        name: name of the picture's file, without ending.
         section: "decided", "changes", "nearest", "shape", "slices" or "network".
         title: short title.
         caption: description in full sentences.
@@ -48,7 +48,7 @@ def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, 
 
 
 def main_pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[ExplanationPicture]:
-    """Yield the pictures that matter most: the points that decided, the smallest changes and the nearest views."""
+    """Yield the most important pictures: the attributions of points, the smallest changes and the nearest views."""
     yield _photo(explanation, frame)
     yield _decided_cloud(explanation)
     if explanation.changes:
@@ -62,7 +62,7 @@ def pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[Explanation
 
     Args:
         explanation: the explanation.
-        frame: the frame that it was made from.
+        frame: the frame of the explained instance.
     """
     yield from main_pictures(explanation, frame)
     yield _slices(explanation, decided=True)
@@ -91,7 +91,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     grey = 0.55 * color.mean(axis=2, keepdims=True) / 255 + 0.35
     shown = np.repeat(grey, 3, axis=2)
     known = np.isfinite(painted)
-    # Each pixel has the value of the largest magnitude around it, so that single points are seen.
+    # Each pixel shows the value of largest magnitude around it, so that single points are visible.
     size = max(3, color.shape[1] // 60)
     high, low = (extreme(np.nan_to_num(painted), size)[known] for extreme in (maximum_filter, minimum_filter))
     colored = plot.attribution_colors(explanation.attributions.values).to_rgba(np.where(high > -low, high, low))
@@ -108,8 +108,8 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
         axes.set_axis_off()
     _color_bar(figure, [first, second], explanation, below=True)
     caption = (
-        f"Orange pixels speak for {explanation.name}, blue ones against it, and grey ones hardly matter. Where "
-        "the outline decides, few pixels do: the width of a strip hangs on its outermost points."
+        f"Orange pixels support {explanation.name}, blue pixels oppose it, and grey pixels have little influence. If "
+        "the outline decides, few pixels are coloured: the width of a strip depends only on its outermost points."
     )
     return ExplanationPicture("photo", "decided", "What decided, on the photo", caption, figure)
 
@@ -133,7 +133,7 @@ def _check(explanation: Explanation) -> ExplanationPicture:
     rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
     figure = Figure(figsize=_SIZE, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
-    titles = ("exact: what the answer loses without the strip", "sum of the attributions of the strip")
+    titles = ("exact: loss of the answer without the strip", "predicted: sum of the attributions in the strip")
     for axes, values, title in zip(panels, (left.strips, left.predicted), titles, strict=True):
         shown = values[:rows, :columns]
         scale = plot.attribution_colors(shown[np.isfinite(shown)])
@@ -143,8 +143,8 @@ def _check(explanation: Explanation) -> ExplanationPicture:
         axes.set(ylabel="slice", yticks=range(rows))
     axes.set_xlabel("strip")
     caption = (
-        f"Above, each strip is left out in turn and the answer is computed again ({_unit(explanation)}). Below, what "
-        "the attributions predict for it."
+        f"Above: the loss of the answer if it is computed again without the strip ({_unit(explanation)}). Below: the "
+        "loss that the attributions predict."
     )
     if left.agreement is not None:
         caption += f" The rank correlation of both is {left.agreement:.2f} (1: the same order, 0: unrelated)."
@@ -195,7 +195,7 @@ def _nearest(explanation: Explanation) -> ExplanationPicture:
 def _clouds(
     shown: Sequence[tuple[str, PreparedInstance]], columns: int, height: float, own_scales: bool = False
 ) -> Figure:
-    """Draw clouds with their titles in rows of a height in inches, around their means or at scales of their own."""
+    """Draw clouds with titles in rows of the given height in inches, around their means or at their own scales."""
     rows = math.ceil(len(shown) / columns)
     figure = Figure(figsize=(_SIZE[0], rows * height), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=not own_scales, sharey=not own_scales).flat
@@ -219,12 +219,12 @@ def _slices(explanation: Explanation, decided: bool) -> ExplanationPicture:
         _color_bar(figure, axes, explanation)
         title = "What decided, in slices and strips"
         caption = (
-            "The same points, turned as the descriptor sees them, with slices (numbered rows) and strips (columns)."
+            "The same points, aligned as they are for the descriptor, with slices (numbered rows) and strips (columns)."
         )
         return ExplanationPicture("slices-attributions", "decided", title, caption, figure)
     slice_mm, strip_mm = (1000 * width / config.sigma_s for width in (config.sigma_1, config.sigma_2))
     caption = (
-        "The points seen from the side, after the object was turned so that its longest side rises at 45 degrees. "
+        "The points seen from the side, after the object was rotated so that its longest side rises at 45 degrees. "
         f"Slices (numbered rows) are {slice_mm:.0f} mm thick, strips (columns) {strip_mm:.0f} mm wide. "
         f"One scaled unit is {1000 / config.sigma_s:.0f} mm."
     )
@@ -236,7 +236,7 @@ def _diagrams(explanation: Explanation) -> ExplanationPicture:
     plot.persistence_diagram(axes, explanation.described.diagrams, explanation.config)
     caption = (
         "Persistence diagrams: one dot for each strip, in the colour of its slice. Its birth is the position of the "
-        "strip; its height above the dashed line, the persistence, is how wide the object is there."
+        "strip; its height above the dashed line, the persistence, is the width of the object there."
     )
     return ExplanationPicture("diagrams", "shape", "Persistence diagrams", caption, figure)
 
@@ -264,7 +264,7 @@ def _network(explanation: Explanation) -> ExplanationPicture:
     order = np.argsort(-weights)[:3]
     most = ", ".join(f"{k} ({weights[k] / max(float(weights.sum()), 1e-9):.0%})" for k in order if weights[k] > 0)
     caption = (
-        "The colour network: regions of similar colours, joined where they are neighbours. Discs in full colour are "
-        f"those of this object and grow with its number of points; most are in region {most}. Pale regions are unused."
+        "The colour network: regions of similar colours, connected if they are neighbours. Discs in full colour are "
+        f"regions of this object, sized by its number of points; most are in region {most}. Pale regions are unused."
     )
     return ExplanationPicture("network", "network", "The part of the colour network in use", caption, figure)

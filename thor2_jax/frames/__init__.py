@@ -1,1 +1,1 @@
-"""Frames of a camera: images, intrinsics, frames, and the clouds of their instances."""
+"""Camera frames: image files, intrinsics, frames, and the clouds of their instances."""

@@ -1,4 +1,4 @@
-"""RGB-D frames with an instance segmentation: validated when they are made, read from image files.
+"""RGB-D frames with an instance segmentation, which are validated at construction and can be read from image files.
 
 frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
 frame.instances                        # label numbers; 0 is background
@@ -43,7 +43,7 @@ MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
 """Range of valid depth, metres."""
 
 MAX_INSTANCES = 1000
-"""Largest number of instances of a frame; an image that is no label image, such as a depth image, has thousands."""
+"""Largest number of instances of a frame; other images than labels, such as depth, have thousands of values."""
 
 MAX_DISTORTION_ERROR = 0.5
 """Largest error of the inverse of a lens distortion, pixels."""
@@ -61,13 +61,14 @@ class RGBDFrame:
     Attributes:
         color: [H, W, 3] uint8, sRGB.
         depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
-            (millimetres by default) or floats in metres; 0, and in floats also NaN or infinity, where there is none.
+            (millimetres by default) or floats in metres; 0, or for floats also NaN or infinity, means no depth.
         labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
             segmented: `thor2_jax.segmentation.segmented` returns it with labels.
         intrinsics: the camera of all three images; a mapping, matrix or ROS message is converted by `Intrinsics.of`.
 
     Raises:
-        InputError: a shape or type that does not fit, or intrinsics of another image size; names the argument.
+        InputError: a shape or type does not fit, or the intrinsics have another image size; the message names the
+            argument.
     """
 
     color: NDArray[np.uint8]
@@ -91,7 +92,7 @@ class RGBDFrame:
             object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields, without what is computed of them, for another process."""
+        """Return the fields without cached properties, to send the frame to another process."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @cached_property
@@ -103,7 +104,7 @@ class RGBDFrame:
 
     @property
     def label_image(self) -> NDArray[Any]:
-        """`labels` of a frame that has them.
+        """The labels [H, W] of a frame with labels.
 
         Raises:
             InputError: the frame has no labels.
@@ -125,10 +126,10 @@ class RGBDFrame:
         """Label number -> sorted flat indices (row * W + column) of its pixels, in the order of `instances`.
 
         Raises:
-            InputError: as `label_image`, or there are more than `MAX_INSTANCES` instances.
+            InputError: the frame has no labels, or more than `MAX_INSTANCES` instances.
         """
         flat = self.label_image.ravel()
-        pixels = np.flatnonzero(flat != 0)  # several times as fast on booleans as on integers
+        pixels = np.flatnonzero(flat != 0)  # much faster for booleans than for integers
         order = np.argsort(flat[pixels], kind="stable")
         pixels = pixels[order]
         labels, first = np.unique(flat[pixels], return_index=True)
@@ -141,7 +142,7 @@ class RGBDFrame:
 
     @cached_property
     def instances(self) -> tuple[int, ...]:
-        """Label numbers of the frame in increasing order, without 0; raises InputError as `instance_pixels`."""
+        """Label numbers of the frame without 0, in increasing order; raises InputError as `instance_pixels`."""
         return tuple(self.instance_pixels)
 
     def points(self, pixels: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -153,7 +154,7 @@ class RGBDFrame:
 
 
 def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
-    """Raise InputError unless shapes and types of the images of a frame fit; the type of depth is not checked."""
+    """Raise InputError unless the shapes and types of a frame's images are valid; the type of depth is not checked."""
     if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
         raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
     if color.dtype != np.uint8:
@@ -166,7 +167,7 @@ def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDA
 
 
 def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return the radial factor and the tangential terms of both axes, of OpenCV's polynomial or rational model.
+    """Return the radial factor and both tangential terms of OpenCV's polynomial or rational model.
 
     Coordinates, here and below, are x / z and y / z in the camera frame; the coefficients are `Intrinsics.distortion`.
     """
@@ -178,15 +179,15 @@ def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Ar
 
 
 def distort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
-    """Return where the lens images the directions (x, y) of an ideal pinhole camera."""
+    """Return the image coordinates of directions (x, y), which are the coordinates in an ideal pinhole camera."""
     radial, tangential_x, tangential_y = _terms(x, y, coefficients)
     return x * radial + tangential_x, y * radial + tangential_y
 
 
 def undistort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
-    """Return the directions that the lens images at (x, y): the inverse of `distort`, by fixed-point iteration.
+    """Return the inverse of `distort` at (x, y), computed by fixed-point iteration.
 
-    Where the model has no inverse, the result is arbitrary; `distort` of it shows that.
+    Where the model has no inverse, the result is arbitrary, and `distort` does not map it to (x, y).
     """
     ideal_x, ideal_y = x, y
     with np.errstate(all="ignore"):
@@ -211,7 +212,7 @@ def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> 
 
 
 def _check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
-    """Raise an InputError unless the camera fits images of this size."""
+    """Raise InputError unless the camera fits images of this size."""
     size = intrinsics.width or width, intrinsics.height or height
     if size != (width, height):
         raise InputError(
@@ -244,7 +245,7 @@ def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
 def pixel_points(pixels: NDArray[np.intp], depth_m: NDArray[Any], width: int, intrinsics: Intrinsics) -> NDArray[Any]:
     """Return the points [n, 3] of pixels (flat indices [n] of an image of this width) with depths [n] in metres.
 
-    They are computed in float64 and have the type of the depths. The frame is that of `backproject`.
+    They are computed in float64 and returned in the type of the depths, in the frame of `backproject`.
     """
     return (pixel_rays(pixels, width, intrinsics) * depth_m[:, None]).astype(depth_m.dtype)
 
@@ -282,13 +283,13 @@ def read_frame(
         depth: one-channel image, see `read_depth`.
         labels: one-channel or indexed image of instance numbers, 8 or 16 bits, lossless; 0 is background.
             None for a frame without labels.
-        intrinsics: file in a format of `thor2_jax.frames.intrinsics`. Of a BOP scene_camera.json, the entry of the
-            image whose number is the name of `color` is taken.
-        depth_scale: depth units per metre, in place of the one in `intrinsics`.
+        intrinsics: file in a format of `thor2_jax.frames.intrinsics`. From a BOP scene_camera.json, the entry whose
+            image number is the name of `color` is read.
+        depth_scale: depth units per metre, in place of the value in `intrinsics`.
 
     Raises:
-        InputError: a file is damaged or of the wrong kind, or the images differ in size; names the file or
-            the argument.
+        InputError: a file is damaged or of the wrong kind, or the images differ in size; the message names the
+            file or the argument.
         OSError: a file cannot be opened.
     """
     label_image = None if labels is None else read_labels(labels)
@@ -312,10 +313,10 @@ def stamp_name(stamp: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class RecordedFrame:
-    """A frame that can be read.
+    """A frame that is read on demand.
 
     Attributes:
-        name: unique: time stamp in seconds, with a number if several frames have it, or name of the folder.
+        name: unique name: time stamp in seconds, with a number if several frames share it, or name of the folder.
         read: function that returns the frame, without labels in recordings; raises InputError and OSError.
         stamp: time of the colour image, nanoseconds.
         gap: time from the colour image to the depth image, nanoseconds.

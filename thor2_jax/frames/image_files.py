@@ -1,4 +1,4 @@
-"""Images whose content is not trusted: PNG, JPEG and TIFF, and files of depth also as NPY and EXR."""
+"""Reading of untrusted image files: PNG, JPEG and TIFF, for depth also NPY and EXR."""
 
 import math
 from pathlib import Path
@@ -22,11 +22,11 @@ MAX_IMAGE_PIXELS = 2**26
 _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
-"""Names of the channel of an EXR file that holds depth, if it has several."""
+"""Names of the depth channel in EXR files with several channels."""
 
 
 class ImageSizeError(ValueError):
-    """An image has no pixels, or more than are read."""
+    """Error of an image that has no pixels or too many."""
 
 
 def check_size(width: int, height: int, max_pixels: int = MAX_IMAGE_PIXELS) -> None:
@@ -46,8 +46,8 @@ def decode_image(
     Pillow keeps 8 of these 16 bits.
 
     Raises:
-        ImageSizeError: it has more than `max_pixels`.
-        Exception: of many kinds, if it is damaged, not of `formats` or, with `lossless`, has JPEG compression.
+        ImageSizeError: the image has more than `max_pixels` pixels.
+        Exception: of any type, if the image is damaged, not in `formats` or, with `lossless`, has JPEG compression.
     """
     with Image.open(stream, formats=formats) as image:
         check_size(*image.size, max_pixels)
@@ -61,11 +61,11 @@ def decode_image(
 
 
 def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
-    """Read an image file by `decode_image`.
+    """Read an image file with `decode_image`.
 
     Raises:
-        InputError: the file is damaged, not of `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
-            JPEG compression; names `argument` and the file.
+        InputError: the file is damaged, not in `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
+            JPEG compression; the message names `argument` and the file.
         OSError: the file cannot be opened.
     """
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
@@ -82,7 +82,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
 
     Raises:
         InputError: the file is damaged, of another kind or too large, or is an EXR file and the package OpenEXR is
-            missing; names the file.
+            missing; the message names the file.
         OSError: the file cannot be opened.
     """
     path = Path(path)
@@ -110,15 +110,15 @@ def read_depth(path: str | Path) -> NDArray[Any]:
 
 
 def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
-    """Read an array of an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
+    """Read an array from an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
 
     Raises:
-        Exception: of many kinds, if the file is damaged, holds Python objects or more than `max_bytes` of values.
+        Exception: of any type, if the file is damaged, contains Python objects or more than `max_bytes` of values.
     """
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = read_header[version](stream)
-    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # values without bytes, type V0, are refused as well
+    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # also rejects values without bytes (type V0)
         raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
@@ -126,7 +126,7 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     """Read the depth channel of an EXR file."""
-    with open_file(path):  # an OSError if it cannot be opened: OpenEXR raises others
+    with open_file(path):  # raises OSError if it cannot be opened, unlike OpenEXR
         pass
     with needs_extra(f"depth: {path} is an EXR file; expected PNG, TIFF or NPY; EXR", "OpenEXR", "exr"):
         import OpenEXR

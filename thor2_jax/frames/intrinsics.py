@@ -1,4 +1,4 @@
-"""Intrinsics of cameras, read from the formats that people have; docs/frames.md shows an example of each.
+"""Intrinsics of cameras, read from common formats; docs/frames.md shows an example of each.
 
 | format | recognized by | depth_scale in it, if any |
 |---|---|---|
@@ -33,18 +33,18 @@ LARGEST_INTRINSIC = 10**9
 """Largest absolute value accepted for an intrinsic parameter."""
 
 MAX_BOP_CAMERA_SCALE = 10.0
-"""Largest depth_scale of BOP's camera.json. As depth units per metre it would mean depth in steps of 10 cm and more."""
+"""Largest depth_scale of BOP's camera.json. As depth units per metre, it would mean depth in steps of 10 cm or more."""
 
 MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8)
-"""Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and its
-rational one (ROS: rational_polynomial)."""
+"""Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and OpenCV's
+rational model (ROS: rational_polynomial)."""
 
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
-"""Distortion models whose coefficients are those of OpenCV; others are refused unless all coefficients are 0."""
+"""Distortion models with OpenCV's coefficients; other models are rejected unless all coefficients are 0."""
 
 
 def _is_number(value: Any) -> bool:
@@ -62,13 +62,13 @@ class Intrinsics:
         cx: column of the principal point.
         cy: row of the principal point.
         depth_scale: depth units per metre; 1000 if depth is in millimetres.
-        width: columns of the images, if known; `RGBDFrame` compares.
+        width: columns of the images, if known; `RGBDFrame` checks it.
         height: rows of the images, if known.
         distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV: k1, k2, p1, p2, then k3, then k4, k5, k6.
 
     Raises:
         InputError: a value is not a finite number or exceeds `LARGEST_INTRINSIC`, a focal length or the depth scale is
-            below its reciprocal, a size is not positive, or the number of coefficients is another one.
+            below 1 / `LARGEST_INTRINSIC`, a size is not positive, or the number of coefficients is not supported.
     """
 
     fx: float
@@ -97,13 +97,13 @@ class Intrinsics:
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """Make intrinsics from a mapping, a matrix or a ROS message in one of the formats of this module.
+        """Create intrinsics from a mapping, a matrix or a ROS message in one of the formats of this module.
 
         Other entries of a mapping are ignored.
 
         Raises:
-            InputError: `values` is none of them, lacks an entry, has an invalid one, or has a lens distortion that is
-                not supported.
+            InputError: `values` is in none of the formats, lacks an entry, has an invalid entry, or has a lens
+                distortion that is not supported.
         """
         if isinstance(values, Intrinsics):
             return values
@@ -140,7 +140,7 @@ class Intrinsics:
         height: int | None = None,
         distortion: Any = (),
     ) -> "Intrinsics":
-        """Make intrinsics from the nine numbers of a camera matrix, row by row.
+        """Create intrinsics from the nine numbers of a camera matrix, row by row.
 
         Raises:
             InputError: `matrix` is not of the form fx, 0, cx, 0, fy, cy, 0, 0, 1, or a value is invalid.
@@ -179,7 +179,7 @@ def _supported(model: Any, distortion: Any) -> Any:
     """Return the coefficients of a distortion model, or none if all are 0.
 
     Raises:
-        InputError: the model is not supported and distorts.
+        InputError: the model is not supported and a coefficient is not 0.
     """
     distortion = () if distortion is None else distortion
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
@@ -247,7 +247,7 @@ def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
 
 
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:
-    """Return the first of these entries, of a matrix in OpenCV's YAML its data."""
+    """Return the first existing entry of these names; for a matrix in OpenCV's YAML, return its data."""
     value = next((values[name] for name in names if name in values), None)
     return value.get("data") if isinstance(value, Mapping) else value
 
@@ -261,18 +261,18 @@ _FORMATS: Sequence[tuple[Sequence[str], Callable[[Mapping[Any, Any]], _Parts]]] 
     (("camera_matrix", "K", "k"), _of_camera_info),
     (_PINHOLE, _of_pinhole),
 )
-"""Entries that show a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
+"""Entries that identify a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
 
 
 def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
-    """Make intrinsics from the content of a file in one of the formats of this module.
+    """Create intrinsics from the content of a file in one of the formats of this module.
 
     Args:
-        content: JSON, YAML (of several documents the first), nine numbers as text, or NPY.
-        image: number of the image, which chooses the entry of a BOP scene_camera.json with several images.
+        content: JSON, YAML (the first of several documents), nine numbers as text, or NPY.
+        image: number of the image, which selects the entry of a BOP scene_camera.json with several images.
 
     Raises:
-        InputError: `content` is in none of the formats, or as `Intrinsics.of`.
+        InputError: `content` is in none of the formats; also as `Intrinsics.of`.
     """
     values = _parse(content)
     if (
@@ -294,7 +294,7 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
 
 
 def _parse(content: bytes) -> Any:
-    """Return the value in a file, whose format shows in its first bytes."""
+    """Return the value in a file, whose first bytes determine the format."""
     expected = "fx, fy, cx, cy or another known format"
     if content.lstrip()[:1] in (b"{", b"["):
         with decoding("intrinsics is not valid JSON", expected):
@@ -311,7 +311,7 @@ def _parse(content: bytes) -> Any:
         return np.array([float(word) for word in content.replace(b",", b" ").split()]) if content.strip() else None
     except ValueError:
         with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
-            # OpenCV's FileStorage writes a directive and tags that YAML parsers refuse.
+            # OpenCV's FileStorage writes a directive and tags that YAML parsers reject.
             return parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
 
 
@@ -325,7 +325,7 @@ def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:
     """Read intrinsics from a file, see `parse_intrinsics`.
 
     Raises:
-        InputError: as `parse_intrinsics`; names the file.
+        InputError: as `parse_intrinsics`; the message names the file.
         OSError: the file cannot be opened.
     """
     content = read_file(path)

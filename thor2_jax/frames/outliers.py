@@ -1,8 +1,8 @@
-"""Points of an instance: a voxel grid, and the rules that remove outliers (paper, section "Recognition").
+"""Points of an instance: voxel grid and outlier removal (paper, section "Recognition").
 
 A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Three rules
-remove them: flying pixels are found by steps in depth, stray points by the mean distance to their neighbours, and
-background by small pieces that are apart from the rest.
+remove these points: steps in depth show flying pixels, the mean distance to the neighbours shows stray points, and
+small pieces that are separate from the rest are background.
 """
 
 import math
@@ -80,20 +80,20 @@ MAX_SLOPE = 15.0
 camera)."""
 
 NEIGHBORS = 30
-"""Neighbours of a point on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
+"""Number of neighbours on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
 
 MAX_NEIGHBOR_DISTANCE = 0.016
 """Largest mean distance of a point to its nearest `NEIGHBORS`, metres; at the corner of a plane it is 0.012."""
 
 PIECE_CELL = 0.01
-"""Cell side of the grid that finds pieces, metres. Cells that touch, even at a corner, are one piece."""
+"""Side length of the grid cells that form pieces, metres. Cells that touch, even at a corner, are one piece."""
 
 GRID_REACH = 100
-"""Cells of that grid on either side of the cloud's median along each axis (1 m), which bounds its memory. All points
-outside count as one piece."""
+"""Number of cells of that grid on either side of the cloud's median along each axis (1 m), which limits the memory. All
+points outside count as one piece."""
 
 MIN_PIECE_SHARE = 0.1
-"""Least size of a piece that is kept, as a share of the points of the largest piece."""
+"""Least number of points in a kept piece, as a fraction of those in the largest piece."""
 
 
 def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -123,7 +123,7 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
     """Return the flat cell index [n] of each of `points` [3, n] and the shape of the grid.
 
-    Points past `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no other cell touches
+    Points beyond `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no other cell touches
     cell 0.
     """
     place = np.floor(points / PIECE_CELL)
@@ -139,10 +139,10 @@ def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ..
 
 
 def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return which of `points` [3, n] surely pass the neighbour rule, from counts and moments of grid cells.
+    """Return which of `points` [3, n] certainly pass the neighbour rule, from counts and moments of grid cells.
 
-    Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
-    of them is at most the root of the mean square distance to all of them.
+    If more than `NEIGHBORS` points lie in a point's cell and the adjacent cells, the mean distance to the nearest of
+    them is at most the root mean square distance to all of them.
     """
     points = points - points.mean(axis=1, keepdims=True)
     square = (points**2).sum(axis=0)
@@ -166,7 +166,7 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
-        from scipy.spatial import KDTree  # takes .1 s to import, and rendering needs none
+        from scipy.spatial import KDTree  # importing it takes 0.1 s, and rendering does not need it
 
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
@@ -190,8 +190,8 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
         points: [n, 3] metres, on a voxel grid of 3 mm.
 
     Returns:
-        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `NEIGHBORS` was
-        left out because it would have dropped more than half of the object, as of a small one or one seen through gaps.
+        Indices of the points to keep, in increasing order, at least one if n > 0; and whether the neighbour rule was
+        skipped because it would have dropped more than half of the object, as if it is small or seen through gaps.
     """
     kept = np.arange(len(points))
     if len(points) == 0:

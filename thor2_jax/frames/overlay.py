@@ -45,19 +45,19 @@ COLORS: tuple[Paint, ...] = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204
 Okabe and Ito, which people with colour blindness can distinguish."""
 
 UNRECOGNIZED: Paint = (213, 94, 0)
-"""Colour of instances without a name: vermilion of the same palette. Its orange is too close and not used."""
+"""Colour of instances without a name: vermilion of the same palette, whose similar orange is not used."""
 
 _SMALLEST_LETTERS = 8
 """Size of the smallest legible letters, pixels."""
 
 
 class Annotation(NamedTuple):
-    """Drawing on an instance.
+    """Outline and label of an instance in a picture.
 
     Attributes:
-        label: its number in the label image.
+        label: number of the instance in the label image.
         paint: colour of the outline and of the label's background.
-        text: the label, of one or more lines; empty for none.
+        text: text of the label, in one or more lines; empty for no label.
     """
 
     label: int
@@ -96,32 +96,32 @@ class _Lettering(NamedTuple):
 def draw_overlay(
     color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
 ) -> None:
-    """Draw the answers for a frame on its photo and write a PNG, which appears only when it is complete.
+    """Draw the answers for a frame on its photo, and write a PNG atomically.
 
     A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
 
     Args:
         color: [H, W, 3] uint8, sRGB.
         labels: [H, W] integers; 0 is background, every other number an instance.
-        answers: for instances in `labels`; instances without an answer are not drawn.
+        answers: answers for instances in `labels`; instances without an answer are not drawn.
         path: path of the picture.
 
     Raises:
-        InputError: shapes or types that do not fit, or an answer for a label that does not occur in `labels`.
+        InputError: a shape or type does not fit, or an answer is for a label that does not occur in `labels`.
         OSError: the file cannot be written.
     """
     color, labels = np.asarray(color), np.asarray(labels)
     check_images(color, labels=labels)
     for answer in answers:
         if answer.label == 0 or not (labels == answer.label).any():
-            raise InputError(f"answers: label {answer.label} is no instance of labels")
+            raise InputError(f"answers: label {answer.label} does not occur in labels")
     picture = annotate(color, labels, answers)
     with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
 def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
-    """Return the picture that `draw_overlay` writes, of valid arguments."""
+    """Return the picture that `draw_overlay` writes; the arguments are not checked."""
     annotations = [
         Annotation(answer.label, paint, _text(answer))
         for answer, paint in zip(answers, answer_paints(answers), strict=True)
@@ -132,19 +132,19 @@ def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[R
 def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:
     """Return a photo with the outlines and labels of instances.
 
-    Letters and outlines grow with the picture. Labels lie inside it, clear of each other while there is space; the
-    first annotations choose first. Letters shrink if a label is wider than the picture; a label that does not fit in
-    the smallest legible letters is left out.
+    Letters and outlines grow with the picture. Labels lie inside it, without overlap while there is space; the labels
+    of the first annotations are placed first. Letters shrink if a label is wider than the picture; a label that does
+    not fit even in the smallest legible letters is left out.
 
     Args:
         color: [H, W, 3] uint8, sRGB.
         labels: [H, W] integers; 0 is background, every other number an instance.
-        annotations: of labels that occur in `labels`.
+        annotations: annotations of labels that occur in `labels`.
     """
     masks = [_crop(labels, annotation.label) for annotation in annotations]
     diagonal = math.hypot(*labels.shape)
     thickness = max(1, round(diagonal / 350))
-    # Letters grow less than in proportion: a large picture is looked at enlarged.
+    # Letters grow more slowly than the picture, since large pictures are usually viewed enlarged.
     size = max(11, round(14 * (diagonal / 800) ** 0.75))
     pixels = color.copy()
     for mask, annotation in zip(masks, annotations, strict=True):
@@ -159,7 +159,7 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
             box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
             _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
-    for box, lettering, paint in placed:  # after all leaders, which may cross a label
+    for box, lettering, paint in placed:  # after all leaders, since these may cross a label
         draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
         start = box.left + lettering.start[0], box.top + lettering.start[1]
         draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
@@ -220,7 +220,7 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]
 
 @functools.lru_cache(maxsize=32)
 def _font(size: int, wide: bool = False) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return Pillow's font or, with `wide`, the one that comes with matplotlib, which has many more characters."""
+    """Return Pillow's font or, with `wide`, matplotlib's font, which has many more characters."""
     matplotlib = importlib.util.find_spec("matplotlib") if wide else None
     if matplotlib is None or matplotlib.origin is None:
         return ImageFont.load_default(size)
@@ -229,7 +229,7 @@ def _font(size: int, wide: bool = False) -> ImageFont.FreeTypeFont | ImageFont.I
 
 @functools.lru_cache(maxsize=4096)
 def _can_draw(character: str, wide: bool = False) -> bool:
-    """Return whether a font has a character; it draws the same box for all those that it lacks."""
+    """Return whether a font has a character; all missing characters are drawn as the same box."""
 
     def shape(text: str) -> bytes:
         return bytes(_font(_SMALLEST_LETTERS, wide).getmask(text))
@@ -238,7 +238,7 @@ def _can_draw(character: str, wide: bool = False) -> bool:
 
 
 def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:
-    """Return the best box on a grid over the picture: clear of other labels, near its instance, hiding few others."""
+    """Return the best box on a grid over the picture: it overlaps no label, is near its instance, hides few others."""
     rows, columns = covered.shape[0] - 1, covered.shape[1] - 1
     letters, width, height = lettering.size, lettering.width, lettering.height
     top, left = (
@@ -251,12 +251,12 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
     gap_y = np.maximum(0, np.maximum(top - target.bottom, target.top - bottom))
     off_centre = np.hypot(left + right - target.left - target.right, top + bottom - target.top - target.bottom)
     hidden = covered[bottom, right] - covered[top, right] - covered[bottom, left] + covered[top, left]
-    # In letter heights: hiding an instance under a tenth of the label costs as much as a distance of four letters.
+    # Costs are in letter heights: hiding an instance under a tenth of the label costs as much as 4 letters' distance.
     cost = np.hypot(gap_x, gap_y) / letters + off_centre / (10 * letters) + 40 * hidden / (width * height)
     for other in placed:
         shared_x = np.minimum(right, other.right + 2) - np.maximum(left, other.left - 2)
         shared_y = np.minimum(bottom, other.bottom + 2) - np.maximum(top, other.top - 2)
-        # The factor exceeds all other costs together: labels overlap only if every place does.
+        # The factor exceeds the sum of all other costs, so labels overlap only if no free place exists.
         cost += 1000 * np.maximum(0, shared_x) * np.maximum(0, shared_y)
     i, j = np.unravel_index(np.argmin(cost), cost.shape)
     x, y = int(left[j]), int(top[i, 0])

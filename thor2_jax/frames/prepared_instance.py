@@ -2,16 +2,15 @@
 
 Preparation is pure NumPy and its results can be pickled, so it can run in other processes than the recognizer.
 
-Pixels with valid depth are put on a voxel grid of 3 mm, which replaces the points of each voxel by their mean, as
-Open3D's `voxel_down_sample` does, and outliers are removed. An instance that cannot be used is not dropped: its
-`reason` says why.
+Points of pixels with valid depth are averaged in voxels of 3 mm, as by Open3D's `voxel_down_sample`, and outliers are
+removed. An instance that cannot be used is not dropped: its `reason` explains why.
 
 A pixel on the contour of an instance's mask belongs to the occlusion boundary (paper, section "Recognition") if its
 neighbour belongs to another instance that is nearer to the camera, or lies outside the image. Masks leave gaps between
 objects and depth cameras give no depth along edges, so both depths are searched for within a few pixels of the contour.
 
 An occluded object is recognized like any other. Its boundary points only decide the orientation of its cloud: view
-normalization turns it so that the occluded end does not come first along x. `Recognition.occluded` reports it.
+normalization turns it so that the occluded end does not come first along x. `Recognition.occluded` reports occlusion.
 """
 
 import dataclasses
@@ -45,10 +44,10 @@ __all__ = [
 ]
 
 CLOUD_VOXEL = 0.003
-"""Voxel side of the grid on which outliers are removed, metres."""
+"""Side length of a voxel in the grid on which outliers are removed, metres."""
 
 RIM = 2
-"""Width of the rim of a mask, pixels: masks reach over the edges of their objects."""
+"""Width of the rim of a mask, pixels, where the mask may extend past the object."""
 
 MIN_POINTS = 30
 """Least number of points on that grid; an instance with fewer cannot be used."""
@@ -56,18 +55,18 @@ MIN_POINTS = 30
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PreparedInstance:
-    """The cloud of an instance of a frame; one of `prepare_instance` is on the descriptors' voxel grid.
+    """The cloud of an instance of a frame; `prepare_instance` returns it on the descriptors' voxel grid.
 
     Attributes:
-        label: its number in the label image.
+        label: number of the instance in the label image.
         points: [n, 3] float32, metres, OpenCV camera frame; empty if the instance cannot be used.
         colors: [n, 3] uint8, sRGB.
         boundary: [n] bool, points on the occlusion boundary; all False if the instance is not occluded.
-        occluded: another instance hides a part of it, or the image border cuts it.
-        kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
-        reason: why the instance cannot be used; None if it can.
-        rim: [n] bool, points of pixels within `RIM` of the contour of the mask, if less than half of them are; None
-            without a mask.
+        occluded: whether another instance hides a part of the instance, or the image border cuts it.
+        kept_by_fallback: whether an outlier rule was skipped, since it would have dropped most of the cloud.
+        reason: why the instance cannot be used; None if it can be used.
+        rim: [n] bool, points of pixels within `RIM` of the contour of the mask; all False if more than half of the
+            points are; None without a mask.
     """
 
     label: int
@@ -98,7 +97,7 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
         with_rim: whether to find the rim.
 
     Raises:
-        InputError: the points are too far apart for the grid, as with wrong intrinsics.
+        InputError: the points are too far apart for the grid, for example because of wrong intrinsics.
     """
     pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
@@ -110,7 +109,7 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
     valid = pixels[trusted]
     points = frame.points(valid).astype(np.float32)
     channels = frame.color.reshape(-1, 3).take(valid, axis=0)
-    if with_rim:  # as a further colour channel
+    if with_rim:  # the rim becomes a further colour channel
         channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
     try:
         points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
@@ -133,11 +132,11 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
 
 
 def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which pixels [n] of a mask are within `RIM` of one that is not in it; the image border is no contour."""
+    """Return which pixels [n] of a mask are within `RIM` of a pixel outside it; the image border is no contour."""
     (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
     columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
     window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    # As `scipy.ndimage.minimum_filter`, in half of the time.
+    # This equals `scipy.ndimage.minimum_filter`, in half the time.
     padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
     inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
     inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
@@ -154,19 +153,19 @@ def unit_question(frame: RGBDFrame) -> str:
 
 
 STEPS = 6
-"""Pixels on either side of the contour that are searched for valid depth."""
+"""Number of pixels on either side of the contour that are searched for valid depth."""
 
 GAP = 3
 """Largest number of background pixels between two masks that count as neighbours."""
 
 MARGIN = max(STEPS, GAP + 1)
-"""Pixels around the mask that are searched at all."""
+"""Width of the searched margin around the mask, pixels."""
 
 NEARER = 0.01
-"""Metres by which the other instance must be nearer; depth noise between two touching objects is less."""
+"""Least distance, metres, by which the other instance must be nearer; depth noise between touching objects is less."""
 
 MIN_BOUNDARY_SHARE = 0.05
-"""Least share of the contour that is occlusion boundary in an occluded instance; noise makes less."""
+"""Least fraction of the contour that is occlusion boundary in an occluded instance; noise causes a smaller one."""
 
 BACKGROUND, OUTSIDE = 0, -1
 """Values in place of a label: no instance, and outside the image."""
@@ -183,8 +182,8 @@ def find_occlusion(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, NDA
         cloud: the instance's cloud, from `instance_cloud`.
 
     Returns:
-        Whether another instance hides a part of it or the image border cuts it, and [n] bool, the points of the cloud
-        on the boundary; all False if it is not occluded.
+        Whether the instance is occluded (see `PreparedInstance`), and [n] bool, the points of the cloud on the
+        boundary; all False if it is not occluded.
     """
     pixels = frame.instance_pixels[cloud.label]
     on_contour, on_boundary, own_depth = _contour(frame, cloud.label, pixels)
@@ -216,7 +215,7 @@ def _window(
 def _contour(
     frame: RGBDFrame, label: int, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """Return for each pixel of the mask: on the contour, on the occlusion boundary, depth of the object there."""
+    """Return whether each pixel of the mask is on the contour and on the occlusion boundary, and the object's depth."""
     window, depth, places = _window(frame, pixels)
     labels, depth = window.ravel(), depth.ravel()
     steps = (1, -1, window.shape[1], -window.shape[1])
@@ -248,7 +247,7 @@ def _contour(
 
 
 DESCRIPTOR_VOXEL = 0.01
-"""Voxel side, in scaled units, of every cloud that is described, in training too: colour vectors count points."""
+"""Voxel side, in scaled units, of all described clouds, also in training, since colour vectors count points."""
 
 
 def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: bool = True) -> PreparedInstance:
@@ -272,22 +271,22 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
     channels = np.column_stack([cloud.colors, np.stack(flags, axis=1) * np.uint8(255)])
     points, channels = downsample_to_fit(cloud.points, channels, DESCRIPTOR_VOXEL / sigma_s)
     rim = None if cloud.rim is None else channels[:, 4] > 127
-    if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object has no inside
+    if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object would lose most of its points
         rim[:] = False
     colors, boundary = channels[:, :3], channels[:, 3] > 0
     return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim)
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
-    """Prepare one instance of a frame, which is to be enrolled or explained.
+    """Prepare one instance of a frame for enrolment or explanation.
 
     Args:
         frame: the frame.
-        label: number of the instance; None if it is the only one.
+        label: number of the instance; None for the only instance of the frame.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
 
     Raises:
-        InputError: the frame has no such instance, or several and no number is given, or the instance cannot be used.
+        InputError: the frame has no such instance, it has several and `label` is None, or the instance cannot be used.
     """
     if label is None and len(frame.instances) != 1:
         raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
@@ -304,9 +303,9 @@ def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity:
     """Pack instances as a batch of `n_rows` clouds in host memory; the last ones are empty.
 
     Args:
-        instances: at most `n_rows`.
-        n_rows: B, clouds in the batch.
-        capacity: N, points in a row; by default the bucket of the largest cloud, see `PointClouds.pack`.
+        instances: at most `n_rows` instances.
+        n_rows: B, number of clouds in the batch.
+        capacity: N, padded number of points; by default the bucket of the largest cloud, see `PointClouds.pack`.
     """
     from thor2_jax.types import PointClouds  # imports JAX, which preparation does not need
 

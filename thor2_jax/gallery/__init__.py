@@ -1,1 +1,1 @@
-"""Recognition from few views: objects are enrolled as embedded views, and queries are compared with them."""
+"""Recognition from a few views: objects are enrolled as embedded views, with which queries are compared."""

@@ -1,14 +1,14 @@
-"""Embeddings of clouds: unit vectors that are close for views of one object, also of objects without training.
+"""Embeddings of clouds: unit vectors that are close for views of one object, even if it was not in the training set.
 
     embedding = load_default()                              # packaged, trained on procedural objects
     similarity = embedding.embed(clouds) @ embedding.embed(others).T
 
-An embedding has two blocks, each of unit length before it is weighted: the output of a trained network on the
-descriptor; and the colour embeddings of the strips, the histogram of balanced colours and the persistence images,
-projected to their principal components, which depend little on what the network was trained on. Embeddings of earlier
-versions have no images there, or the histogram of the colour regions in a block of its own. The embedding of a run also
-classifies: by this network and further ones, whose class probabilities are averaged. `training.embedding` fits the
-networks.
+An embedding has two blocks, each of unit length before it is weighted. The first block is the output of a network,
+which reads the descriptor. The second block depends little on the training set: the colour embeddings of the strips,
+the histogram of balanced colours and the persistence images are projected to their principal components. In embeddings
+of earlier versions, this block has no images, or the histogram of the colour regions is a third block. The embedding of
+a run also classifies: the class probabilities of its network and of further networks are averaged. `training.embedding`
+fits the networks.
 """
 
 import dataclasses
@@ -46,27 +46,27 @@ EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
 
 VIEW_WEIGHT, NEUTRAL_SIMILARITY = 10.0, 0.8
-"""Log-odds of an object being one of the classes for each unit of its similarity to the nearest reference view, as a
-logistic regression on held-out views weighs it; the similarity at which they stay as they are."""
+"""VIEW_WEIGHT: change of the log-odds of being one of the classes per unit of similarity to the nearest reference view,
+from a logistic regression on held-out views. NEUTRAL_SIMILARITY: similarity at which they do not change."""
 
 _FURTHER = "further/{}/"
-"""Prefix of the names of the arrays of a further network in the file, with its number."""
+"""Prefix of the array names of a further network in the file, with the number of the network."""
 
 
 REFERENCES_FILE = "references.safetensors"
-"""References of the embedding in the same directory."""
+"""File of the references, in the directory of the embedding."""
 
 BACKGROUND = -1
-"""Label of views of the background."""
+"""Label of background views."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class References:
-    """Reference views: embedded views of the classes of a run and of a background of objects that are none of them.
+    """Reference views: embedded views of the classes of a run, and of background objects, which are none of them.
 
-    They take part in the regression of a gallery (`Gallery.scores`), so that an enrolled object is recognized by what
-    distinguishes it from them, and a gallery with a single object already knows what is unknown. With
-    `EmbeddingSizes.views`, those of the classes also take part in the classification (`Embedding.class_probabilities`).
+    The regression of a gallery includes them (`Gallery.scores`). So an enrolled object is recognized by its differences
+    from the references, and even a gallery with a single object rejects unknown objects. With `EmbeddingSizes.views`,
+    the classification also uses the views of the classes (`Embedding.class_probabilities`).
 
     Attributes:
         embeddings: [n, D] float16, of unit length.
@@ -79,7 +79,7 @@ class References:
     classes: tuple[str, ...] = ()
 
     def save(self, path: Path, fingerprint: str) -> None:
-        """Write the references of the embedding with this fingerprint, atomically; raises OSError if that fails."""
+        """Write the references of the embedding with this fingerprint, atomically; raise OSError if that fails."""
         about = {"embedding": fingerprint, "classes": list(self.classes)}
         arrays: dict[str, NDArray[Any]] = {"embeddings": self.embeddings, "label": self.label}
         with atomic_write(path) as temporary:
@@ -90,7 +90,7 @@ class References:
         """Read the references of the embedding with this fingerprint and of this length D.
 
         Raises:
-            InputError: the file is missing or damaged, or of another embedding. The message names the file.
+            InputError: the file is missing or damaged, or belongs to another embedding. The message names the file.
         """
         expected = "the views of the embedding beside it; copy both files, or train the run again"
         with decoding(f"embedding: {path} cannot be used", expected):
@@ -134,11 +134,11 @@ class _ClassViews(nnx.Module):
 def _class_probabilities(
     models: Sequence[Any], oriented: LookDescriptors, n_classes: int, n_networks: int, nearest: bool
 ) -> jax.Array:
-    """Return the probabilities [B, n_classes] of the first proxies.
+    """Return the probabilities [B, n_classes] of the classes, which are the first proxies.
 
-    With `nearest`, all others are one column, with the sum that they would have if each had the logit of the nearest
-    one. With `_ClassViews` after the networks, the odds of all classes together grow with the similarity of the most
-    probable one.
+    With `nearest`, the distractors are merged into one column, as if each had the logit of the nearest distractor. If
+    `_ClassViews` follow the networks, the odds of all classes together grow with the similarity of the nearest view of
+    the most probable class.
     """
     networks = models[:n_networks]
     learned = [model.learned(*oriented.flat) for model in networks]
@@ -160,9 +160,9 @@ def _class_probabilities(
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
     """Return the graph and the state of a network, with its values as the file stores them."""
-    with jax.ensure_compile_time_eval():  # the result is kept, also if the first call is inside a compiled function
+    with jax.ensure_compile_time_eval():  # the result is cached, even if the first call is inside a compiled function
         graph, state = nnx.split(model)
-        # By NumPy: JAX would compile a program for each shape.
+        # NumPy converts the values, since JAX would compile a program for each shape.
         with np.errstate(over="ignore"):
             return graph, jax.tree.map(lambda a: jax.device_put(np.asarray(a, np.float16).astype(np.float32)), state)
 
@@ -177,12 +177,12 @@ class Embedding:
         sizes: sizes of the network.
         model: the network of the embedding. Do not change it: compiled functions and `fingerprint` keep its arrays.
         classes: classes that the network also recognizes by its first proxies; none in the packaged embedding.
-        distractors: number of proxies after those of the classes, of objects that are none of them.
-        further: networks from `create_further`, fitted as `model` was from other random weights. `class_probabilities`
+        distractors: number of distractors, whose proxies follow those of the classes.
+        further: networks from `create_further`, fitted like `model` from other random weights. `class_probabilities`
             averages all networks, which separates unknown objects more reliably (Lakshminarayanan et al., "Simple and
             Scalable Predictive Uncertainty Estimation using Deep Ensembles", NeurIPS 2017). Only `model` embeds.
         references: embedded views of the classes and of the background, for galleries and, with `sizes.views`, for the
-            classification; None in embeddings of earlier versions, whose galleries know less of what is unknown. Not a
+            classification; None in embeddings of earlier versions, whose galleries reject fewer unknown objects. Not
             part of `fingerprint`.
     """
 
@@ -210,7 +210,7 @@ class Embedding:
         Args:
             config: by default the paper's descriptor.
             network: by default the packaged colour network.
-            sizes: of the network.
+            sizes: sizes of the network.
             seed: seed for the weights.
             classes: names of the classes that the network also recognizes.
             distractors: number of objects that are none of the classes.
@@ -222,9 +222,9 @@ class Embedding:
         return cls(config, network, sizes, model, classes, distractors)
 
     def create_further(self, seed: int = 0) -> EmbeddingNetwork:
-        """Return a network for `further` with random weights; without a colour block, since it does not embed.
+        """Return a network for `further` with random weights; it has no colour block, since it does not embed.
 
-        Its weights of the statistics of colours are zero, as they stay if it is fitted on statistics without them.
+        Its weights for the colour statistics are zero, and stay zero in a fit on statistics without colours.
         """
         sizes = dataclasses.replace(self.sizes, color=0)
         n_regions, n_proxies = self.network.n_regions, len(self.classes) + self.distractors
@@ -264,7 +264,7 @@ class Embedding:
         """Return the embeddings [B, K, D] of K looks at clouds.
 
         Args:
-            oriented: described by this descriptor.
+            oriented: descriptors of the looks, computed with this embedding's config.
             clouds: [B, N] the clouds, whose colours are compared too; None if `oriented` is `with_balanced`.
         """
         if self.sizes.balanced and clouds is not None:
@@ -275,17 +275,17 @@ class Embedding:
     def class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
         """Function from K looks at clouds, described by this embedding's descriptor, to class probabilities [B, C].
 
-        What they lack to 1 is that of the distractors. They are the geometric mean over the networks and over the
-        looks. With `sizes.nearest`, every distractor has the logit of the nearest one, for each
+        The rest to 1 is the probability of the distractors. The probabilities are the geometric mean over the networks
+        and over the looks. With `sizes.nearest`, every distractor has the logit of the nearest distractor, for each
         network and look. With `sizes.views`, the odds of all classes are multiplied by
-        exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)), where s is the largest cosine between the learned blocks of a
-        look and of a reference view of the most probable class, averaged over the looks (Sun et al.,
-        "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022).
+        exp(`VIEW_WEIGHT` (s - `NEUTRAL_SIMILARITY`)) (Sun et al., "Out-of-Distribution Detection with Deep Nearest
+        Neighbors", ICML 2022). Here s is the largest cosine between the learned blocks of a look and of a reference
+        view of the most probable class, averaged over the looks.
         """
         models = [self._embedder, *map(_split, self.further)]
         static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
         if self.sizes.views and self.references is not None:
-            with jax.ensure_compile_time_eval():  # as in `_split`; on the device, or every call would copy the views
+            with jax.ensure_compile_time_eval():  # as in `_split`; keeps the views on the device
                 models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
         return compiled(_class_probabilities, models, *static)
 
@@ -333,8 +333,8 @@ class Embedding:
             network: colour network that the embedding was fitted with; by default the packaged one.
 
         Raises:
-            InputError: the file is missing or damaged, or its format, descriptor version or colour network is another
-                one. The message names the file.
+            InputError: the file is missing or damaged, or its format, descriptor version or colour network does not
+                fit. The message names the file.
         """
         path, network = Path(path), network or colornet.load_default()
         advice = "an embedding of this version; copy the whole run directory, or train the run again"
@@ -362,12 +362,12 @@ class Embedding:
         if file.is_file():
             references = References.load(file, content_digest([content]), embedding.size)
         embedding = dataclasses.replace(embedding, further=tuple(further), references=references)
-        # The file determines the fingerprint, also if another version of this software wrote it.
+        # The fingerprint is computed from the file itself, which another version of this software may have written.
         embedding.__dict__["_content"] = content
         return embedding
 
 
 @functools.cache
 def load_default() -> Embedding:
-    """Return the packaged embedding, trained on procedural objects; `python -m training.embedding.build` makes it."""
+    """Return the packaged embedding, trained on procedural objects; `python -m training.embedding.build` fits it."""
     return Embedding.load(Path(__file__).with_name("data") / "embedding.safetensors")

@@ -1,8 +1,8 @@
 """Enrolment: how views of an object are augmented and embedded, and a gallery that can be taught, in memory or on disk.
 
-Views, whether a few frames or renderings of a mesh, show little of how another camera sees the object. They get
-augmented copies, made without rendering: light, sensor noise and cut masks. The copies are drawn from the cloud itself,
-so that each copy of a view is the same in every embedding.
+Another camera may see an object differently than its views, whether these are a few frames or renderings of a mesh.
+Augmented copies of the views therefore have other light, sensor noise and cut masks; they are made without rendering.
+The random numbers are seeded with the cloud, so that each copy of a view is the same for every embedding.
 """
 
 import dataclasses
@@ -38,13 +38,13 @@ __all__ = [
 ]
 
 LOOKS = 2
-"""Looks at a view, each of which is embedded, and at a query, whose scores are averaged."""
+"""Number of looks at a view, which are all embedded, and at a query, whose scores are averaged over them."""
 
 ROWS = 4
-"""Clouds embedded in one call, as recognition does."""
+"""Number of clouds embedded in one call, as in recognition."""
 
 MANY_ROWS = 16
-"""Clouds embedded in one call if there are many: a call costs as much as several clouds."""
+"""Number of clouds embedded in one call if there are many, since a call costs as much as several clouds."""
 
 
 def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
@@ -72,7 +72,7 @@ def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> ND
     Args:
         embedding: the embedding.
         clouds: the views.
-        source: where they come from, see `augmented_copies`.
+        source: source of the views, see `augmented_copies`.
     """
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
@@ -80,7 +80,7 @@ def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> ND
 
 
 def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:
-    """Return an object that is enrolled now; `embeddings` [..., D] are those of `views_to_embed`."""
+    """Return an object that is enrolled at this time; `embeddings` [..., D] are those of `views_to_embed`."""
     date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     flat = embeddings.reshape(-1, embeddings.shape[-1]).astype(np.float16)
     return GalleryObject(flat, clouds, source, date)
@@ -90,7 +90,7 @@ def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], sour
     """Return the views of an object as a gallery stores them; the arguments are those of `_embed_views`.
 
     Raises:
-        InputError: there is no view, or one has no points or is too large.
+        InputError: there is no view, or a view has no points or is too large.
     """
     clouds = CompactClouds.of(list(views))
     if not len(clouds):
@@ -99,22 +99,22 @@ def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], sour
 
 
 MAX_COPIES = 8
-"""Copies of all views from frames together."""
+"""Largest number of copies of all views from frames together."""
 
 MESH_COPIES = 1
-"""Copies of each view from a mesh."""
+"""Number of copies of each view from a mesh."""
 
 CAST, MESH_CAST = 0.06, 0.2
 """Largest deviation from 1 of the factor of each colour channel, for objects from frames and for those with a mesh."""
 
 
 def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
-    """Return copies of the views of one object.
+    """Return augmented copies of the views of one object.
 
     Args:
         views: the views.
-        source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view, with colour casts up to `MESH_CAST`; with
-            "frames", about `MAX_COPIES` in all, with casts up to `CAST`, and none for more than that many views.
+        source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view, with colour casts up to `MESH_CAST`;
+            "frames" for up to `MAX_COPIES` in all, with casts up to `CAST`, or none for more views than that.
     """
     of_mesh = source.startswith("mesh")
     copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(views), 1), CAST)
@@ -122,7 +122,7 @@ def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[Pre
 
 
 def augmented_view(view: PreparedInstance, copy: int, cast: float = CAST) -> PreparedInstance:
-    """Return an augmented copy of a view; it is determined by the arguments.
+    """Return an augmented copy of a view; equal arguments give equal copies.
 
     Args:
         view: a view with at least one point.
@@ -149,7 +149,7 @@ def _relit(colors: NDArray[np.uint8], cast: float, rng: np.random.Generator) -> 
 
 
 def _sensed(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return the points with noise along their rays, with the deviation of a depth camera at half of its noise."""
+    """Return the points with noise along their rays, at most half of a depth camera's noise."""
     deviation = rng.uniform(0, 0.5) * (0.0012 + 0.0019 * (points[:, 2:] - 0.4) ** 2)
     noise = deviation * rng.standard_normal((len(points), 1))
     return (points * (1 + noise / np.maximum(points[:, 2:], 0.1))).astype(np.float32)
@@ -165,14 +165,14 @@ def _cut(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bo
 
 
 FEW = 10
-"""With fewer views of an object, or without a background and with fewer objects, most unknown objects are named."""
+"""Number of views of an object (without a background: of objects) below which few unknown objects are rejected."""
 
 
 class ObjectGallery:
     """Enrolled objects beside the trained classes of a run.
 
-    Each change is one immutable gallery in place of another, so that another thread reads the one or the other. A
-    shallow copy shares the gallery, and neither sees what is changed through the other one before it is refreshed.
+    Each change replaces the immutable gallery by a new one, so that other threads see the state before or after it. A
+    shallow copy shares the gallery; a change through one of the two is visible to the other after `refresh`.
 
     Attributes:
         gallery: the gallery.
@@ -181,7 +181,7 @@ class ObjectGallery:
     """
 
     def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
-        """Begin with an empty gallery in memory.
+        """Create an empty gallery in memory.
 
         Args:
             trained: class names of the run.
@@ -201,12 +201,12 @@ class ObjectGallery:
 
         Args:
             directory: directory of the gallery.
-            reembed: embed all views again, with the embedding of this run, whatever they were embedded by; and rebuild
-                an index that was lost.
+            reembed: embed all views again with the embedding of this run, whatever their embedding was, and rebuild a
+                lost index.
 
         Raises:
             InputError: see `refresh`.
-            OSError: the gallery cannot be written; it is as before.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
         if reembed and directory.exists():
@@ -217,14 +217,14 @@ class ObjectGallery:
 
     @property
     def embedding(self) -> Embedding:
-        """The embedding of the views; the packaged one is read when it is first needed."""
+        """The embedding of the views; the packaged one is loaded on first use."""
         if self._embedding is None:
             self._embedding = load_default()
         return self._embedding
 
     @property
     def weak_rejection(self) -> str:
-        """Why unknown objects are hardly rejected, and what helps, in words; empty if they are not."""
+        """Message that explains why few unknown objects are rejected, and what helps; empty if there is no cause."""
         objects, references = self.gallery.objects.values(), self.gallery.references
         few = sum(len(views.clouds) < FEW for views in objects)
         if few:
@@ -237,7 +237,7 @@ class ObjectGallery:
         """Read the gallery again if it has changed on disk, and return whether it has.
 
         Raises:
-            InputError: it cannot be read, or has another embedding; the gallery in memory stays.
+            InputError: the gallery cannot be read, or has another embedding; the gallery in memory is unchanged.
         """
         if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
             return False
@@ -267,7 +267,7 @@ class ObjectGallery:
         )
 
     def _set(self, gallery: Gallery) -> None:
-        """Keep a gallery, with what the run and the options add to it; references only once it has objects."""
+        """Set the gallery, with the values of the run and the options; it has references only if it has objects."""
         self.gallery = dataclasses.replace(
             gallery,
             trained=self.gallery.trained,
@@ -284,14 +284,14 @@ class ObjectGallery:
         Args:
             name: name of the object.
             views: its views.
-            source: "mesh" for views that are rendered from a mesh, or "frames".
-            extend: add the views to those of an object with this name.
-            replace: discard the views, and the output of the classifiers, of an object with this name.
+            source: "mesh" for views rendered from a mesh, or "frames".
+            extend: add the views to an existing object with this name.
+            replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Raises:
             InputError: a view cannot be used, or the name exists and neither `extend` nor `replace` is given. Nothing
                 is enrolled.
-            OSError: the gallery cannot be written; it is as before.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
         self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
@@ -314,15 +314,15 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is as before.
         """
         if self.directory is not None and store.gallery_stamp(self.directory) is None:
-            self.gallery.without(name)  # a name that is refused leaves nothing behind
+            self.gallery.without(name)  # raises for an unknown name before a gallery is created on disk
         self._change(lambda gallery: gallery.without(name))
 
     def undo(self, generation: int) -> None:
-        """Take back the last change of a gallery on disk; `generation` is the one after that change.
+        """Undo the last change of a gallery on disk; `generation` is the gallery's generation after that change.
 
         Raises:
-            InputError: the gallery is in memory, or as `store.previous_gallery`.
-            OSError: the gallery cannot be written; it is as before.
+            InputError: the gallery is in memory; also as `store.previous_gallery`.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         if self.directory is None:
             raise InputError("undo needs a gallery on disk; open one")

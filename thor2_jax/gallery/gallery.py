@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["CompactClouds", "Gallery", "GalleryObject"]
 
 NEAREST = 128
-"""Views of the gallery in the regression of a query; all views give the same accuracy on held-out frames."""
+"""Number of views in the regression of a query; using all views gives the same accuracy on held-out frames."""
 
 GAMMA = 4.0
 """The kernel of two views is exp(GAMMA (cosine - 1)); chosen on held-out frames."""
@@ -44,8 +44,8 @@ KEPT: tuple[tuple[dict[int, float], dict[int, float]], ...] = (
     ({1: 0.24, 3: 0.31, 5: 0.34, 10: 0.355, 120: 0.43}, {1: 0.17, 3: 0.24, 5: 0.27, 10: 0.29, 120: 0.3}),
     ({1: 0.255, 3: 0.345, 5: 0.375, 10: 0.43, 120: 0.455}, {1: 0.145, 3: 0.235, 5: 0.25, 10: 0.305, 120: 0.39}),
 )
-"""Number of views of an object -> score whose odds give the default threshold, by `EmbeddingSizes.version`, without and
-with reference views; up to ten views from held-out frames, 120 from meshes. 95 % of the correct answers reach it."""
+"""For each `EmbeddingSizes.version`, without and with reference views: number of views of an object -> score that 95 %
+of the correct answers reach, for the default threshold. Up to 10 views are from held-out frames, 120 from meshes."""
 
 TOYS = frozenset(
     ("apple banana cereal_box_blue cereal_box_yellow hammer mug_blue mug_white screwdriver soup_can_green soup_can_red "
@@ -74,7 +74,7 @@ class CompactClouds:
         points: [n, 3] int16, multiples of `STEP`, relative to `centre`.
         colors: [n, 3] uint8, sRGB.
         boundary: [n] bool, points on the occlusion boundary.
-        counts: [V] int32, points of each view.
+        counts: [V] int32, number of points of each view.
         centre: [V, 3] float32, metres, camera frame.
     """
 
@@ -137,7 +137,7 @@ class GalleryObject:
     Attributes:
         embeddings: [E, D] float16 of unit length: several looks at each view, and its augmented copies.
         clouds: the views as they were enrolled.
-        source: where the views come from: "mesh", "frames" or "mesh and frames".
+        source: source of the views: "mesh", "frames" or "mesh and frames".
         date: date of the last enrolment, ISO 8601.
         file: name of its file in the gallery on disk; None until it is written.
     """
@@ -170,16 +170,16 @@ class Gallery:
     """Enrolled objects; an immutable value.
 
     Attributes:
-        embedding: fingerprint of the embedding that the views are embedded by.
+        embedding: fingerprint of the embedding of the views.
         objects: name -> its views, in the order of enrolment.
         trained: class names of the run, in the order of the classifiers' outputs.
-        hidden: trained classes that were forgotten or replaced; no classifier answers by them.
+        hidden: trained classes that were forgotten or replaced; the classifiers' outputs for them are ignored.
         references: reference views of the embedding; None if it has none.
         version: version of the embedding, see `EmbeddingSizes`.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
         generation: number of changes on disk so far.
-        stamp: `store.gallery_stamp` of this state; None if it is not on disk.
+        stamp: `store.gallery_stamp` of this state; None if the gallery is not on disk.
     """
 
     embedding: str
@@ -212,13 +212,13 @@ class Gallery:
         return known
 
     def with_object(self, name: str, views: GalleryObject, *, extend: bool = False, replace: bool = False) -> "Gallery":
-        """Return the gallery with an object more.
+        """Return the gallery with a further object.
 
         Args:
             name: name of the object.
             views: its views.
-            extend: add the views to those of an object that exists, or to a trained class.
-            replace: discard the views of an object that exists, and hide a trained class.
+            extend: add the views to an existing object or to a trained class.
+            replace: discard the views of an existing object, and hide a trained class with this name.
 
         Raises:
             InputError: see `check_name`; or the name exists and neither `extend` nor `replace` is given, or both are.
@@ -249,10 +249,11 @@ class Gallery:
 
     @functools.cached_property
     def regression(self) -> tuple[NDArray[np.float16], NDArray[np.intp], NDArray[np.float64]]:
-        """Embeddings [N, D] of all views, the number of the owner of each, and its regularization.
+        """Embeddings [N, D] of all views, and for each view the number of its owner and its regularization.
 
-        Owners are the objects, the trained classes and the background; those of many views shall not outweigh those of
-        few. Views of a class belong to the enrolled object of its name, those of a forgotten class to the background.
+        Owners are the objects, the trained classes and the background. The regularization keeps owners with many views
+        from outweighing those with few. Views of a trained class belong to the enrolled object with its name, if there
+        is one, and views of a forgotten class to the background.
         """
         embeddings = [views.embeddings for views in self.objects.values()]
         counts = np.array([len(each) for each in embeddings], np.float64)
@@ -276,9 +277,9 @@ class Gallery:
 
     @functools.cached_property
     def unknown_below(self) -> NDArray[np.float64]:
-        """[n_objects] least confidence of an answer with the name of each object, by default.
+        """Default thresholds [n_objects]: the least confidence of an answer with the name of each object.
 
-        Its score is interpolated between the numbers of `KEPT`, linearly in the logarithm of the number of views.
+        They follow from scores that are interpolated in `KEPT`, linearly in the logarithm of the number of views.
         """
         views = [len(views.clouds) for views in self.objects.values()]
         kept = KEPT[self.version][self.references is not None]
@@ -292,7 +293,8 @@ class Gallery:
     def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
-        A score is the value of the regression, times its share in the sum with the value of the best trained class.
+        A score is v * v / (v + w), where v is the value of the regression for the object, and w the largest value for a
+        trained class (0 without references).
 
         Args:
             embeddings: [B, D] of unit length, or [B, K, D] for K looks, whose scores are averaged.
@@ -336,7 +338,7 @@ class Gallery:
 
     @functools.cached_property
     def summary(self) -> str:
-        """The names in words, such as "21 objects: mug, bowl, ..."."""
+        """The names as a phrase, such as "21 objects: mug, bowl, ..."."""
         toys = [name for name in self.answered_names if name in TOYS] if set(self.trained) == TOYS else []
         own = [name for name in self.answered_names if name not in toys]
         listed = first_names(own, MAX_LISTED)
@@ -365,15 +367,16 @@ class Gallery:
     def combine(self, probabilities: Values | None, scores: Values) -> Values:
         """Combine the confidences of the classifiers with the scores of the gallery.
 
-        The shares of the names are the confidence of a trained class, and for an enrolled object what the best class
-        leaves to 1, times the odds of the object's score. The largest share is the answer. A class that is the answer
-        keeps its confidence c. If an object is, or has a share in it, the answer has the probability that it is known
-        at all, (c + m) / (1 + m), where c and m are the largest shares of a class and of an object. The values of the
-        others are in proportion. So an enrolled object takes the name only where its score is high.
+        Each name gets a share. The share of a trained class is its confidence. The share of an enrolled object is 1 - c
+        times the odds of its score, where c is the largest confidence of a class; a class with enrolled views gets the
+        sum of both. The name with the largest share is the answer. Its value is c if its share is not larger than c.
+        Otherwise it is the probability that the object is known, (c + m) / (1 + m), where m is the largest share of an
+        enrolled object. The values of the other names are proportional to their shares. So an enrolled object is the
+        answer only if its score is high.
 
         Args:
-            probabilities: [B, C], fused; None if the gallery alone answers.
-            scores: [B, n_objects].
+            probabilities: [B, C] fused probabilities; None if the gallery alone answers.
+            scores: [B, n_objects] scores of the gallery.
 
         Returns:
             [B, n] from 0 to 1, in the order of `answered_names`; they need not sum to 1.

@@ -22,13 +22,13 @@ CHUNK = 2**14
 """Views per matrix product: 16 MB as float32 at 256 numbers each."""
 
 BUILD_CANDIDATES = 64
-"""Candidates for the neighbours of a view while the index is built: half of the default of usearch."""
+"""Number of candidate neighbours of a view while the index is built, half of the default of usearch."""
 
 SEARCH_CANDIDATES = 2048
-"""Candidates for the nearest views of a query of the index; fewer miss many among millions of views."""
+"""Number of candidates for the nearest views of a query; with fewer, an index of millions misses many of them."""
 
 FAST_VIEWS = 2**17
-"""Largest number of views that are also kept as float32 (134 MB): their conversion takes half of a query."""
+"""Largest number of views that are also stored as float32 (134 MB), since conversion takes half the time of a query."""
 
 
 _thread_pools = functools.cache(threadpoolctl.ThreadpoolController)
@@ -37,18 +37,18 @@ _thread_pools = functools.cache(threadpoolctl.ThreadpoolController)
 def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     """Limit NumPy's linear algebra to one thread in the context.
 
-    Small products gain nothing from several threads, which on a busy machine wait for one another: a query that takes
-    10 ms then takes up to seconds.
+    Small products gain nothing from several threads. On a busy machine the threads wait for one another, and a query of
+    10 ms can take seconds.
     """
     limited: contextlib.AbstractContextManager[Any] = _thread_pools().limit(limits=1, user_api="blas")
     return limited
 
 
 class ExactSearch:
-    """Exact search by matrix products in chunks; it needs little memory beside the embeddings."""
+    """Exact search by matrix products in chunks, which need little memory beside the embeddings."""
 
     def __init__(self, embeddings: NDArray[np.float16]) -> None:
-        """Keep embeddings [N, D] of unit length, as float32 if they are few."""
+        """Store embeddings [N, D] of unit length, as float32 if they are few."""
         self._embeddings = embeddings.astype(np.float32) if len(embeddings) <= FAST_VIEWS else embeddings
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
@@ -102,12 +102,12 @@ class IndexSearch:
         self._index.add(np.arange(len(embeddings)), embeddings)
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """See `ExactSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
+        """Return approximately the result of `ExactSearch.nearest`, in which some views may be replaced by others."""
         count = min(count, len(self._embeddings))
         matches = self._index.search(queries.astype(np.float16), count)
         rows = [matches] if len(queries) == 1 else list(matches)
         similarity, index = np.zeros((len(rows), count), np.float32), np.zeros((len(rows), count), np.intp)
-        # Where several threads have built the index, it may not reach all views, and return fewer than asked for.
+        # An index that several threads have built may not reach all views, and then returns too few of them.
         short = np.array([len(row) < count for row in rows])
         for k in np.flatnonzero(~short):
             similarity[k], index[k] = 1 - rows[k].distances, rows[k].keys

@@ -1,13 +1,13 @@
-"""Galleries on disk: changes are atomic, also when several processes write.
+"""Galleries on disk, with changes that are atomic even if several processes write.
 
 GALLERY/index.json                      format, generation, fingerprint of the embedding, hidden classes, and for each
                                         object its name, file, number of views, source and date
-GALLERY/previous.json                   index.json before the last change, so that it can be taken back
+GALLERY/previous.json                   index.json before the last change, which can thus be undone
 GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object, with its name, source and date
 
-A writer holds the lock, writes the files of new objects and then replaces index.json: the gallery on disk is always the
-one before or the one after a change. Files of objects that index.json does not name are removed by the next writer;
-all other files stay. If index.json is lost, `thor2 objects --reembed` writes it again from the files of the objects.
+A writer holds the lock, writes the files of new objects and then replaces index.json, so the gallery on disk is always
+in the state before or after a change. The next writer removes object files that index.json does not name; all other
+files stay. If index.json is lost, `thor2 objects --reembed` writes it again from the object files.
 """
 
 import contextlib
@@ -60,15 +60,15 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 PREVIOUS_FILE = "previous.json"
 
 LOCK_SECONDS = 20.0
-"""Time that a writer waits for another one; a change takes milliseconds."""
+"""Time that a writer waits for another writer; a change takes milliseconds."""
 
 
 class GalleryError(InputError):
-    """A gallery on disk cannot be used: it is damaged or has another embedding. The message names its file."""
+    """Error of a gallery on disk that is damaged or has another embedding. The message names the file."""
 
 
 class GalleryBusyError(GalleryError):
-    """Another process is writing to the gallery."""
+    """Error of a gallery to which another process is writing."""
 
 
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
@@ -81,7 +81,7 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
 
 
 def check_index(directory: Path) -> None:
-    """Raise GalleryError if the path is no directory, or a directory with objects but no index."""
+    """Raise GalleryError if the path is not a directory, or is a directory with objects but without an index."""
     if directory.exists() and not directory.is_dir():
         raise GalleryError(f"gallery: {directory} is no directory; expected that of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
@@ -92,12 +92,12 @@ def check_index(directory: Path) -> None:
 
 
 def load_gallery(directory: Path, embedding: str | None = None, known: Gallery | None = None) -> Gallery:
-    """Read a gallery; one that does not exist is empty.
+    """Read a gallery; a gallery that does not exist is empty.
 
     Args:
         directory: directory of the gallery.
         embedding: fingerprint that the gallery must have; None accepts any.
-        known: an earlier state, whose objects are not read again.
+        known: an earlier state of the gallery, whose objects are not read again.
 
     Raises:
         GalleryError: a file is missing or damaged, or the gallery has another embedding. The message names the file.
@@ -113,7 +113,7 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
                 f"gallery: {directory} was enrolled with the embedding {index['embedding'][:8]}, and the run has "
                 f"{embedding[:8]}; embed its views again with `thor2 objects --reembed`"
             )
-        # A file that the index names is missing if a writer replaced it after the index was read, or it was deleted.
+        # A file of the index is missing if a writer replaced it after the index was read, or if it was deleted.
         with contextlib.suppress(FileNotFoundError):
             return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
     raise GalleryError(
@@ -127,9 +127,9 @@ def _read_index(path: Path) -> dict[str, Any] | None:
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
         if not all(isinstance(index[field], kind) for field, kind in fields.items()):
             raise TypeError("a field has another type")
-        json.dumps(index, ensure_ascii=False).encode()  # refuses text that could not be written again
+        json.dumps(index, ensure_ascii=False).encode()  # raises for text that could not be written again
         names, files = ([entry[field] for entry in index["objects"]] for field in ("name", "file"))
-        # Names of older versions need not pass `check_name`.
+        # Names from older versions may fail `check_name`.
         if len(set(names)) < len(names) or not all(isinstance(name, str) and name.isprintable() for name in names):
             raise ValueError("a name is missing or listed twice")
         if not all(isinstance(file, str) and _DIGEST.fullmatch(file) for file in files):
@@ -178,7 +178,7 @@ def _object_content(name: str, views: GalleryObject) -> bytes:
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
-    """Return the name of an object, which files of version 0.2 and before do not have, and the object."""
+    """Return the name of an object (None in files of version 0.2 and before) and the object."""
     try:
         content = read_file(path)
     except FileNotFoundError:
@@ -197,7 +197,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
 
 
 def _lock(directory: Path, seconds: float) -> contextlib.AbstractContextManager[object]:
-    """Lock the gallery of a directory, which is created if it is missing, for the context that is returned."""
+    """Return a context in which the gallery of a directory is locked; create the directory if it is missing."""
     directory.mkdir(parents=True, exist_ok=True)
     try:
         # A soft lock would outlive a killed process.
@@ -216,15 +216,15 @@ def update_gallery(
     lock_seconds: float = LOCK_SECONDS,
     rebuild: bool = False,
 ) -> Gallery:
-    """Change a gallery on disk; another writer's change is never lost.
+    """Change a gallery on disk without losing the change of another writer.
 
     Args:
         directory: directory of the gallery; created if it is missing.
-        change: function of the gallery on disk that returns the new one. Whatever it raises leaves the disk as it was.
+        change: function of the gallery on disk that returns the new one. If it raises, nothing changes on disk.
         embedding: fingerprint that the gallery must have; None accepts any.
-        known: an earlier state, whose objects are not read again.
+        known: an earlier state of the gallery, whose objects are not read again.
         lock_seconds: time to wait for another writer.
-        rebuild: if the index is missing, begin with the objects whose files are there; `change` embeds them again.
+        rebuild: if the index is missing, start from the existing object files; `change` embeds the views again.
 
     Returns:
         The gallery after the change.
@@ -232,7 +232,7 @@ def update_gallery(
     Raises:
         GalleryError: the gallery cannot be read.
         GalleryBusyError: another process holds the lock.
-        OSError: a file cannot be written; the gallery is as before.
+        OSError: a file cannot be written; the gallery is unchanged.
     """
     with _lock(directory, lock_seconds):
         is_lost = rebuild and gallery_stamp(directory) is None
@@ -244,7 +244,7 @@ def update_gallery(
         written: list[Path] = []
         try:
             if before.stamp is None and not before.objects:
-                # A writer that is killed leaves an empty gallery, and no objects without an index.
+                # The index is written first, so that a killed writer leaves an empty gallery, not objects without it.
                 written.append(directory / INDEX_FILE)
                 write_text(written[0], _index_content(Gallery(changed.embedding)))
             for name, views in changed.objects.items():
@@ -262,7 +262,7 @@ def update_gallery(
             for path in reversed(written):
                 path.unlink(missing_ok=True)
             raise
-        # The change is made; it only cannot be taken back if that fails, or a foreign file has this name.
+        # The change is complete. If this write fails, or if previous.json is another file, it only cannot be undone.
         with contextlib.suppress(OSError, GalleryError):
             _read_index(directory / PREVIOUS_FILE)
             write_text(directory / PREVIOUS_FILE, _index_content(before))
@@ -270,13 +270,13 @@ def update_gallery(
 
 
 def previous_gallery(directory: Path, generation: int, gallery: Gallery) -> Gallery:
-    """Return a gallery before its last change, to which `update_gallery` can change it.
+    """Return the state of a gallery before its last change, for use with `update_gallery`.
 
-    Taking that back, in turn, restores the first change.
+    If this change is undone as well, the first change is restored.
 
     Args:
         directory: directory of the gallery.
-        generation: generation of the gallery after the change that is taken back.
+        generation: generation of the gallery after the change that is undone.
         gallery: the gallery on disk.
 
     Raises:
@@ -300,7 +300,7 @@ def _write_durably(path: Path, content: bytes) -> None:
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
-        os.fsync(file.fileno())  # the index must not reach the disk before the files that it names
+        os.fsync(file.fileno())  # the files must reach the disk before the index that names them
 
 
 def _index_content(gallery: Gallery) -> str:
@@ -320,7 +320,7 @@ def _index_content(gallery: Gallery) -> str:
 def _own_objects(
     directory: Path, used: Collection[str | None] = ()
 ) -> Iterator[tuple[Path, tuple[str | None, GalleryObject]]]:
-    """Yield the files of objects that are not used, those with the name and the content of one, and `_read_object`."""
+    """Yield each valid object file that is not in `used`, with the result of `_read_object`."""
     for path in sorted((directory / "objects").glob("*.safetensors")):
         with contextlib.suppress(GalleryError, FileNotFoundError):
             if _DIGEST.fullmatch(path.stem) and path.stem not in used:
@@ -328,10 +328,10 @@ def _own_objects(
 
 
 def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
-    """Remove what an interrupted writer left, and the files of objects that an earlier change removed."""
+    """Remove the leftovers of an interrupted writer, and the files of objects that an earlier change removed."""
     for folder in (directory, directory / "objects"):
         remove_leftovers(folder)
-    if (directory / "objects").is_symlink():  # Another gallery may share the files behind it.
+    if (directory / "objects").is_symlink():  # Another gallery may use the linked files.
         return
     for path, _ in _own_objects(directory, used):
         if not path.is_symlink():
@@ -339,7 +339,7 @@ def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
 
 
 def _rebuilt(directory: Path) -> Gallery:
-    """Return the gallery of the objects whose files are there, if the index is lost; its embedding is unknown."""
+    """Return a gallery of all object files in a directory without an index; its embedding is unknown."""
     previous: dict[str, Any] = {"objects": [], "hidden": [], "generation": -1}
     with contextlib.suppress(GalleryError):
         previous = _read_index(directory / PREVIOUS_FILE) or previous
@@ -349,7 +349,7 @@ def _rebuilt(directory: Path) -> Gallery:
         entry = listed.get(path.stem)
         if name is None and entry is not None:
             name, views = entry["name"], _with_origin(views, entry)
-        # Of two files with one name, the one that is not in the index before the last change is newer.
+        # If two files have the same name, the one that the previous index lacks is newer.
         objects.append((entry is None, views.date, name or f"object-{path.stem[:8]}", views))
     objects.sort(key=lambda each: each[:3])
     of_name = {name: views for *_, name, views in objects}

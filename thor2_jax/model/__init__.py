@@ -1,1 +1,1 @@
-"""The model, and the answers that it gives."""
+"""The model and its answers."""

@@ -1,28 +1,28 @@
 """Fusion: one answer from the class probabilities of several classifiers (paper, section "Recognition"); confidence.
 
-Each rule makes one distribution over the classes from those of the classifiers; its most probable class is the answer
-and that class's probability is the confidence:
+Each rule fuses the distributions of the classifiers over the classes into one. Its most probable class is the answer,
+and the probability of this class is the confidence:
 
 - "max", the paper's rule: the distribution of the classifier with the largest top-1 probability.
 - "mean": the arithmetic mean of the distributions.
 - "log-mean", the default: their geometric mean (the mean of the log-probabilities), normalized to sum to one. A class
-  wins only if every classifier finds it likely.
+  wins only if no classifier gives it a low probability.
 
 >>> shape, color = np.array([[0.6, 0.4]], np.float32), np.array([[0.1, 0.9]], np.float32)
 >>> fused_probabilities({"tops": shape, "tops2": color}, "max").argmax(axis=1)
 array([1])
 
 Confidence is the estimated probability that the answer to a known object is correct; it is low for unknown objects.
-The fused probability of a class says which of the trained classes is most likely, not whether the object is one of them
-at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. The score of an
-answer is the product of two logistic functions,
+The fused probabilities show which of the trained classes is most likely, but not whether the object belongs to any of
+them. The embedding of a run is also fitted on distractors, objects that belong to none of the classes. The score of
+an answer is the product of two logistic functions,
 
     score = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
 
-In new runs the first one is constant, since an object that looks like two classes is no unknown object. Known and
+In new runs the first function is constant, since an object that looks like two classes need not be unknown. Known and
 unknown objects have equal weights in the fit, so that the score separates them well. The confidence is a third logistic
-function, of the log-odds of the score: the share of correct answers to known objects with this score (Platt, 1999).
-They are fitted by `training` on views that no network was trained on.
+function, of the log-odds of the score: the fraction of correct answers to known objects with this score (Platt, 1999).
+`training` fits the three functions on views that no network was trained on.
 """
 
 import dataclasses
@@ -93,7 +93,7 @@ def fused_probabilities(probabilities: Mapping[str, Any], rule: FusionRule = DEF
 Probabilities = NDArray[np.floating[Any]]
 
 MAX_ODDS = 8.0
-"""Largest absolute log-odds of a feature; beyond it, probabilities of networks say nothing more."""
+"""Largest absolute log-odds of a feature; more extreme probabilities of networks carry no information."""
 
 
 def answer_features(fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
@@ -101,7 +101,7 @@ def answer_features(fused: Probabilities, embedding: Probabilities) -> NDArray[n
 
     Args:
         fused: [B, C] fused class probabilities.
-        embedding: [B, C] class probabilities of the embedding; what they lack to 1 is that of the distractors.
+        embedding: [B, C] class probabilities of the embedding; the rest to 1 is the probability of the distractors.
     """
     values = [fused.max(axis=1), embedding.sum(axis=1)]
     return logit(np.stack(values, axis=1).astype(np.float64).clip(0, 1)).clip(-MAX_ODDS, MAX_ODDS)
@@ -109,7 +109,7 @@ def answer_features(fused: Probabilities, embedding: Probabilities) -> NDArray[n
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A fitted confidence.
+    """A fitted calibration of the confidence.
 
     Attributes:
         correct_bias: log-odds of a correct answer, for a known object whose first feature is 0.

@@ -3,10 +3,10 @@
 >>> inference = infer(model, describe_looks(clouds, network, config))               # doctest: +SKIP
 >>> answers(model, instances, inference)                                            # doctest: +SKIP
 
-All that recognizes uses these functions: frames, sequences of frames, the service, explanations and evaluation.
+Recognition of frames and sequences, the service, explanations and evaluation all use these functions.
 
-The instances of a frame are computed a few at a time: JAX dispatches asynchronously, so that the device computes one
-chunk while the host prepares the next.
+The instances of a frame are processed in chunks: JAX dispatches asynchronously, so that the device computes one chunk
+while the host prepares the next one.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 MIN_PART = 32
-"""A chunk is padded to at least 1 / MIN_PART of its size: commands, whose chunks are large, compile fewer sizes."""
+"""A chunk is padded to at least 1 / MIN_PART of its size, so that fewer sizes are compiled for large chunks."""
 
 T = TypeVar("T")
 
@@ -45,11 +45,11 @@ T = TypeVar("T")
 def compute_by_chunks(
     instances: Iterable[PreparedInstance], size: int, compute: Callable[[PointClouds], T]
 ) -> tuple[list[PreparedInstance], T]:
-    """Prepare instances and compute something of the usable ones.
+    """Prepare instances and apply a function to the usable ones in chunks.
 
     Args:
-        instances: an iterator that prepares them, one after the other.
-        size: usable instances in a chunk.
+        instances: an iterator that prepares the instances one by one.
+        size: number of usable instances in a chunk.
         compute: function from the clouds of a chunk, padded to `padded_rows`, to arrays [B, ...] as a pytree; it is
             called at least once.
 
@@ -83,27 +83,27 @@ def compute_by_chunks(
 
 
 def padded_rows(n: int, size: int) -> int:
-    """Return the rows that `n` instances in chunks of `size` are padded to: largest batches, then a batch bucket.
+    """Return the padded number of rows for `n` instances in chunks of `size`: whole largest batches, then a bucket.
 
-    There are at least `size` / `MIN_PART` rows, and at least one.
+    The result is at least `size` / `MIN_PART`, and at least 1.
     """
     whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
     return n if n == whole > 0 else whole + batch_bucket(max(n - whole, size // MIN_PART, 1))
 
 
 N_TOP = 5
-"""Most probable names of each classifier that an answer lists."""
+"""Number of most probable names of each classifier in an answer."""
 
 
 class Inference(NamedTuple):
     """Outputs of a model for clouds, one row for each.
 
     Attributes:
-        overflow: [B] int, of the descriptors of the first look.
+        overflow: [B] int, overflow of the descriptors of the first look.
         probabilities: classifier -> class probabilities [B, C], fused over the looks; empty if the gallery alone
-            answers. Those of the embedding sum to the probability that an object is one of the classes.
+            answers. The embedding's probabilities sum to the probability that the object is one of the classes.
         embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
-        scores: [B, n_objects] scores of the gallery, of an inference that is fused over frames, in place of embeddings.
+        scores: [B, n_objects] scores of the gallery, which replace the embeddings after fusion over frames.
     """
 
     overflow: Any
@@ -121,7 +121,7 @@ def infer(
         model: the model.
         oriented: descriptors of the looks at B clouds.
         clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
-        classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
+        classifiers: classifiers to evaluate, see `RunClassifiers.default`; empty if the gallery alone answers.
     """
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
@@ -152,7 +152,7 @@ def infer_clouds(
     """
     source = model.answers_by(answer_by)
     config = model.run.config
-    # The gallery alone needs two looks, which `infer` would otherwise describe again.
+    # If the gallery alone answers, it needs `LOOKS` looks, which `infer` would otherwise describe again.
     count = max(config.looks, LOOKS) if source == "gallery" else config.looks
     oriented = describe_looks(clouds, model.run.network, config, count)
     names = model.chosen_classifiers(classifiers) if source != "gallery" else ()
@@ -167,7 +167,7 @@ def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | N
 
 
 def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:
-    """Return the values [B, n] of all names, whose largest one is the answer and its confidence."""
+    """Return the values [B, n] of all names; the largest value is the confidence, and its name is the answer."""
     return model.combined(jax.tree.map(np.asarray, inference.probabilities), object_scores(model, inference))
 
 
@@ -176,8 +176,8 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
 
     Args:
         model: the model.
-        instances: all of them; the usable ones are the first rows of the inference, in order.
-        inference: outputs of the model for them.
+        instances: all instances of the frame.
+        inference: outputs of the model, whose first rows belong to the usable instances in order.
     """
     n_usable = sum(instance.reason is None for instance in instances)
     inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)

@@ -38,15 +38,15 @@ MAX_PARAMETER = 1.5
 
 @dataclasses.dataclass(frozen=True)
 class ColorTransform:
-    """Colours c in [0, 1] become exp(gain) exp(warmth [1, 0, -1]) c^exp(gamma), then the distance from grey is scaled.
+    """Correction of colours c in [0, 1]: exp(gain) exp(warmth [1, 0, -1]) c^exp(gamma), then scaled saturation.
 
-    With all parameters 0, nothing changes.
+    With all parameters 0, colours do not change.
 
     Attributes:
         gamma: logarithm of the exponent.
         gain: logarithm of the factor of all channels.
         saturation: logarithm of the factor of a colour's distance from grey.
-        warmth: logarithm of the factor of red, and of one over the factor of blue.
+        warmth: logarithm of the factor of red and of the inverse factor of blue.
 
     Raises:
         InputError: a parameter is not a finite number, or its absolute value is above `MAX_PARAMETER`.
@@ -66,9 +66,9 @@ class ColorTransform:
             )
 
     def __call__(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the corrected colours of colours [..., 3] uint8 sRGB."""
+        """Return the corrected values of colours [..., 3] uint8 sRGB."""
         gamma, gain, saturation, warmth = dataclasses.astuple(self)
-        # The channels are powers of 256 values, which a table holds.
+        # A channel has only 256 values, so a table holds their powers.
         powers = (np.arange(256) / 255) ** np.exp(gamma)
         values = powers[colors] * np.exp(gain + warmth * np.array([1, 0, -1]))
         grey = (values @ LUMA)[..., None]
@@ -76,12 +76,12 @@ class ColorTransform:
 
 
 def _stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: str) -> T | None:
-    """Return a dataclass instance from the record of a run; None if the record does not have it.
+    """Return a dataclass instance from the record of a run; None if the record lacks the value.
 
     Args:
         kind: the dataclass; its own checks apply.
         name: name of the value in the record.
-        record: the record, as JSON holds it; the value is a mapping of field names to values.
+        record: the record as JSON values; the stored value is a mapping of field names to values.
         remedy: advice of the error message.
 
     Raises:
@@ -103,10 +103,10 @@ def _fused_probabilities(models: Sequence[MLP], oriented: LookDescriptors, name:
 
 
 def _check_answer_by(value: str | None) -> AnswerBy | None:
-    """Return the source of the answers, or None if it is not given.
+    """Return the source of the answers, or None if no source is given.
 
     Raises:
-        InputError: it is unknown.
+        InputError: the source is unknown.
     """
     if value not in (None, *get_args(AnswerBy)):
         raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
@@ -121,10 +121,10 @@ class Model:
         run: the trained run.
         classifiers: its compiled classifiers by name.
         gallery: the enrolled objects.
-        unknown_below: least confidence, from 0 to 1, of an answer with any name; None for those of `thresholds`.
+        unknown_below: least confidence, from 0 to 1, of an answer with a name; None for the defaults in `thresholds`.
         rule: fusion rule of the classifiers, see `fusion`; the paper's is "max".
-        answer_by: source of the answers, see `answers_by`; None for that of the run's record.
-        color_transform: corrects the colours of every instance; None changes nothing.
+        answer_by: source of the answers, see `answers_by`; None for the source in the run's record.
+        color_transform: correction of the colours of every instance; None for no correction.
     """
 
     run: TrainedRun
@@ -165,12 +165,12 @@ class Model:
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:
-        """Turns fused probabilities into confidences; None in runs without one."""
+        """The calibration, which turns fused probabilities into confidences; None in runs without one."""
         return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
+        """All names that an answer can have: trained classes, without forgotten ones, and enrolled objects."""
         return self.gallery.answered_names
 
     @property
@@ -186,7 +186,7 @@ class Model:
                 it has none of these.
 
         Raises:
-            InputError: there is no name, or a classifier that the run does not have.
+            InputError: no name is given, or the run lacks a classifier.
         """
         if names is None:
             return tuple(name for name in (*THOR2, EMBEDDING) if name in self.classifiers) or tuple(self.classifiers)
@@ -198,8 +198,8 @@ class Model:
         """Return the source of the answers: "classifiers", "gallery" or "both".
 
         Args:
-            answer_by: the wanted source; by default that of the model. Without classifiers it is always the gallery,
-                with an empty gallery always the classifiers, and otherwise both by default.
+            answer_by: the requested source; by default that of the model, and else "both". A run without classifiers
+                always answers by the gallery, a run with an empty gallery always by the classifiers.
         """
         wanted = _check_answer_by(answer_by) or self.answer_by
         if not self.classifiers:
@@ -209,12 +209,12 @@ class Model:
         return wanted or "both"
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
-        """Return the least confidence [n] of an answer with each of the `names`; with `unknown_below`, it is that.
+        """Return the least confidence [n] of an answer with each of the `names`: `unknown_below`, if it is set.
 
         By default it is the confidence that 95 % of the correct answers on held-out views or frames reach (97 % in runs
-        of earlier versions). That of a class with an output of the classifiers is the run's own, measured on held-out
-        views, or 0 in runs without one. That of other objects, and of all where the gallery alone answers, depends on
-        the number of their views, see `Gallery.unknown_below`.
+        of earlier versions). For a class with an output of the classifiers, it is measured on held-out views and stored
+        in the run, or 0 in runs without it. For other objects, and for all names if the gallery alone answers, it
+        depends on the number of enrolled views, see `Gallery.unknown_below`.
 
         Args:
             answer_by: source of the answers, see `answers_by`.
@@ -229,7 +229,7 @@ class Model:
         )
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
-        """Return an instance with the colours that `color_transform` makes of those of the camera."""
+        """Return an instance with its colours corrected by `color_transform`."""
         if self.color_transform is None:
             return instance
         return dataclasses.replace(instance, colors=self.color_transform(instance.colors))
@@ -237,11 +237,11 @@ class Model:
     def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
         """Return the fused class probabilities [B, C] of the classifiers.
 
-        The embedding is not fused with others. Where the run is calibrated, it scales their fused probabilities, so
-        that the largest one is the confidence.
+        The embedding is not fused with other classifiers. In a calibrated run, it determines the confidence, to which
+        the largest fused probability is scaled.
         """
         others = {name: values for name, values in probabilities.items() if name != EMBEDDING}
-        # The default rule normalizes the probabilities of the embedding, which lack that of being none of the classes.
+        # The default rule normalizes the embedding's probabilities, whose sum is below 1 because of the distractors.
         fused = fused_probabilities(others or probabilities, self.rule if others else DEFAULT_RULE)
         if self.calibration is None or EMBEDDING not in probabilities:
             return fused
@@ -250,11 +250,13 @@ class Model:
     def combined(
         self, probabilities: Mapping[str, NDArray[np.float32]], scores: NDArray[np.float32] | None
     ) -> NDArray[np.floating[Any]]:
-        """Return the values [B, n] of all `names`, whose largest one is the answer and its confidence.
+        """Return the values [B, n] of all `names`; the name with the largest value is the answer.
+
+        The largest value is the confidence.
 
         Args:
             probabilities: classifier -> class probabilities [B, C]; empty if the gallery alone answers.
-            scores: [B, n_objects] of the gallery; None if the classifiers alone answer.
+            scores: [B, n_objects] scores of the gallery; None if the classifiers alone answer.
         """
         if scores is None:
             return self.gallery.of_classifiers(self.fused(probabilities))

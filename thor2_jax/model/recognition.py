@@ -22,7 +22,7 @@ AnswerBy = Literal["classifiers", "gallery", "both"]
 """Sources of answers."""
 
 MAX_OVERFLOW = 0.5
-"""Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
+"""Largest overflow of an answer with a name, as a fraction of the points; beyond it, the descriptor misses too much."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,22 +30,21 @@ class Recognition:
     """The answer for one instance of a frame.
 
     Attributes:
-        label: its number in the label image.
+        label: number of the instance in the label image.
         name: the object's name. None if the instance could not be described (fewer points than
-            `prepared_instance.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
-            confidence is below `unknown_below` (see `inference.answers`): an unknown object.
-        confidence: from 0 to 1, also of an unknown object: estimated probability that the name of a known object is
-            correct; low for most unknown objects (see `model.fusion`). Without a calibration, the fused
-            probability of the most probable class or the score of the gallery. None if the instance could not be
-            described.
+            `prepared_instance.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if the object
+            is unknown. Unknown objects have a confidence below the threshold (see `inference.answers`).
+        confidence: from 0 to 1, also for unknown objects: estimated probability that the name is correct if the object
+            is known; low for most unknown objects (see `model.fusion`). Without a calibration, the fused probability of
+            the most probable class or the score of the gallery. None if the instance could not be described.
         classifier: the classifier that gives this class the largest probability ("tops", "tops2" or "embedding"), or
             "gallery".
         top: classifier or "gallery" -> its five most probable (name, probability) pairs.
-        occluded: another instance hides a part of it, or the image border cuts it.
-        overflow: points and persistence pairs outside the descriptor's grid, see `Descriptors`.
-        points_used: points of the described cloud.
-        kept_by_fallback: a rule of outlier removal would have dropped most of the cloud and was skipped.
-        reason: why `name` is None; None if it is not.
+        occluded: whether another instance hides a part of the instance, or the image border cuts it.
+        overflow: number of points and persistence pairs outside the descriptor's grid, see `Descriptors`.
+        points_used: number of points of the described cloud.
+        kept_by_fallback: whether an outlier rule was skipped, since it would have dropped most of the cloud.
+        reason: why `name` is None; None if there is a name.
     """
 
     label: int
@@ -71,13 +70,13 @@ class Box(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """The answer for an instance, and where it is.
+    """The answer for an instance, and the position of the instance.
 
     Attributes:
         recognition: the answer.
-        box: its place in the image, pixels.
-        position: mean of its visible points in the OpenCV camera frame (x right, y down, z forward), metres; None if it
-            has no depth.
+        box: box around the instance in the image, pixels.
+        position: mean of the visible points in the OpenCV camera frame (x right, y down, z forward), metres; None if
+            the instance has no depth.
     """
 
     recognition: Recognition
@@ -104,7 +103,7 @@ def detections_of(frame: RGBDFrame, recognitions: Sequence[Recognition]) -> list
 
 
 def detections_as_json(detections: Sequence[Detection]) -> list[dict[str, Any]]:
-    """Return the detections as JSON values: those of the answer, `box` and `position`."""
+    """Return the detections as JSON values: the fields of the answer, `box` and `position`."""
     return [
         {**dataclasses.asdict(one.recognition), "box": list(one.box), "position": one.position and list(one.position)}
         for one in detections

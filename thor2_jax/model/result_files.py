@@ -1,6 +1,6 @@
 """Files with the recognitions of frames: JSON and overlay, COCO results, BOP results.
 
-A frame has a name. COCO and BOP number images and objects instead: `image_numbers` and `category_numbers`.
+Frames and objects have names. COCO and BOP use numbers instead, see `image_numbers` and `category_numbers`.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ _IDENTITY = "1 0 0 0 1 0 0 0 1"
 
 
 def check_no_foreign_results(out: Path) -> None:
-    """Raise InputError if `write_recognitions` would replace a file that it has not written."""
+    """Raise InputError if `write_recognitions` would overwrite a file that is not one of its own."""
     names = [name for name in RESULT_FILES if (out / name).exists()]
     if names and not has_json(out / RESULT_FILES[0], ("label", "name", "confidence", "points_used")):
         raise InputError(f"out: {out} has {names[0]}, which this command has not written; choose another directory")
@@ -50,7 +50,7 @@ def is_coco_file(path: Path) -> bool:
 
 
 def is_bop_file(path: Path) -> bool:
-    """Return whether a file has the lines of BOP results that `ResultTables` writes: all rotations are the identity."""
+    """Return whether a file has BOP results as `ResultTables` writes them, where every rotation is the identity."""
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
     except (OSError, ValueError):
@@ -73,8 +73,8 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
 def image_numbers(names: Sequence[str]) -> list[tuple[int, int]]:
     """Return scene number and image number of each frame.
 
-    They are the last two parts of the name (`000048/000001`: scene 48, image 1; `000001`: scene 1) if these are numbers
-    and differ between the frames; otherwise all frames are of scene 1 and are counted from 1.
+    The numbers are the last two parts of the name (`000048/000001`: scene 48, image 1; `000001`: scene 1) if these are
+    numbers that differ between the frames; otherwise all frames are in scene 1 and are counted from 1.
     """
     numbers = []
     for name in names:
@@ -93,8 +93,8 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
 
     Args:
         classes: names of the objects.
-        names: number -> name; a class that it lacks gets no number. By default `obj_000012` has the number 12 if all
-            classes have such names, and otherwise the classes are counted from 1.
+        names: number -> name; other classes get no number. By default `obj_000012` has the number 12 if all classes
+            have such names, and otherwise the classes are counted from 1.
     """
     if names is not None:
         numbers = {name: number for number, name in names.items()}
@@ -127,11 +127,11 @@ def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
 class ResultTables:
     """The COCO and BOP results of all frames, filled frame by frame and written at the end.
 
-    Instances without a name, or whose name has no number, are in neither file. THOR2 estimates no pose: in the lines of
-    BOP (`BOP_HEADER`), R is the identity, and t the mean of the visible points, in millimetres.
+    Instances without a name, or whose name has no number, are in neither file. THOR2 does not estimate poses: in the
+    BOP results (`BOP_HEADER`), R is the identity and t is the mean of the visible points, in millimetres.
 
     Attributes:
-        n_without_number: named instances whose class has no number.
+        n_without_number: number of recognized instances whose class has no number.
     """
 
     def __init__(self, frames: Sequence[str], classes: Sequence[str], names: Mapping[int, str] | None = None) -> None:
@@ -154,9 +154,9 @@ class ResultTables:
         """Add the detections of a frame.
 
         Args:
-            name: name of the frame, which is stored with each entry of COCO, as is the name of the object.
+            name: name of the frame; each COCO entry contains it and the name of the object.
             frame: the frame.
-            detections: its answers, and where the objects are.
+            detections: the detections in the frame.
             seconds: time for the whole frame.
         """
         scene, image = self._images[name]
@@ -185,7 +185,7 @@ class ResultTables:
             self._bop.append(f"{scene},{image},{category},{answer.confidence},{_IDENTITY},{place},{seconds:.4f}")
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
-        """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.
+        """Write COCO results as JSON and BOP results as CSV to the given paths, and create the directories.
 
         Raises:
             OSError: a file cannot be written.

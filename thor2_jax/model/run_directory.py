@@ -6,17 +6,17 @@ RUN/network.npz                 the colour network whose regions the descriptors
 RUN/weights/NAME.safetensors    parameters and batch statistics of one classifier
 RUN/embedding.safetensors       the embedding of the gallery, in place of the packaged one, which may also recognize
                                 the classes
-RUN/references.safetensors      its reference views, with which galleries tell unknown objects apart
+RUN/references.safetensors      its reference views, with which galleries reject unknown objects
 
-These five are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does not
-read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl` and
-`curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`, from
-which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`). A run whose embedding
-recognizes the classes may have no classifiers, and one that was made by enrolling has neither classes nor classifiers.
+These five files are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does
+not read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl`
+and `curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`,
+from which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`). A run whose embedding
+recognizes the classes may have no classifiers; a run that `thor2 enroll` created has neither classes nor classifiers.
 With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
 
-A run directory appears under its name only when it is complete, and everything is checked when it is loaded. Two
-trainings that are equal (see `training.fitting.fit`) give the same bytes in these five.
+A run directory appears under its name only when it is complete, and all files are checked when it is loaded. Two
+equal trainings (see `training.fitting.fit`) write the same bytes to these five files.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ from thor2_jax.networks import (
 __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file"]
 
 EMBEDDING_FILE = "embedding.safetensors"
-"""Embedding of a run directory, in place of the packaged one."""
+"""File of a run's embedding, which replaces the packaged one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ class TrainedRun:
         network: the colour network.
         classes: class names, in the order of a classifier's outputs; none in a run of enrolled objects only.
         classifiers: feature -> trained MLP.
-        record: how the run was made (options, counts, training metrics), as JSON holds it.
+        record: record of the training (options, counts, metrics) as JSON values.
         embedding: embedding of the run, which may recognize its classes, too; None for the packaged one.
     """
 
@@ -121,15 +121,15 @@ def load_run(path: str | Path) -> TrainedRun:
     """Read a run directory.
 
     Raises:
-        InputError: the path is not a run directory, a file is damaged, the format or the descriptor version is another
-            one, or the files do not belong together. The message names the file.
+        InputError: the path is not a run directory, a file is damaged, the format or the descriptor version is not
+            supported, or the files do not belong together. The message names the file.
     """
     path = Path(path).absolute()
     description = read_description(path)
     try:
         config = DescriptorConfig.of_record(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
-        # A run of enrolled objects only has neither.
+        # A run with enrolled objects only has neither.
         names = check_features(description["classifiers"], "classifiers") if description["classifiers"] else ()
         fingerprint = description["color_network"]
         digests = {name: description["weights"][name] for name in names}

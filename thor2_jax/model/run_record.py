@@ -1,4 +1,4 @@
-"""The description of a run, run.json. No JAX."""
+"""The description of a run, run.json; this module does not import JAX."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ def read_description(path: Path) -> dict[str, Any]:
     """Return the content of run.json in a run directory.
 
     Raises:
-        InputError: the path is not a run directory, or its format or descriptor version is another one.
+        InputError: the path is not a run directory, or its format or descriptor version is not supported.
     """
     try:
         description = json.loads(read_file(path / RUN_FILE))

@@ -1,1 +1,1 @@
-"""Recordings and live cameras: frames from bags and RealSense cameras, and files with the detections in them."""
+"""Recordings and live cameras: frames from bags and RealSense cameras, and files with their detections."""

@@ -1,4 +1,4 @@
-"""Frames in recordings of ROS 1, ROS 2 and MCAP: colour and depth images nearest in time (extra `bags`).
+"""Frames from ROS 1, ROS 2 and MCAP recordings: pairs of colour and depth images nearest in time (extra `bags`).
 
 with Bag("table.mcap") as bag:
     for recorded in bag.frames():
@@ -46,13 +46,13 @@ MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
 
 MAX_TOPICS = 1000
-"""Largest number of image and camera topics: finding the first message of each may read the whole recording."""
+"""Largest number of image and camera topics, since finding the first message of each may read the whole recording."""
 
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
-"""Suffix of a file -> the command that repairs it; directories have that of .db3."""
+"""Suffix of a file -> command that repairs it; for directories, the command of .db3."""
 
 MAX_DECOMPRESSED = 2**28
-"""Largest size in bytes of a decompressed chunk or message, that of an image of `MAX_IMAGE_PIXELS` in four channels."""
+"""Largest size in bytes of a decompressed chunk or message: an image of `MAX_IMAGE_PIXELS` with four channels."""
 
 MAX_OVERLAPPING = 2**29
 """Largest size in bytes of the decompressed chunks of an MCAP file that overlap in time."""
@@ -62,16 +62,16 @@ MAX_RATIO = 1000
 
 
 class Bag:
-    """A recording, open while its context is entered.
+    """A recording that is open inside its context.
 
     Attributes:
         path: the file, or the directory of a ROS 2 bag.
         topics: the topics that are read.
-        intrinsics: the colour camera.
+        intrinsics: intrinsics of the colour camera.
         frame_id: coordinate frame of the colour images.
-        counts: images and pairs so far.
-        is_truncated: whether its end is missing. Of MCAP files, the frames before are read nevertheless.
-        notes: likely mistakes of the recording that are no errors.
+        counts: numbers of images and pairs so far.
+        is_truncated: whether the end of the recording is missing; complete frames of an MCAP file are read anyway.
+        notes: warnings about likely mistakes in the recording.
     """
 
     def __init__(
@@ -83,17 +83,17 @@ class Bag:
         depth_scale: float | None = None,
         max_gap: float = DEFAULT_MAX_GAP,
     ) -> None:
-        """Describe what is read; nothing is opened yet.
+        """Set the arguments; `__enter__` opens the recording.
 
         Args:
             path: a ROS 1 bag (.bag), a ROS 2 bag (its directory, or a .db3 file) or an MCAP file.
-            topics: names of topics; by default they are chosen by what they hold.
-            intrinsics: the colour camera, in place of the recorded one.
-            depth_scale: depth units per metre, in place of ROS's 1000.
+            topics: names of topics; by default they are chosen by their content.
+            intrinsics: intrinsics of the colour camera, in place of the recorded ones.
+            depth_scale: depth units per metre, in place of the 1000 of ROS.
             max_gap: largest time between the two images of a frame, seconds.
 
         Raises:
-            InputError: `max_gap` is no positive number, or too large.
+            InputError: `max_gap` is not a positive number, or too large.
         """
         if not 0 < max_gap <= MAX_GAP:
             raise InputError(f"max_gap is {max_gap}; expected a positive number of seconds, at most {MAX_GAP:g}")
@@ -111,7 +111,7 @@ class Bag:
         Raises:
             InputError: the package rosbags is missing, the recording is damaged or of another format, or it lacks a
                 topic.
-            OSError: it cannot be opened.
+            OSError: the recording cannot be opened.
         """
         with needs_extra(f"bag is {self.path}, which", "rosbags", "bags"):
             from rosbags.rosbag1 import Reader as Reader1
@@ -121,18 +121,18 @@ class Bag:
             _limit_decompression()
         for file in [self.path, *self.path.glob("*")]:
             if not file.is_dir():
-                open_file(file).close()  # an OSError if it is a pipe, which rosbags would read forever
+                open_file(file).close()  # raises OSError for a pipe, which rosbags would read forever
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
                     raise ValueError("it has no metadata.yaml")
-                # rosbags would expand aliases without a limit, and fail to close other values of "files".
+                # rosbags would expand YAML aliases without a limit, and could not close invalid values of "files".
                 files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
                 if not isinstance(files, list | None):
                     raise ValueError("files of metadata.yaml is no list")
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
             source: Any = _CompleteRecords(self.path) if self.is_truncated else self.path
-            # ROS's own definitions of images are used, which have not changed: rosbags would compile those of the file.
+            # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":
                 reader: Any = Reader1(source)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
@@ -155,7 +155,7 @@ class Bag:
         """Yield the frames in the order of their time stamps.
 
         Raises:
-            InputError: the recording is damaged or missing from here on, or no two images are near enough in time.
+            InputError: the rest of the recording is damaged or missing, or no two images are near enough in time.
         """
         tolerance = round(self._max_gap * 1e9)
         names: Counter[str] = Counter()
@@ -245,7 +245,7 @@ class Bag:
 
     @contextlib.contextmanager
     def _damage_named(self) -> Iterator[None]:
-        """Turn what rosbags and its decompressors raise on damaged files, dozens of kinds, into an InputError."""
+        """Turn any exception of rosbags and its decompressors for a damaged file into an InputError."""
         try:
             yield
         except (OSError, InputError):
@@ -262,7 +262,7 @@ class Bag:
 
 
 def _camera(message: Any, color_topic: str) -> Intrinsics:
-    """Return the intrinsics of a CameraInfo: of rectified images P without distortion, of others K."""
+    """Return the intrinsics of a CameraInfo: P without distortion for rectified images, otherwise K."""
     projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
     if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
         matrix = projection.reshape(3, 4)[:, :3]
@@ -272,7 +272,7 @@ def _camera(message: Any, color_topic: str) -> Intrinsics:
 
 @functools.cache
 def _limit_decompression() -> None:
-    """Let rosbags, which decompresses without a limit, raise ValueError beyond `MAX_DECOMPRESSED`, in this process."""
+    """Make rosbags raise ValueError beyond `MAX_DECOMPRESSED` bytes in this process; by itself it has no limit."""
     import apsw
     import lz4.frame
     from rosbags.rosbag1 import reader as rosbag1
@@ -283,13 +283,13 @@ def _limit_decompression() -> None:
     rosbag1.decompressors.update(bz2=_limited(bz2.BZ2Decompressor), lz4=lz4_frame)
     storage_mcap.DECOMPRESSORS.update(lz4=lz4_frame, zstd=zstd)
     rosbag2.zstd = SimpleNamespace(decompress=zstd, open=functools.partial(_open_limited, rosbag2.zstd.open))
-    # A column of a database can be computed, and be larger than the file.
+    # A computed column of a database can be larger than the file.
     hooks: list[Any] = apsw.connection_hooks
     hooks.append(lambda database: database.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_DECOMPRESSED))
 
 
 def _limited(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return a function that decompresses with the standard library's interface of incremental decompressors."""
+    """Return a limited decompression function for an incremental decompressor (interface of the standard library)."""
 
     def decompress(data: bytes, *_: object) -> bytes:
         stream = decompressor()
@@ -318,11 +318,11 @@ def _open_limited(open_file: Callable[..., Any], stream: Any, mode: str) -> Any:
 
 
 def _largest_overlap(reader: Any, channels: Collection[int]) -> int:
-    """Return the largest size in bytes of the chunks of an MCAP file that overlap in time: rosbags holds them together.
+    """Return the largest total size in bytes of chunks that overlap in time; rosbags keeps them in memory together.
 
     Args:
         reader: reader of rosbags.
-        channels: numbers of the connections that are read; chunks without them do not count.
+        channels: numbers of the connections that are read; chunks without these are ignored.
     """
     storage = getattr(reader, "storage", None)
     largest = 0
@@ -344,7 +344,7 @@ _TAIL = bytes([_FOOTER]) + (20).to_bytes(8, "little") + bytes(20) + _MAGIC
 
 
 def _is_truncated(path: Path) -> bool:
-    """Return whether a file begins as MCAP and does not end so; raises OSError."""
+    """Return whether a file has the beginning, but not the end, of an MCAP file; raises OSError."""
     with open_file(path) as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
             return False
@@ -353,7 +353,7 @@ def _is_truncated(path: Path) -> bool:
 
 
 class _CompleteRecords(type(Path())):  # type: ignore[misc]  # Path itself cannot be derived from before Python 3.12
-    """A path to a truncated MCAP file that opens as one with all its complete records, and without an index."""
+    """A path to a truncated MCAP file, which opens as a file with all complete records but without an index."""
 
     def open(self, mode: str = "rb") -> BinaryIO:
         """Open the complete records for reading."""
@@ -361,7 +361,7 @@ class _CompleteRecords(type(Path())):  # type: ignore[misc]  # Path itself canno
 
 
 class _OpenRecords(io.BufferedReader):
-    """A truncated MCAP file, for rosbags: only `_TAIL` is read without a size, and it is looked for at the end."""
+    """A truncated MCAP file that looks complete to rosbags, which reads only `_TAIL` without a size and at the end."""
 
     def __init__(self, stream: io.FileIO) -> None:
         size = os.fstat(stream.fileno()).st_size
@@ -377,7 +377,7 @@ class _OpenRecords(io.BufferedReader):
         self.seek(0)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a position, for which `_TAIL` lies at the end of the complete records, and return it."""
+        """Move to a position and return it; the end is the end of the complete records, where `_TAIL` follows."""
         return super().seek(self._end) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def read(self, size: int | None = -1) -> bytes:

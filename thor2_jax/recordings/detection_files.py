@@ -82,7 +82,7 @@ def detection_types() -> Any:
 class MessageBag:
     """A ROS 2 bag or an MCAP file that is being written.
 
-    It appears when the context ends, also with an exception, if at least one message was written.
+    The bag appears when the context ends, even by an exception, if at least one message was written.
     """
 
     argument = "path"
@@ -91,12 +91,12 @@ class MessageBag:
         """Check that `path` can be written.
 
         Args:
-            path: the MCAP file (.mcap), or the directory of the ROS 2 bag; it does not exist.
-            topics: topic -> kind of its messages.
+            path: the new MCAP file (.mcap), or the new directory of the ROS 2 bag.
+            topics: topic -> type of its messages.
 
         Raises:
-            InputError: it exists or names a ROS 1 bag, or the package rosbags is missing.
-            OSError: its folder does not exist or cannot be written.
+            InputError: `path` exists or names a ROS 1 bag, or the package rosbags is missing.
+            OSError: the parent directory does not exist or cannot be written.
         """
         if path.suffix == ".bag":
             raise InputError(
@@ -117,7 +117,7 @@ class MessageBag:
         self._stack = contextlib.ExitStack()
         folder = self._stack.enter_context(temporary_directory(self._path.absolute().parent))
         plugin = StoragePlugin.MCAP if self._path.suffix == ".mcap" else StoragePlugin.SQLITE3
-        # ROS 2 names the files of a bag by its directory.
+        # ROS 2 names the files of a bag after its directory.
         self._bag = folder / self._path.stem
         self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
         self._writer.open()
@@ -136,10 +136,10 @@ class MessageBag:
                 os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self._path)
 
     def write_message(self, topic: str, fields: Mapping[str, Any], stamp: int) -> None:
-        """Write a message, recorded at `stamp` (ns) or, as bags have no earlier time, at 0.
+        """Write a message with the recording time `stamp` (ns), or 0 if it is negative.
 
         Raises:
-            InputError: the time is out of the range of ROS 2.
+            InputError: the time is outside the range of ROS 2.
         """
         if not -(2**31) <= stamp // 10**9 < 2**31:
             raise InputError(
@@ -156,8 +156,8 @@ class MessageBag:
 class DetectionBag(MessageBag):
     """A bag with the detections of a recording.
 
-    It holds `vision_msgs/Detection2DArray` in the topic `/thor2/detections` and, as JPEG, the colour images with
-    outlines and names in `/thor2/overlay/compressed`.
+    The topic `/thor2/detections` has `vision_msgs/Detection2DArray`; `/thor2/overlay/compressed` has the colour images
+    with outlines and names as JPEG.
     """
 
     argument = "out_bag"
@@ -183,7 +183,7 @@ class DetectionBag(MessageBag):
 
 
 def ros_message(value: Any) -> Any:
-    """Return what rosbags writes as a message: objects in place of mappings, and arrays of numbers."""
+    """Return a message in the form that rosbags writes: objects instead of mappings, and arrays of numbers."""
     if isinstance(value, Mapping):
         return SimpleNamespace(**{name: ros_message(field) for name, field in value.items()})
     if not isinstance(value, list):
@@ -201,21 +201,21 @@ _MAX_CLASS = 2**16 - 1
 class RerunFile:
     """An .rrd file that is being written.
 
-    It has the colour and depth images, the labels and the boxes of the instances below `camera`, and the positions of
-    the objects in `objects`. It appears when the context ends, also with an exception, if at least one frame was
-    written, and then replaces an older one.
+    The entity `camera` has the colour and depth images, the labels and the boxes of the instances; `objects` has the
+    positions of the objects. If at least one frame was written, the file appears when the context ends, even by an
+    exception, and replaces an older one.
 
     Attributes:
         path: the file.
-        n_frames: frames written.
+        n_frames: number of frames written.
     """
 
     def __init__(self, path: Path) -> None:
         """Check that `path` can be written.
 
         Raises:
-            InputError: its suffix is not .rrd, it is a recording of another program, or rerun-sdk is missing.
-            OSError: its folder does not exist or cannot be written.
+            InputError: the suffix is not .rrd, the file is a recording of another program, or rerun-sdk is missing.
+            OSError: the parent directory does not exist or cannot be written.
         """
         if path.suffix != ".rrd" or path.is_dir():
             raise InputError(f"rerun is {path}; expected a file with the suffix .rrd")
@@ -233,7 +233,7 @@ class RerunFile:
             self._temporary = self._folder.enter_context(temporary_directory(parent)) / self.path.name
         self._recording = self._rerun.RecordingStream(_APPLICATION)
         self._recording.save(self._temporary)
-        # Camera coordinates, as those of OpenCV: x right, y down, z forward.
+        # Camera coordinates are those of OpenCV: x right, y down, z forward.
         self._recording.log("/", self._rerun.ViewCoordinates.RDF, static=True)
         return self
 
@@ -249,13 +249,13 @@ class RerunFile:
     def write(self, frame: RGBDFrame, detections: Sequence[Detection], *, name: str, stamp: int | None = None) -> None:
         """Write a frame with labels and its detections.
 
-        Lens distortion is not written: Rerun's camera has none.
+        Lens distortion is not written, since Rerun's camera has none.
 
         Args:
             frame: the frame.
-            detections: of the frame.
-            name: its name.
-            stamp: its time, nanoseconds; None if it is unknown.
+            detections: detections in the frame.
+            name: name of the frame.
+            stamp: time of the frame, nanoseconds; None if it is unknown.
         """
         rerun, log = self._rerun, self._recording.log
         self._recording.set_time("frame", sequence=self.n_frames)
@@ -288,7 +288,7 @@ class RerunFile:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is a recording of this software: its head names the application."""
+    """Return whether a file is a recording of this software, whose head contains the application's name."""
     with path.open("rb") as file:
         head = file.read(4096)
     return head.startswith(b"RRF") and _APPLICATION.encode() in head

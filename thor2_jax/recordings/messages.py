@@ -26,7 +26,7 @@ _COLOR_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
     "bgra8": (4, (2, 1, 0)),
     "8uc4": (4, (2, 1, 0)),
 }
-"""Encoding in lower case -> number of channels, and those of red, green and blue."""
+"""Encoding in lower case -> number of channels, and indices of the red, green and blue channels."""
 
 _DEPTH_TYPES: dict[str, np.dtype[Any]] = {
     "16uc1": np.dtype(np.uint16),
@@ -49,7 +49,7 @@ def stamp_of(message: Any) -> int:
 
 
 def image_kind(message: Any) -> str:
-    """Return "color" or "depth", what `color_image` or `depth_image` reads, or "other"."""
+    """Return "color" or "depth" for an image that `color_image` or `depth_image` can read, otherwise "other"."""
     if not hasattr(message, "format"):
         encoding = message.encoding.lower()
         return "color" if encoding in _COLOR_CHANNELS else "depth" if encoding in _DEPTH_TYPES else "other"
@@ -119,7 +119,7 @@ def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
 
 
 def _decoded(content: bytes, described: str) -> NDArray[Any]:
-    """Return the pixels of a PNG or JPEG whose content is not trusted."""
+    """Return the pixels of an untrusted PNG or JPEG."""
     with decoding(f"a compressed image ({described}) is damaged", "PNG or JPEG"):
         return decode_image(io.BytesIO(content), _FORMATS)[0]
 
@@ -153,12 +153,12 @@ def ros_time(stamp: int) -> dict[str, int]:
 def detection_array(detections: Sequence[Detection], *, stamp: int, frame_id: str) -> dict[str, Any]:
     """Return the fields of a vision_msgs/Detection2DArray (version 4, ROS 2), as nested mappings and lists.
 
-    The name is `class_id`, empty for an unknown object, and the confidence is `score`. The position is that of the
-    visible points. THOR2 estimates no rotation: that of the pose is the identity. `id` is the number of the track, the
-    same in all frames, or of the label in answers without tracks.
+    The name is `class_id`, empty for an unknown object, and the confidence is `score`. The position is the mean of the
+    visible points; the rotation is the identity, since THOR2 does not estimate it. `id` is the number of the track,
+    which is the same in all frames, or the label number if there are no tracks.
 
     Args:
-        detections: of one frame.
+        detections: detections in one frame.
         stamp: time of the colour image, nanoseconds.
         frame_id: coordinate frame of the colour camera.
     """

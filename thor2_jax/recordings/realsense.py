@@ -19,14 +19,14 @@ from thor2_jax.frames.intrinsics import Intrinsics
 __all__ = ["RealSenseCamera"]
 
 WIDTH, HEIGHT, RATE = 640, 480, 30
-"""Size of both images and frames per second; every RealSense camera with colour has them."""
+"""Size of both images, and frames per second; every RealSense camera with colour supports these."""
 
 
 class RealSenseCamera:
-    """A camera that is open while its context is entered; depth is aligned to colour."""
+    """A camera that is open inside its context; depth is aligned to colour."""
 
     def __init__(self, source: Any = None, timeout: float = 5.0) -> None:
-        """Describe the camera; nothing is opened yet.
+        """Set the arguments; `__enter__` starts the camera.
 
         Args:
             source: source of frames, with `wait_for_frames(milliseconds)`: a started pipeline or a syncer of
@@ -51,7 +51,7 @@ class RealSenseCamera:
             config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, RATE)
             pipeline = rs.pipeline()
             try:
-                if not len(rs.context().query_devices()):  # `start` would wait for one
+                if not len(rs.context().query_devices()):  # `start` would wait for a device
                     raise RuntimeError("no device connected")
                 pipeline.start(config)
             except RuntimeError as error:
@@ -65,12 +65,12 @@ class RealSenseCamera:
     def __exit__(self, *_: object) -> None:
         """Stop the camera."""
         if self._pipeline is not None:
-            with contextlib.suppress(RuntimeError):  # It is unplugged.
+            with contextlib.suppress(RuntimeError):  # The camera may be unplugged.
                 self._pipeline.stop()
             self._pipeline = None
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """Yield the newest frame, again and again.
+        """Yield the newest frame repeatedly.
 
         Raises:
             InputError: no frame arrives in time.

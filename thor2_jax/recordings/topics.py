@@ -1,4 +1,4 @@
-"""Choice of the topics of a recording by name or by content, and pairs of colour and depth images by time stamp."""
+"""Choice of the topics of a recording by name or content, and pairing of colour and depth images by time stamp."""
 
 import dataclasses
 from collections import deque
@@ -27,10 +27,10 @@ _EXPECTED = {
     "depth": "depth images (16UC1 or 32FC1)",
     "camera": "sensor_msgs/CameraInfo",
 }
-"""Kind of a topic -> what it holds."""
+"""Kind of a topic -> description of its content."""
 
 _ALIGNED = ("aligned", "registered")
-"""Parts of the names of topics with depth that is registered to colour."""
+"""Parts of the names of topics with depth registered to colour."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +54,13 @@ def choose_topics(
     """Return the topics to read.
 
     Args:
-        wanted: names of topics; those that are None are chosen.
-        kinds: topic -> "color", "depth", "camera" or "other", of all topics with messages.
-        types: topic -> message type, of all topics; for the error messages.
+        wanted: requested names of topics; topics that are None are chosen.
+        kinds: topic -> "color", "depth", "camera" or "other", for all topics with messages.
+        types: topic -> message type, for all topics; used in error messages.
         needs_camera: whether intrinsics are needed.
 
     Raises:
-        InputError: a topic does not exist or holds something else, none is found, or there are several.
+        InputError: a topic does not exist or has other content, no topic fits, or several topics fit.
     """
     color = _choose("color", wanted.color, kinds, types)
     depth = _choose("depth", wanted.depth, kinds, types)
@@ -109,19 +109,19 @@ def _listed(types: Mapping[str, Any]) -> str:
 
 
 DEFAULT_MAX_GAP = 0.03
-"""Default of the largest time between the images of a pair, seconds: about a period at 30 frames a second."""
+"""Default of the largest time between the images of a pair, seconds: about one period at 30 frames per second."""
 
 LONGEST_WAIT = 2 * 10**9
-"""How much later than the others, in nanoseconds, an image may arrive in the recording to be paired still."""
+"""Largest delay, nanoseconds, with which an image may arrive in the recording after the others and still be paired."""
 
 
 class StampedImage(NamedTuple):
     """An image of a recording.
 
     Attributes:
-        is_color: whether it is of the colour stream; the depth stream otherwise.
-        stamp: time at which it was taken, nanoseconds.
-        arrival: time at which it was recorded, nanoseconds.
+        is_color: whether the image belongs to the colour stream, otherwise to the depth stream.
+        stamp: time at which the image was taken, nanoseconds.
+        arrival: time at which the image was recorded, nanoseconds.
         message: the message.
     """
 
@@ -139,7 +139,7 @@ class PairCounts:
         color: number of colour images.
         depth: number of depth images.
         pairs: number of pairs.
-        smallest_gap: smallest time between a colour image and a depth image, nanoseconds; None if there was none.
+        smallest_gap: smallest time between a colour and a depth image, nanoseconds; None if there are no such images.
     """
 
     color: int = 0
@@ -158,7 +158,7 @@ def nearest_pairs(
     Args:
         images: both streams, in the order in which they were recorded.
         tolerance: largest time between the two images of a pair, nanoseconds.
-        counts: is filled while the pairs are drawn.
+        counts: counts that are updated while the pairs are read.
     """
     colors: deque[StampedImage] = deque()
     depths: deque[StampedImage] = deque()
@@ -187,7 +187,7 @@ def nearest_pairs(
         ):
             yield from resolve(colors.popleft())
         earliest = colors[0].stamp if colors else latest
-        # Colour images to come are later, so of the depth images before `earliest` only the last one can be nearest.
+        # Later colour images follow, so only the last depth image before `earliest` can still be nearest to one.
         while len(depths) > 1 and (
             (earliest is not None and depths[1].stamp <= earliest) or image.arrival - depths[0].arrival > LONGEST_WAIT
         ):

@@ -1,1 +1,1 @@
-"""Instance masks for frames without labels: things on a table, and segmenters of other packages."""
+"""Instance masks for frames without labels, by the built-in segmenter for tables or those of other packages."""

@@ -1,10 +1,11 @@
-"""Pieces of a segmenter, divided and merged where that gives known objects: things in a pile touch without an edge.
+"""Refinement of a segmentation by recognition, since objects in a pile touch without a visible edge.
 
 labels = segment_known(frame, labels, recognize)          # labels of any segmenter, [H, W]
 
-Each piece is divided into parts of about one colour and place. The parts, unions of neighbouring ones and whole pieces
-are candidates for an object, which are all recognized. A piece is divided if its best division has objects of different
-names. Neighbouring things are then merged, again and again, where one object is recognized better in both together.
+Each piece of the segmentation is divided into parts of similar colour and place. The parts, unions of neighbouring
+parts and whole pieces are candidates for objects and are all recognized. A piece is divided if its best division
+contains objects of different names. Neighbours are then merged repeatedly if their union is recognized better than each
+of them.
 """
 
 import dataclasses
@@ -22,57 +23,58 @@ from thor2_jax.segmentation.pixels import Mask, components, nearest_known, windo
 __all__ = ["segment_known"]
 
 Parts = frozenset[int]
-"""Numbers of parts: a candidate, or a whole piece."""
+"""Numbers of the parts of a candidate or of a whole piece."""
 
 Answer = tuple[str | None, float]
-"""Name, None for an unknown object, and confidence."""
+"""Name (None for an unknown object) and confidence."""
 
 LEAST_PART, MOST_PARTS = 1000, 6
-"""Pixels of a part, at least on average, and most parts of a piece."""
+"""Least average number of pixels of a part, and largest number of parts of a piece."""
 
 MOST_JOINED = 4
-"""Most parts in a candidate that is no whole piece."""
+"""Largest number of parts in a candidate that is not a whole piece."""
 
 CELL = (25.0, 0.06)
-"""Distances in colour (CIELAB, with six tenths of the lightness) and in space, metres, that count the same."""
+"""Equivalent distances in colour (CIELAB with 0.6 of the lightness) and in space (metres)."""
 
 SMOOTH = 9
-"""Width, pixels, of the median of colours."""
+"""Width, pixels, of the median filter of the colours."""
 
 BESIDE = 7
-"""Width, pixels, of the square around a part in which its neighbours are."""
+"""Width, pixels, of the square by which parts are grown to find their neighbours."""
 
 MARGIN = 10
-"""Pixels around a candidate that its recognition may read."""
+"""Width, pixels, of the margin around a candidate that its recognition can read."""
 
 LEAST = 0.8
-"""Least confidence of a candidate that counts."""
+"""Least confidence at which a candidate counts as known."""
 
 MOST = 0.99
 """Confidences are clipped to this value."""
 
 SHARE = 0.5
-"""Least share of a piece that is recognized in its division."""
+"""Least fraction of a piece that must be recognized in its division."""
 
 COST, COST_OF_UNKNOWN = 0.3, 0.5
-"""Penalties for each known and unknown part of a division: these log-odds, times the area of the piece."""
+"""Penalties for each known and each unknown candidate in a division: these log-odds times the area of the piece."""
 
 GAIN = 1.0
-"""Log-odds that a known object must gain when two things are merged."""
+"""Least increase of the log-odds of a known object when two objects are merged."""
 
 
 def segment_known(
     frame: RGBDFrame, labels: NDArray[np.integer], recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]]
 ) -> NDArray[np.int32]:
-    """Return labels whose pieces are divided and merged where known objects result.
+    """Return labels after pieces are divided and merged where the results are known objects.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W], pieces of a segmenter.
-        recognize: function from frames to the answer for the instance 1 of each; other labels are things beside it.
+        labels: [H, W], labels of a segmenter.
+        recognize: function from frames to the answer for the instance with label 1 in each frame; other labels are
+            neighbours.
 
     Returns:
-        Labels [H, W]: 0 is background, and the things are numbered from 1.
+        Labels [H, W]: 0 is background, and the objects are numbered from 1.
     """
     parts, piece_of = _parts(frame, labels)
     beside = _neighbours(parts)
@@ -91,12 +93,12 @@ def segment_known(
 
 
 class _Known:
-    """Candidates that were recognized.
+    """Recognized candidates.
 
     Attributes:
-        area: candidate -> pixels.
+        area: candidate -> number of pixels.
         name: candidate -> name, None for an unknown object.
-        odds: candidate -> log-odds of the confidence, 0 if it does not count.
+        odds: candidate -> log-odds of the confidence, 0 for an unknown object.
     """
 
     def __init__(self, recognize: Callable[[Sequence[Parts]], Sequence[Answer]], sizes: NDArray[np.intp]) -> None:
@@ -106,7 +108,7 @@ class _Known:
         self._recognize, self._sizes = recognize, sizes
 
     def look_at(self, candidates: Sequence[Parts]) -> None:
-        """Recognize the candidates that are new, all at once."""
+        """Recognize the new candidates in one call."""
         new = [each for each in dict.fromkeys(candidates) if each not in self.odds]
         for each, (name, confidence) in zip(new, self._recognize(new), strict=True):
             counts = name is not None and confidence >= LEAST
@@ -116,7 +118,7 @@ class _Known:
 
 
 def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """Return the numbers [H, W] of the parts of all pieces, 0 is background, and the piece of each part [n + 1]."""
+    """Return the part of each pixel [H, W], 0 for the background, and the piece of each part [n + 1]."""
     lab = np.asarray(cv2.cvtColor(cv2.medianBlur(frame.color, SMOOTH), cv2.COLOR_RGB2LAB), np.float32)
     points = backproject(frame.depth_m, frame.intrinsics)
     features = np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
@@ -141,7 +143,7 @@ def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.in
 
 
 def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[np.int32]:
-    """Return the numbers [H, W] of the large connected parts of clusters; the rest of a mask goes to the nearest."""
+    """Return the numbers [H, W] of large connected parts of clusters; other pixels of the mask get the nearest part."""
     numbers = np.zeros(clusters.shape, np.int32)
     for cluster in range(1, count + 1):
         here, _ = components(clusters == cluster)
@@ -157,7 +159,7 @@ def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[n
 
 
 def _neighbours(parts: NDArray[np.int32]) -> dict[int, set[int]]:
-    """Return the parts beside each part."""
+    """Return the neighbours of each part."""
     beside: dict[int, set[int]] = {part: set() for part in range(1, int(parts.max()) + 1)}
     grown = cv2.dilate(parts.astype(np.float32), np.ones((BESIDE, BESIDE), np.uint8)).astype(np.int32)
     grown = np.where(parts > 0, parts, grown)
@@ -186,7 +188,7 @@ def _mask(parts: NDArray[np.int32], candidate: Parts) -> Mask:
 
 
 def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBDFrame:
-    """Return the part of a frame around a candidate, which has the label 1; all other parts are beside it."""
+    """Return the section of a frame around a candidate; the candidate has the label 1, other parts higher labels."""
     mask = _mask(parts, candidate)
     here = window(mask, MARGIN)
     labels = np.where(mask[here], 1, np.where(parts[here] > 0, parts[here] + 1, 0))
@@ -197,9 +199,9 @@ def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBD
 
 
 def _best_division(piece: Parts, candidates: Sequence[Parts], known: _Known) -> tuple[Parts, ...]:
-    """Return the division of a piece into candidates with the largest sum of area times log-odds, less the costs.
+    """Return the division of a piece into candidates with the largest sum of area times log-odds, minus the costs.
 
-    A piece without two known objects remains.
+    A piece is not divided unless two different known objects result.
     """
     area = known.area[piece]
 
@@ -223,7 +225,7 @@ def _best_division(piece: Parts, candidates: Sequence[Parts], known: _Known) -> 
 
 
 def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> set[Parts]:
-    """Return things of which neighbours are merged where a known object gains by it; nothing if none does."""
+    """Return objects after neighbours are merged where a known object gains; an empty set if nothing is merged."""
     at = {part: thing for thing in things for part in thing}
     touching = {(at[part], at[other]) for part in at for other in beside[part] if min(at[part]) < min(at[other])}
     pairs = sorted(

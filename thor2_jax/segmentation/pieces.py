@@ -1,8 +1,8 @@
-"""Pieces of things, and those that belong together.
+"""Pieces of objects, and the decision which pieces belong together.
 
-Pieces are found by watershed: regions grow from sure pixels of things and of the background until they meet at colour
-edges. Near depth edges and where depth is missing, the colour image alone decides. Neighbours without an edge of depth
-between them, and both sides of hollow things, are then merged.
+Pieces are found by watershed: regions grow from certain pixels of objects and of the background until they meet at
+colour edges. Near depth edges and where depth is missing, the colour image alone decides. Neighbours without a depth
+edge between them, and the inner and outer sides of hollow objects, are then merged.
 """
 
 import dataclasses
@@ -21,67 +21,69 @@ from thor2_jax.segmentation.planes import DepthImage
 __all__ = ["find_pieces"]
 
 LEAST_MARKER = 10
-"""Least pixels of a marker."""
+"""Least number of pixels of a marker."""
 
 RIM = 3
-"""Width, pixels, of the square within which depth is not trusted at the border of a thing."""
+"""Width, pixels, of the square around the border of an object in which depth is not trusted."""
 
 NECK = 2.4
 """Half the width, pixels, of a neck that divides a body."""
 
 OUTSIDE = 21
-"""Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
+"""Width, pixels, of the square in which objects may extend over pixels without depth outside the plane."""
 
 LEAST_CONTACT = 0.08
-"""Least share of the border of the smaller piece that two pieces of one thing have in common."""
+"""Least common border of two pieces of one object, as a fraction of the smaller piece's border."""
 
 EDGE = 0.25
-"""Least share of a common border that is a step, for two things."""
+"""Least fraction of the common border of two objects that is a depth step."""
 
 PART = 90.0
-"""Largest colour difference between a body and a part of it that was found by its colour."""
+"""Largest colour difference between a body and one of its parts that was found by colour."""
 
 GAP = 5
-"""Pixels between parts of one thing that are found by their colour, less one."""
+"""Width, pixels, of closed gaps between parts of one object that are found by colour, plus one."""
 
 OPEN = 0.3
-"""Least share of the border of a shadow along the plane; what is darker in a bowl is its bottom."""
+"""Least fraction of a shadow's border that lies along the plane, which distinguishes it from the bottom of a bowl."""
 
 SHADOW = 21
-"""Width, pixels, of the square around a body in which its shadow begins; shadows are divided from other things."""
+"""Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Least share of the border of a piece without depth, an inner side or a shadow, along the thing it belongs to."""
+"""Least fraction of a piece's border along its object, for pieces without depth, inner sides and shadows."""
 
 TALL, LOW = 0.035, 0.02
-"""Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
+"""Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
 
 SAME_HEIGHT, RIM_SHARE = 0.015, 97
-"""Largest difference, metres, of the upper rims of the two sides of a hollow thing, and their percentile of heights."""
+"""Largest height difference, metres, between the rims of both sides of a hollow object; percentile of a rim."""
 
 CONCAVE = 0.1
-"""Least bend of the inner side of a hollow thing, as a share of its size."""
+"""Least bend of the inner side of a hollow object, as a fraction of its size."""
 
 BEFORE, AFTER = 2, 2
-"""Pixels beside a border at which the two pieces are compared."""
+"""Distances, pixels, from a border at which the two pieces are compared."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Pieces:
     """Pieces [n], and borders between pairs of neighbours [N], the smaller number first; the background is a piece.
 
+    The last four attributes are computed from every second pixel in each direction.
+
     Attributes:
         pairs: [N, 2] the pieces of each pair.
-        length: [N] border pixels.
-        step: [N] share of them at a step.
-        contrast: [N] mean colour difference across, sum over the channels.
-        behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
-        perimeter: [n] border pixels of each piece.
-        colored: [n] pieces that were found by their colour alone.
-        tall: [n] pieces that reach `TALL`; this and the following by every second pixel in each direction.
-        low: [n] pieces below `LOW`.
-        unknown: [n] pieces mostly without depth.
-        shade: [n] pieces mostly in the shade.
+        length: [N] number of border pixels.
+        step: [N] fraction of border pixels at a depth step.
+        contrast: [N] mean colour difference across the border, summed over the channels.
+        behind: [N] fraction of border pixels where the second piece is farther, minus fraction where it is nearer.
+        perimeter: [n] number of border pixels of each piece.
+        colored: [n] whether a piece was found by its colour alone.
+        tall: [n] whether a piece reaches `TALL`.
+        low: [n] whether a piece is below `LOW`.
+        unknown: [n] whether a piece is mostly without depth.
+        shade: [n] whether a piece is mostly in the shade.
     """
 
     pairs: NDArray[np.int64]
@@ -98,12 +100,12 @@ class _Pieces:
 
 
 def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> NDArray[np.int32]:
-    """Return the pieces between edges, merged where they are one thing: labels [H, W], 0 for the background.
+    """Return the pieces between edges, merged if they are one object: labels [H, W], 0 for the background.
 
     Args:
-        color: [H, W, 3] uint8, a little blurred.
+        color: [H, W, 3] uint8, slightly blurred.
         depth: the depth image.
-        evidence: probabilities by height and colour, and edges of depth.
+        evidence: height and colour relative to the planes, and depth edges.
     """
     labels, colored = _flood(color, depth, evidence)
     pieces, n = _measure(labels, colored, color, depth, evidence), len(colored)
@@ -128,7 +130,7 @@ def _flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> t
     body_numbers, body_sizes = components(high)
     marked = np.zeros(len(body_sizes), bool)
     marked[body_numbers[markers > 0]] = True
-    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
+    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that consist of rim only
     rest, n_bodies = renumbered(body_numbers, alone, n_bodies)
     markers += rest
     body = (marked | alone)[body_numbers]
@@ -144,15 +146,15 @@ def _flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> t
         markers = np.where(numbers > 0, numbers, markers)
     beside = grow(near | colored, 5) | (~evidence.region & grow(body, OUTSIDE))
     unknown = near | colored | (~depth.valid & beside)
-    markers += 1  # the background is 1, and 0 is flooded
+    markers += 1  # the background has the marker 1; pixels with 0 are flooded
     markers[(markers == 1) & unknown] = 0
     return watershed(color, markers) - 1, np.arange(1 + n_pieces) > n_bodies
 
 
 def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are.
+    """Return the numbers [H, W] of the inner parts of bodies between edges, and the number of these parts.
 
-    Edges have gaps, so parts are also divided at necks. `find_pieces` undoes what was no edge.
+    Edges have gaps, so parts are also divided at necks. `find_pieces` merges parts without an edge between them again.
     """
     numbers, sizes = components(shrink(body, RIM) & ~edges)
     room = np.asarray(cv2.distanceTransform((numbers > 0).view(np.uint8), cv2.DIST_L2, 3))
@@ -170,14 +172,14 @@ def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
 
 
 def _components(pairs: NDArray[np.int64], n: int) -> NDArray[np.int32]:
-    """Return the numbers [n] of the groups of connected pieces; the background is connected to none and has 0."""
+    """Return the group [n] of each piece, where groups are connected; the background is alone and has the number 0."""
     pairs = pairs[pairs[:, 0] > 0]
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), (n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
 def _is_shadow(groups: NDArray[np.int32], pieces: _Pieces) -> Mask:
-    """Return which pieces [n] lie in the shade along a tall thing and are part of nothing else."""
+    """Return which pieces [n] are in the shade along a tall object and not connected to pieces outside the shade."""
     alone = ~np.isin(groups, groups[~pieces.shade])
     tall = np.isin(groups, groups[pieces.tall])
     ends, others = np.concatenate([pieces.pairs, pieces.pairs[:, ::-1]]).T
@@ -186,7 +188,7 @@ def _is_shadow(groups: NDArray[np.int32], pieces: _Pieces) -> Mask:
 
 
 def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
-    """Return which pairs [N] are of one thing, but for hollow things."""
+    """Return which pairs [N] belong to one object, except for the sides of hollow objects."""
     a, b = pieces.pairs.T
     part_by_color = (pieces.colored[a] != pieces.colored[b]) & (pieces.tall[a] | pieces.tall[b])
     is_part = (pieces.contrast < PART) | _main_contact(pieces, part_by_color)
@@ -196,9 +198,9 @@ def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
 
 
 def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
-    """Return which pairs [N] of a body and a piece that was found by its colour are one thing without a step between.
+    """Return which pairs [N] of a body and a piece found by its colour are one object without a depth step.
 
-    The body must be that with the longest common border, and the piece must not be in the shade.
+    The body must have the longest common border with the piece, and the piece must not be in the shade.
     """
     part = np.where(pieces.colored[pieces.pairs[:, 0]], *pieces.pairs.T)
     length = pieces.length * parts
@@ -209,7 +211,7 @@ def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
 
 
 def _is_hollow(k: int, pieces: _Pieces, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence) -> bool:
-    """Return whether the farther piece of a pair is the inner side of the other: concave, with the same upper rim."""
+    """Return whether the farther piece of a pair is the other's inner side: concave, with the same upper rim."""
     outer, inner = pieces.pairs[k].tolist() if pieces.behind[k] > 0 else pieces.pairs[k, ::-1].tolist()
     if pieces.length[k] < ATTACHED * pieces.perimeter[inner]:
         return False

@@ -1,4 +1,4 @@
-"""Operations on images of pixels, with the types of NumPy; masks are boolean images [H, W]."""
+"""Image operations of OpenCV with NumPy's types; masks are boolean images [H, W]."""
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ __all__ = [
 Mask = NDArray[np.bool_]
 
 CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)), np.uint8)
-"""A cross of three pixels."""
+"""A cross with a width of three pixels."""
 
 
 def _bytes(mask: Mask) -> NDArray[np.uint8]:
@@ -30,22 +30,22 @@ def _bytes(mask: Mask) -> NDArray[np.uint8]:
 
 
 def pixel_mask(image: object) -> Mask:
-    """Return an image of zeros and ones of OpenCV as a mask."""
+    """Return an OpenCV image of zeros and ones as a mask."""
     return np.asarray(image, np.uint8).view(np.bool_)
 
 
 def grow(mask: Mask, size: int) -> Mask:
-    """Return the pixels with a pixel of the mask in the square of `size` pixels around them."""
+    """Return the mask dilated by a square of `size` pixels."""
     return pixel_mask(cv2.dilate(_bytes(mask), np.ones((size, size), np.uint8)))
 
 
 def shrink(mask: Mask, size: int) -> Mask:
-    """Return the pixels whose square of `size` pixels lies in the mask; pixels outside the image do not count."""
+    """Return the mask eroded by a square of `size` pixels; the image border does not erode it."""
     return pixel_mask(cv2.erode(_bytes(mask), np.ones((size, size), np.uint8)))
 
 
 def open_round(mask: Mask) -> Mask:
-    """Return the mask without what a cross of three pixels does not fit in."""
+    """Return the mask opened with a cross of three pixels, which removes thinner parts."""
     return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_OPEN, CROSS))
 
 
@@ -57,7 +57,7 @@ def close(mask: Mask, size: int) -> Mask:
 def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
     """Return the numbers [H, W] of the connected components, 0 outside the mask, and their sizes in pixels.
 
-    The size with the number 0 is 0.
+    The size of number 0, the rest of the image, is set to 0.
     """
     count, numbers = cv2.connectedComponents(_bytes(mask), connectivity=connectivity)
     sizes = np.bincount(numbers.ravel(), minlength=count)
@@ -66,12 +66,12 @@ def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], ND
 
 
 def renumbered(numbers: NDArray[np.int32], kept: Mask, last: int = 0) -> tuple[NDArray[np.int32], int]:
-    """Return numbers [H, W] with those that are kept [n] counted from `last` + 1 and others 0, and the last of them."""
+    """Return numbers [H, W], with the kept ones [n] renumbered from `last` + 1 and others 0, and the last number."""
     return np.where(kept, np.cumsum(kept) + last, 0).astype(np.int32)[numbers], last + int(kept.sum())
 
 
 def window(mask: Mask, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns around the pixels of a mask, which must not be empty."""
+    """Return the rows and columns of the window around a mask with a margin; the mask must not be empty."""
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     top, left = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
     return slice(top, rows[-1] + margin + 1), slice(left, columns[-1] + margin + 1)
@@ -91,7 +91,7 @@ def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Flood pixels with the marker 0 from the others, which are positive, along the edges of a colour image.
+    """Flood pixels with the marker 0 from pixels with positive markers, up to the edges of a colour image.
 
     Args:
         color: [H, W, 3] uint8.

@@ -1,8 +1,8 @@
 """Dominant planes of a depth image: the table, and a floor or a wall behind it.
 
-A plane is linear in inverse depth, 1 / z = a x + b y + c for the ray (x, y, 1) of a pixel, and the error of a
-structured-light or stereo camera has about the same size everywhere in 1 / z. Planes are therefore found, refined and
-subtracted there. The refinement has second-order terms, which absorb the distortion of the depth sensor.
+A plane is linear in inverse depth: 1 / z = a x + b y + c for the ray (x, y, 1) of a pixel. The error of a
+structured-light or stereo camera is about constant in 1 / z. Planes are therefore found, refined and subtracted in
+inverse depth. The refinement has second-order terms, which absorb the distortion of the depth sensor.
 """
 
 import dataclasses
@@ -20,27 +20,27 @@ __all__ = ["DepthImage", "Plane", "dominant_planes"]
 MAX_PLANES = 4
 HYPOTHESES = 150
 SCORED_POINTS = 500
-"""Points that the hypotheses of a plane are scored on."""
+"""Number of points on which the hypotheses of a plane are scored."""
 
 REFINED_POINTS = 3000
-"""Points that a plane is refined on."""
+"""Number of points on which a plane is refined."""
 
 LEAST_POINTS = 50
 TOLERANCE = (0.003, 0.004)
 """Largest distance of an inlier: the first in metres, plus the second times the squared depth in metres."""
 
 LEAST_SHARE = 0.05
-"""Least share of the points that lie on a dominant plane."""
+"""Least fraction of the points that lie on a dominant plane."""
 
 LEAST_SHARE_OF_LARGEST, LEAST_EXTENT_OF_LARGEST = 0.2, 0.15
 LEAST_EXTENT = 0.23
 """Least extent, metres, across the longest direction of a plane after the largest; sides of boxes have less."""
 
 LEAST_FILLING = 0.25
-"""Least share of the hull of a plane that its inliers fill: tops of several things in one plane fill less."""
+"""Least fraction of a plane's hull that its inliers fill; the tops of several objects at equal height fill less."""
 
 PARALLEL, LARGEST_THING = 0.97, 0.15
-"""Least cosine between the normals of a plane and of the tops of things on it, and their largest height, metres."""
+"""Least cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
 
 LEAST_SHARE_OF_SUPPORT = 0.08
 
@@ -51,14 +51,14 @@ class DepthImage:
     Attributes:
         z: [H, W] float32, metres; 0 where depth is missing or outside `MIN_DEPTH` to `MAX_DEPTH`.
         inverse: [H, W] float32, 1 / z; 0 where `z` is.
-        valid: [H, W], where `z` is not 0.
-        x: [W] float32, of the rays (x, y, 1) of the pixels.
-        y: [H] float32.
+        valid: [H, W] bool, whether `z` is not 0.
+        x: [W] float32, x of the pixels' rays (x, y, 1).
+        y: [H] float32, y of the pixels' rays.
         pixel_size: width of a pixel at a depth of one metre, metres.
     """
 
     def __init__(self, depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> None:
-        """Prepare `depth_m` [H, W], metres, of a camera."""
+        """Prepare a depth image `depth_m` [H, W] in metres."""
         self.valid: Mask = (depth_m >= MIN_DEPTH) & (depth_m <= MAX_DEPTH)
         self.z = depth_m * self.valid
         self.inverse = np.zeros_like(self.z)
@@ -74,10 +74,10 @@ class Plane:
     """A dominant plane.
 
     Attributes:
-        coefficients: [6], of 1 / z = a x + b y + c + d x^2 + e x y + f y^2.
-        hull: [n, 2] int32, columns and rows of the convex hull of its inliers.
-        share: share of the points that lie on the plane.
-        distance: median depth of its inliers, metres.
+        coefficients: [6], a to f in 1 / z = a x + b y + c + d x^2 + e x y + f y^2.
+        hull: [n, 2] int32, columns and rows of the convex hull of the inliers.
+        share: fraction of the points that lie on the plane.
+        distance: median depth of the inliers, metres.
     """
 
     coefficients: NDArray[np.float64]
@@ -94,7 +94,7 @@ class Plane:
         heights += b * y + f * y * y + c
         np.subtract(depth.inverse, heights, out=heights)
         heights *= depth.z
-        # z times the difference in 1 / z, divided by the length of (a, b, c), is the distance to the plane.
+        # The distance to the plane is z times the difference in 1 / z, divided by the length of (a, b, c).
         heights *= np.float32(1 / math.hypot(a, b, c))
         return heights
 
@@ -107,7 +107,7 @@ class Plane:
 class _Points:
     """Points of a grid of pixels, `step` pixels apart.
 
-    They have positions [N], terms [N, 6] of the coefficients, inverse depth [N] and tolerance [N].
+    The fields are positions [N], terms [N, 6] for the coefficients, inverse depth [N] and tolerance [N].
     """
 
     step: int
@@ -119,10 +119,10 @@ class _Points:
 
 
 def dominant_planes(depth: DepthImage) -> list[Plane]:
-    """Find up to `MAX_PLANES` planes by RANSAC; equal depth has equal planes.
+    """Find up to `MAX_PLANES` planes by RANSAC; equal depth images have equal planes.
 
     Returns:
-        The planes, the likely support of the objects first: the nearest plane of some size.
+        The planes. The first one is the nearest plane of sufficient size, which is the likely support of the objects.
     """
     points = _grid_points(depth)
     total = len(points.inverse)
@@ -153,7 +153,7 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
 
 
 def _is_just_above(plane: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Return whether another plane is parallel to a plane and a little nearer to the camera: the tops of things."""
+    """Return whether `other` is parallel to a plane and slightly nearer to the camera, like tops of objects on it."""
     normals = np.stack([plane[:3], other[:3]])
     lengths = np.linalg.norm(normals, axis=1)
     parallel = normals[0] @ normals[1] > PARALLEL * lengths.prod()
@@ -175,7 +175,7 @@ def _grid_points(depth: DepthImage) -> _Points:
 
 
 def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float64] | None:
-    """Return the plane [3] through three random points of `left` that is near the most of them."""
+    """Return the plane [3] through three random points of `left` that has the most inliers."""
     triples = left[rng.integers(0, len(left), (HYPOTHESES, 3))]
     matrices = points.terms[triples, :3]
     usable = np.abs(np.linalg.det(matrices)) > 1e-4
@@ -186,7 +186,7 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
     fields = points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance
     x, y, inverse, tolerance = (values[scored].astype(np.float32) for values in fields)
     single = planes.astype(np.float32)
-    # Not a matrix product, for which threads would be started.
+    # A matrix product would start threads.
     near = np.abs(single[:, :1] * x + single[:, 1:2] * y + single[:, 2:] - inverse) < tolerance
     return planes[int(np.count_nonzero(near, axis=1).argmax())]
 
@@ -194,7 +194,7 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
 def _refine(
     hypothesis: NDArray[np.float64], points: _Points, left: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the inliers of `left` and the coefficients [6] that fit them by least squares."""
+    """Return the inliers among `left` and their least-squares coefficients [6]."""
     coefficients = np.concatenate([hypothesis, np.zeros(3)])
     terms, inverse, tolerance = points.terms[left], points.inverse[left], points.tolerance[left]
     for n_terms in (3, 3, 3, 6, 6):
@@ -208,6 +208,6 @@ def _refine(
 
 
 def _least_extent(points: _Points, inliers: NDArray[np.intp]) -> float:
-    """Return the extent, metres, of a flat set of points across its longest direction, as of a uniform rectangle."""
+    """Return the width, metres, of a uniform rectangle that spreads like the points across its longest direction."""
     positions = points.terms[inliers, :3] / points.inverse[inliers, None]
     return float(np.sqrt(12 * max(np.linalg.eigvalsh(np.cov(positions.T))[1], 0.0)))

@@ -1,10 +1,10 @@
-"""Segmenters by name: the built-in one, and those that other packages offer as entry points.
+"""Segmenters by name: the built-in one, and those of other packages.
 
 labels = segment(frame)                      # [H, W] integers, by the built-in segmenter "table"
 recognizer.recognize(segmented(frame, "sam"))
 
-A segmenter is a function from a frame, whose labels are None, to labels [H, W]: integers, 0 is background. A package
-offers one under a name in the entry point group `ENTRY_POINTS`, see docs/segmentation.md.
+A segmenter is a function from a frame without labels to labels [H, W], which are integers; 0 is background. A package
+offers a segmenter as an entry point in the group `ENTRY_POINTS`, see docs/segmentation.md.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ TABLE = "table"
 """Name of the built-in segmenter, `table.segment_table`, which needs OpenCV (extra `segment`)."""
 
 MODEL = "model"
-"""Name by which commands that recognize choose `Recognizer.segment`, which is `TABLE` and recognition."""
+"""Name of `Recognizer.segment` in commands that recognize; it refines `TABLE` by recognition."""
 
 
 def segmenter_names() -> list[str]:
@@ -59,7 +59,7 @@ def load_segmenter(name: str) -> Segmenter:
             f"it in the entry point group {ENTRY_POINTS}"
         )
     subject = f"segmenter is {name!r}; {points[0].value}"
-    # The package is not ours: importing it may raise anything.
+    # Importing a package of others may raise any exception.
     try:
         segmenter = points[0].load()
     except Exception as error:
@@ -71,7 +71,7 @@ def load_segmenter(name: str) -> Segmenter:
 
 
 def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any]:
-    """Segment a frame; labels that it has are not passed on.
+    """Segment a frame; existing labels are ignored.
 
     Args:
         frame: colour, depth and intrinsics.
@@ -81,7 +81,7 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
         Labels [H, W], integers; 0 is background.
 
     Raises:
-        InputError: the segmenter is unknown, raises an exception, or returns no labels of the size of the frame.
+        InputError: the segmenter is unknown, raises an exception, or does not return labels of the frame's size.
     """
     function = load_segmenter(segmenter) if isinstance(segmenter, str) else segmenter
     name = segmenter if isinstance(segmenter, str) else getattr(segmenter, "__name__", type(segmenter).__name__)

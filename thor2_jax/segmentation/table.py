@@ -1,9 +1,9 @@
-"""Segmentation of things on a table, or another plane, without learned weights.
+"""Segmentation of objects on a table, or another plane, without learned weights.
 
 labels = segment_table(frame)          # [H, W] int32, 0 is background
 
-Dominant planes are found and removed; what rises above them, or lies on one and has another colour, is grouped into
-pieces, which are divided at depth steps, folds and colour edges.
+Dominant planes are found and removed. Pixels above a plane, or on it with another colour, are grouped into pieces,
+which are divided at depth steps, folds and colour edges.
 """
 
 import cv2
@@ -23,43 +23,43 @@ WORKING_SIZE = 320
 """Larger side, pixels, of the images that are segmented; larger images are subsampled by a whole number."""
 
 BAND = 3
-"""Width, working pixels, of the square around a border within which it is moved to an edge of colour."""
+"""Width, working pixels, of the square around a border in which the border is moved to a colour edge."""
 
 MARGIN = 4
-"""Working pixels around all things within which their borders are moved; the rest of the image is background."""
+"""Margin around all objects, working pixels, in which their borders are moved; the rest of the image is background."""
 
 LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
-"""Area of a thing, square metres."""
+"""Least and largest area of an object, square metres."""
 
 LARGEST_SHARE = 0.25
-"""Largest share of the image that a thing fills."""
+"""Largest fraction of the image that an object fills."""
 
 LEAST_SUPPORT = 0.3
-"""Least share of the pixels of a thing that lie in the hull of a plane."""
+"""Least fraction of the pixels of an object that lie in the hull of a plane."""
 
 HOLE = 0.3
-"""Largest hole in a thing, as a share of it, that is filled, for instance the handle of scissors."""
+"""Largest hole in an object that is filled, as a fraction of the object, such as the handle of scissors."""
 
 LEAST_INNER = 0.9
-"""Least share of a thing that is left without the rim of half a working pixel; thin things keep their rim."""
+"""Least fraction of an object inside its rim of half a working pixel; thinner objects keep their rim."""
 
 
 def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
-    """Segment what stands or lies on the dominant planes of a frame; its labels are not read.
+    """Segment the objects on the dominant planes of a frame; its labels are ignored.
 
     Args:
         frame: colour, depth and intrinsics.
 
     Returns:
-        Labels [H, W]: 0 is background, and the things are numbered from 1 without a gap in the order of their first
+        Labels [H, W]: 0 is background, and the objects are numbered from 1 without a gap in the order of their first
         pixels. Without a dominant plane, everything is background. Equal frames get equal labels.
     """
     stride = max(1, round(max(frame.depth.shape) / WORKING_SIZE))
     height, width = (-(-side // stride) for side in frame.depth.shape)
     color = np.asarray(cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     camera = frame.intrinsics
-    # The planes' second-order terms absorb lens distortion.
+    # Lens distortion is ignored, since the planes' second-order terms absorb it.
     subsampled = Intrinsics(camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
     depth = DepthImage(np.ascontiguousarray(frame.depth_m[::stride, ::stride]), subsampled)
     planes = dominant_planes(depth)
@@ -71,7 +71,7 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
 
 
 def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -> NDArray[np.int32]:
-    """Return labels of the size of the colour image, whose borders run along its edges."""
+    """Return labels in the size of the colour image, with borders along its edges."""
     refined = np.zeros(color.shape[:2], np.int32)
     if not labels.any():
         return refined
@@ -87,9 +87,9 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
 
 
 def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
-    """Return labels without the rims of things, where depth belongs to one surface and colour to another.
+    """Return labels without the rims of objects, where depth belongs to one surface and colour to another.
 
-    A pixel is of the rim if the square of `size` pixels around it has another label.
+    A pixel belongs to the rim if the square of `size` pixels around it contains another label.
     """
     rim = np.flatnonzero(label_borders(labels, size))
     of_rim = labels.take(rim)
@@ -101,7 +101,7 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
 
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:
-    """Return the things among the pieces, without holes and numbered from 1."""
+    """Return the objects among the pieces, without holes and numbered from 1."""
     region = grow(np.any([plane.region(labels.shape) for plane in planes], axis=0), 5)
     cleaned, count = np.zeros_like(labels), 0
     for label, place in enumerate(ndimage.find_objects(labels), start=1):
@@ -131,6 +131,6 @@ def _largest_part(mask: Mask) -> Mask:
 
 def _without_holes(mask: Mask) -> Mask:
     numbers, sizes = components(np.pad(~mask, 1, constant_values=True))
-    sizes[1] = 0  # the outside has the first pixel
+    sizes[1] = 0  # the first pixel is outside
     filled = (sizes > 0) & (sizes < HOLE * mask.sum())
     return mask | filled[numbers[1:-1, 1:-1]] if filled.any() else mask

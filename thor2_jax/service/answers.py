@@ -60,14 +60,14 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
 
 
 def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:
-    """Return the JSON record of an estimate of the camera's colours; None if there is none."""
+    """Return the JSON record of an estimate of the camera's colour transform; None without an estimate."""
     if adaptation is None:
         return None
     return schemas.AdaptationAnswer(instances=adaptation.instances, **dataclasses.asdict(adaptation.transform))
 
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
-    """Return the JSON records of all objects that may be answered."""
+    """Return the JSON records of all objects that the model can recognize."""
     gallery = objects.gallery
     answers = []
     for name, is_trained in zip(gallery.answered_names, gallery.has_output, strict=True):
@@ -90,8 +90,8 @@ def explained_frame(
     Args:
         model: the model of the results.
         prepared: the decoded frame, with its label map.
-        results: one per usable instance, in the order of the instances.
-        recognitions: one per instance.
+        results: one result per usable instance, in the order of the instances.
+        recognitions: one recognition per instance.
         timings: stage -> milliseconds.
     """
     assert prepared.label_map is not None
@@ -111,14 +111,14 @@ def explained_frame(
 def calibrated_confidence(model: Model, recognition: Recognition, inference: Inference) -> float | None:
     """Return the calibrated confidence of the most probable class of a cloud.
 
-    It is that of the answer if the run has a calibration, else the confidence after temperature scaling of both
-    classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
-    gallery, and with forgotten classes.
+    If the run has a calibration, the result is the confidence of the answer, otherwise the confidence after temperature
+    scaling of both classifiers. It is None with a gallery, with forgotten classes, or without temperatures, which
+    training fits on a held-out set (`thor2 train --folds`).
 
     Args:
         model: the model.
         recognition: the answer for the cloud.
-        inference: the outputs of the model for it, without the axis of the batch.
+        inference: the outputs of the model for the cloud, without the batch axis.
     """
     if model.answers_by() != "classifiers" or model.gallery.hidden:
         return None

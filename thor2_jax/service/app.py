@@ -38,7 +38,7 @@ from thor2_jax.service.signals import handlers_replaced
 __all__ = ["create_app"]
 
 WHY_SECONDS = 90.0
-"""Least deadline of an explanation: further ones wait for it."""
+"""Least deadline of an explanation, since explanations wait for one another."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
@@ -49,8 +49,8 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
 
     Args:
         settings: settings of this process.
-        workers: number of processes that share a socket. With several, the lifespan starts when this one is ready, so
-            that the server accepts no connection before; a single process answers with status 503 until then.
+        workers: number of processes that share a socket. With several, the lifespan starts when this process is ready,
+            so that it accepts no connection before; a single process answers with status 503 until then.
 
     Raises:
         InputError: the run cannot be read.
@@ -107,7 +107,7 @@ def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
 
 @contextlib.contextmanager
 def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
-    """Refuse new requests from the moment of the signal; the server only closes its connections later."""
+    """Reject new requests as soon as the signal arrives; the server closes its connections later."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -132,7 +132,7 @@ def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
 
     @app.get("/readyz", responses=error_responses(503))
     async def readyz() -> schemas.Readiness:
-        """Report whether requests are accepted, and by how many processes: only ready ones receive requests."""
+        """Report whether requests are accepted, and by how many processes; only ready processes receive requests."""
         service.check_ready()
         return schemas.Readiness(status="ready", ready_workers=service.metrics.count_ready_workers(), workers=workers)
 
@@ -144,7 +144,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
-        """Recognize every instance of a frame; one without labels is segmented."""
+        """Recognize every instance of a frame; a frame without labels is segmented."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
             prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
@@ -157,7 +157,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
-        """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
+        """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
             recognized = await service.recognize(files, admitted, with_label_map=True)
             model, timings = service.engine.model, admitted.milliseconds()
@@ -167,9 +167,9 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})
     async def why(request: Request) -> schemas.WhyAnswer:
-        """Explain the answer for one instance: the points that decided, and the smallest changes that change it.
+        """Explain the answer for one instance: the contributions of points, and the smallest changes to another answer.
 
-        Until explanations of clouds of this size are compiled, which begins after the start, the status is 503.
+        The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
         seconds = max(service.settings.deadline, WHY_SECONDS)
         async with service.admit(partial(read_form, request, schemas.WHY_FORM), seconds) as (admitted, files):
@@ -229,7 +229,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.get("/v1/objects", responses=error_responses(500))
     async def objects() -> schemas.ObjectsAnswer:
-        """Return the objects that may be answered, with their views."""
+        """Return the objects that the model can recognize, with their views."""
         known = service.known_objects()
         return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.gallery.generation)
 
@@ -250,7 +250,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def enroll(request: Request) -> schemas.EnrolmentAnswer:
         """Enroll an object from one instance of a frame; all processes recognize it from now on.
 
-        A name that exists needs extend or replace.
+        For a name that exists, set extend or replace.
         """
         async with service.admit(partial(read_form, request, schemas.ENROLMENT_FORM)) as (admitted, files):
             name, label, flags = parse_enrolment(files)
@@ -266,7 +266,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         openapi_extra={"requestBody": schemas.UNDO_FORM},
     )
     async def undo(request: Request) -> schemas.ChangeAnswer:
-        """Take back the last change of the gallery, unless another one was made since."""
+        """Undo the last change of the gallery, unless it has changed again since then."""
         async with service.admit(partial(read_form, request, schemas.UNDO_FORM)) as (admitted, files):
             generation = parse_number(files, "generation")
             known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
@@ -274,8 +274,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
-        """Forget an object: its views are removed, and a trained class is never answered again."""
-        async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # There is no body.
+        """Forget an object: remove its views, and never answer with its trained class again."""
+        async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # The request has no body.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
@@ -283,9 +283,9 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
 
 async def _check_same_site(request: Request) -> None:
-    """Raise RequestError (403) if a web page of another site sends the request, as browsers let any page do."""
+    """Raise RequestError (403) if a web page of another site sent the request, which browsers allow."""
     site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
-    if site is not None:  # Browsers send it to https and to localhost.
+    if site is not None:  # Browsers send this header to https and to localhost.
         is_foreign = site not in ("same-origin", "none")
     else:
         is_foreign = origin is not None and origin.partition("://")[2] != request.headers.get("host")

@@ -70,7 +70,7 @@ async def read_body(request: Request) -> bytes:
 
 
 async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
-    """Return the fields of a multipart form; those that `form`, an OpenAPI request body, does not have are ignored.
+    """Return the fields of a multipart form that are in `form`, an OpenAPI request body; other fields are ignored.
 
     Raises:
         RequestError: 413 if the body is larger than `MAX_BODY`, 415 for another content type or charset, 400 if the
@@ -106,7 +106,7 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
 
 
 def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]]:
-    """Take the fields name, instance, extend and replace, of which the last two may be absent, out of a form.
+    """Remove the fields name, instance, extend and replace from a form and parse them; the last two are optional.
 
     Returns:
         The name of the object, its number in the label image, and the flags extend and replace.
@@ -130,7 +130,7 @@ def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]
 
 def _parse_name(content: bytes) -> str:
     with field_errors("name"):
-        # A valid name has at most 4000 bytes; decoding and quoting all of a long one would take time.
+        # A valid name has at most 4000 bytes; decoding and quoting a long one completely would take time.
         return check_name(content[:4004].decode(errors="surrogateescape"))
 
 
@@ -142,7 +142,7 @@ def _parse_flag(fields: dict[str, bytes], name: str) -> bool:
 
 
 def parse_number(fields: dict[str, bytes], name: str) -> int:
-    """Take the number in a field out of a form. Raises RequestError (422)."""
+    """Remove a field from a form and return its number. Raises RequestError (422)."""
     content = fields.pop(name)
     if not re.fullmatch(rb"[0-9]{1,18}", content):
         raise RequestError(422, name, f"{name} is not a number; expected a whole number of at most 18 digits.")
@@ -171,7 +171,7 @@ def _parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
 def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | None = None) -> RGBDFrame:
     """Decode a frame from the contents of its files (formats of `frames.read_frame`; depth and labels only as PNG).
 
-    Without `labels`, the frame has none.
+    Without `labels`, the frame has no labels.
 
     Raises:
         RequestError: 413 or 422, with the errors of all fields.
@@ -294,6 +294,6 @@ def _decode_npz(content: bytes) -> dict[str, NDArray[Any]]:
     for name, entry in entries.items():
         try:
             arrays[name] = read_npy(io.BytesIO(archive.read(entry)), entry.file_size)
-        except Exception:  # As above.
+        except Exception:  # Damaged arrays do so, too.
             raise RequestError(422, name, f"{name} is not a numeric array, or is damaged.") from None
     return arrays

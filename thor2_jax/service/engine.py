@@ -1,6 +1,6 @@
 """The compiled model and the single thread that runs it, with batches shared between waiting requests.
 
-Descriptors and class probabilities for batches of a few sizes are all compiled before serving.
+All batch sizes are compiled before serving.
 """
 
 import dataclasses
@@ -35,21 +35,21 @@ __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 log = logging.getLogger(__name__)
 
 MIN_BATCH_BUCKET = 8
-"""Smallest padded number of clouds of a batch; smaller ones run hardly faster, and each takes seconds to compile."""
+"""Smallest padded number of clouds of a batch; smaller sizes are hardly faster, and each takes seconds to compile."""
 
 ExplanationPrograms = tuple[int, bool]
-"""Padded number of points, and kind of scores (`explained_kinds`) of what is compiled for explanations."""
+"""Padded number of points and kind of scores (`explained_kinds`) of programs for explanations."""
 
 
 class CloudResult(NamedTuple):
-    """Descriptor and class probabilities of one cloud, or of those of a batch with one more axis.
+    """Descriptor and class probabilities of one cloud, or of a batch of clouds with one more axis.
 
     Attributes:
         images: [S, P, P] float32, persistence images.
         embeddings: [S, R, J] float32, colour embeddings.
         aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
-        inference: outputs of the model, fields without the axis of the batch.
+        inference: outputs of the model, without the batch axis.
     """
 
     images: NDArray[np.float32]
@@ -64,13 +64,13 @@ Job = tuple[Sequence[PreparedInstance], Future[list[CloudResult]]]
 
 
 class Batcher:
-    """Process the instances of requests in one thread; those that arrive meanwhile share the next batches."""
+    """A thread that processes the instances of requests; instances that arrive meanwhile share the next batches."""
 
     def __init__(self, process_batch: Callable[[list[PreparedInstance]], list[CloudResult]], max_batch: int) -> None:
-        """Start without requests.
+        """Create the thread.
 
         Args:
-            process_batch: returns one result per instance, for at most `max_batch` instances.
+            process_batch: function that returns one result per instance, for at most `max_batch` instances.
             max_batch: maximum number of instances in a batch.
         """
         self._process_batch, self._max_batch = process_batch, max_batch
@@ -78,18 +78,18 @@ class Batcher:
         self._device = ThreadPoolExecutor(1, thread_name_prefix="device")
 
     def submit(self, instances: Sequence[PreparedInstance]) -> Future[list[CloudResult]]:
-        """Queue `instances` and return a future of their results, in order; one that is cancelled is skipped."""
+        """Queue `instances` and return a future of their results, in order; cancelled futures are skipped."""
         future = Future[list[CloudResult]]()
         self._waiting.put((instances, future))
         self._device.submit(self._process)
         return future
 
     def close(self) -> None:
-        """Process all that was submitted and stop the thread."""
+        """Process all submitted instances and stop the thread."""
         self._device.shutdown()
 
     def _process(self) -> None:
-        """Process what waits, unless an earlier call has done so with its own batch."""
+        """Process the waiting instances, unless an earlier call has included them in its batch."""
         jobs: list[Job] = []
         instances: list[PreparedInstance] = []
         while len(instances) < self._max_batch and not self._waiting.empty():
@@ -117,7 +117,7 @@ class InferenceEngine:
         """Load the run.
 
         Raises:
-            InputError: the run or the gallery cannot be used, or an error of `Recognizer`.
+            InputError: the run or the gallery cannot be used; also as `Recognizer`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
@@ -129,11 +129,11 @@ class InferenceEngine:
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         model = dataclasses.replace(recognizer.model, run=self.run)
-        if settings.teach and model.answer_by == "classifiers":  # They would never answer by an enrolled object.
+        if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")
         recognizer.model = model
         self._recognizer = recognizer
-        # A service that teaches compiles the embedding before the first object is enrolled.
+        # With `teach`, the embedding is compiled before the first object is enrolled.
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
         self.max_batch = settings.max_batch
@@ -150,15 +150,15 @@ class InferenceEngine:
 
     @property
     def adaptation(self) -> Adaptation | None:
-        """The latest estimate of the camera's colours; None before the first one, or if the service does not adapt."""
+        """The latest estimate of the camera's colour transform; None before the first estimate and without `adapt`."""
         return None if self._online is None else self._online.latest
 
     def correct(self, instances: Sequence[PreparedInstance], *, observe: bool) -> list[PreparedInstance]:
         """Return the instances of a frame with corrected colours.
 
         Args:
-            instances: with the camera's colours.
-            observe: also estimate the colours of the camera from them, if the service adapts.
+            instances: instances with the camera's colours.
+            observe: also use them to estimate the camera's colour transform, with `adapt`.
         """
         if observe and self._online is not None:
             self._online.observe(instances)
@@ -173,10 +173,10 @@ class InferenceEngine:
         return self._recognizer.objects
 
     def refresh(self) -> None:
-        """Read the gallery again if a process has changed it; if it cannot be read, the one in memory stays.
+        """Read the gallery again if a process has changed it; if it cannot be read, the gallery in memory is unchanged.
 
-        The gallery is not read again if it was empty at the start and the service does not teach: clouds are not
-        embedded then.
+        The gallery is not read again if it was empty at the start and `teach` is not set, since clouds are not embedded
+        then.
         """
         if not self._embeds:
             return
@@ -199,7 +199,7 @@ class InferenceEngine:
         self._infer([], n_clouds, n_points)
 
     def compile_adaptation(self) -> None:
-        """Compile the programs of the adaptation, if the service adapts."""
+        """Compile the programs of the adaptation, with `adapt`."""
         if self._online is not None:
             self._online.compile()
 
@@ -222,7 +222,7 @@ class InferenceEngine:
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
-        """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
+        """Return a recognition per instance of a frame; `results` belong to the usable instances in order."""
         if not results:
             return [Recognition(instance.label, reason=instance.reason) for instance in instances]
         inference = jax.tree.map(lambda *rows: np.stack(rows), *[result.inference for result in results])
@@ -235,7 +235,7 @@ class InferenceEngine:
         return answers(model, instances, inference)
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
-        """Return the programs that explain the answer for a cloud of so many points."""
+        """Return the programs that explain answers for clouds of `n_points` points."""
         return [(batch_points([n_points]), by_classifiers) for by_classifiers in explained_kinds(self.model)]
 
 
@@ -243,7 +243,7 @@ def _load(settings: Settings) -> Recognizer:
     """Load the recognizer of a service.
 
     Raises:
-        InputError: as `Recognizer.load`, or a gallery that is given does not exist and the service does not teach.
+        InputError: as `Recognizer.load`; also if the given gallery does not exist and `teach` is not set.
     """
     directory = settings.gallery
     if directory is not None and not settings.teach and not (directory / INDEX_FILE).is_file():

@@ -1,6 +1,6 @@
 """Listening sockets, allowed names of the host, and headers of pages, for the service and the live view.
 
-A web page can give its own name the address of a local server (DNS rebinding), and is then of the same origin. Its
+A web page can give its own name the address of a local server (DNS rebinding) and then has the same origin. Its
 requests still have that name in the header Host.
 """
 
@@ -46,9 +46,9 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
 
 
 def page_headers(images: str, cache: str) -> dict[str, str]:
-    """Return the headers of all answers of a server with a page.
+    """Return the headers of all responses of a server with a page.
 
-    The page loads from and connects to its own server only, has no inline code and cannot be framed.
+    The page can only load from and connect to its own server, has no inline code and cannot be framed.
 
     Args:
         images: sources of images, as in a Content-Security-Policy.
@@ -76,7 +76,7 @@ def is_allowed_host(header: str, address: str, names: Iterable[str]) -> bool:
     Args:
         header: the header, a name or an address with or without a port.
         address: local address of the connection.
-        names: names and addresses that are allowed besides it and those of the loopback interface.
+        names: names and addresses that are allowed besides this address and those of the loopback interface.
     """
     name = re.sub(r":\d*$", "", header)
     if not _NAME.fullmatch(name):

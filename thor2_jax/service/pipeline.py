@@ -47,20 +47,20 @@ WHY_RETRY_SECONDS = 3
 """Value of Retry-After until explanations are compiled."""
 
 COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
-"""Event of JAX that a program was compiled."""
+"""JAX event for the compilation of a program."""
 
 COMPILER_THREAD = "compile-explanations"
 """Name of the thread whose compilations are not counted, since no request waits for them."""
 
 LOCK_SHARE = 0.8
-"""Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
+"""Fraction of a request's remaining time for which it waits for another writer; the rest is for the error response."""
 
 
 class AdmittedRequest:
     """A request in progress.
 
     Attributes:
-        deadline: time of `time.monotonic` by which it must be answered.
+        deadline: time of `time.monotonic` by which the request must be answered.
         seconds: stage -> duration.
     """
 
@@ -92,7 +92,7 @@ class Service:
         self.progress = ""
         self._in_progress = self._accepted = 0
         self._compiled: dict[ExplanationPrograms, Future[None]] = {}
-        self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
+        self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy only one thread.
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
@@ -132,17 +132,17 @@ class Service:
             self._warm_why([programs for n in POINT_BUCKETS for programs in self.engine.explanation_programs(n)])
 
     def _warm_why(self, programs: list[ExplanationPrograms]) -> None:
-        """Compile for explanations, one size after the other, so that what requests ask for comes in between."""
+        """Compile for explanations, one size after the other, so that the sizes of requests can be inserted."""
         if programs and self.state == "ready":
             self._compile_explanations(programs[0]).add_done_callback(lambda _: self._warm_why(programs[1:]))
 
     def _compile_explanations(self, programs: ExplanationPrograms) -> Future[None]:
-        """Compile what explanations need in the background, unless that has begun already."""
+        """Compile programs for explanations in the background, unless their compilation has already begun."""
 
         def compile_all() -> None:
             try:
                 compile_explanations(self.engine.model, *programs, lambda: self.state != "ready")
-            except Exception:  # Requests compile what is missing, and report the error.
+            except Exception:  # Requests compile the missing programs and report the error.
                 log.exception("compiling explanations failed")
             log.info("explanations of clouds of %d points are compiled", programs[0])
 
@@ -163,7 +163,7 @@ class Service:
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
     def stop_accepting(self) -> None:
-        """Refuse new requests; requests in progress are still answered."""
+        """Reject new requests; requests in progress are still answered."""
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
 
@@ -185,12 +185,12 @@ class Service:
         """Admit a request for the duration of the context; yield it with its body.
 
         Args:
-            read_body: waits for the body of the request; it is called only if the request is admitted.
-            seconds: time until its deadline; by default that of the settings.
+            read_body: function that waits for the body of the request; called only if the request is admitted.
+            seconds: time until the deadline; by default that of the settings.
 
         Raises:
-            RequestError: 503 if the service is not ready, 429 if the queue is full, or as `read_body`; at the deadline,
-                408 if the body has not arrived and 504 otherwise.
+            RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
+                has not arrived and 504 otherwise; also as `read_body`.
         """
         self.check_ready()
         if self._in_progress >= self.settings.queue:
@@ -267,13 +267,13 @@ class Service:
     async def enroll(
         self, files: dict[str, bytes], name: str, label: int, flags: dict[str, bool], request: AdmittedRequest
     ) -> ObjectGallery:
-        """Enroll an object from one instance of the frame in `files`, and return the gallery with it.
+        """Enroll an object from one instance of the frame in `files`, and return the new gallery.
 
-        The view and its augmented copies are embedded in batches, as the instances of frames are. The flags are
+        The view and its augmented copies are embedded in batches, like the instances of frames. The flags are
         `extend` and `replace` of `ObjectGallery.add`.
 
         Raises:
-            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `change` and
+            RequestError: 409 if the name exists and neither `extend` nor `replace` is true; also as `change` and
                 `prepare_view`. Nothing is enrolled.
         """
         with self._gallery_errors(409, "name"):
@@ -293,20 +293,20 @@ class Service:
     async def change(
         self, change: Callable[[ObjectGallery], None], refused: int, field: str, request: AdmittedRequest
     ) -> ObjectGallery:
-        """Change the gallery on disk in another thread, then read it again in this one, as other processes do.
+        """Change the gallery on disk in another thread, then read it again in this thread, like other processes.
 
         Args:
-            change: changes the gallery, of which it gets a copy.
-            refused: status if the gallery refuses the change.
-            field: field of the request that is then concerned.
+            change: function that changes a copy of the gallery.
+            refused: status if the gallery rejects the change.
+            field: field of the request that the error then names.
             request: the request.
 
         Returns:
             The gallery after the change.
 
         Raises:
-            RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it
-                cannot be written, `refused` for other errors. The gallery is as before.
+            RequestError: 500 if the gallery cannot be read, 503 while another process writes to it, 507 if it cannot be
+                written, `refused` for other errors. The gallery is unchanged.
         """
         with timed(request.seconds, "gallery"):
             async with self._gallery_lock:
@@ -319,7 +319,7 @@ class Service:
 
     @contextlib.contextmanager
     def _gallery_errors(self, refused: int, field: str) -> Iterator[None]:
-        """Turn the errors of the gallery into those of `change`, which do not say where the gallery lies."""
+        """Turn the errors of the gallery into those of `change`, whose messages do not contain its path."""
         try:
             yield
         except OSError as error:
@@ -335,7 +335,7 @@ class Service:
             raise RequestError(refused, field, f"{error}.") from None
 
     def known_objects(self) -> ObjectGallery:
-        """Return the objects that may be answered, as they are on disk. Raises RequestError as `change`."""
+        """Return the objects that the model can recognize, as stored on disk. Raises RequestError as `change`."""
         with self._gallery_errors(500, "gallery"):
             self.engine.objects.refresh()
         return self.engine.objects

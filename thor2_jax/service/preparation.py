@@ -1,7 +1,7 @@
 """Worker processes that decode images and compute instance clouds.
 
-This is most of the work of a frame and holds the interpreter lock, so threads would not run in parallel. A process that
-exceeds its deadline or crashes is replaced.
+Most of the work on a frame is done here. It holds the interpreter lock, so threads would not run in parallel. A process
+that exceeds its deadline or crashes is replaced.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ MIN_SECONDS = 1.0
 
 @contextlib.contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Write the duration of the context to `seconds`, unless it raises."""
+    """Store the duration of the context in `seconds`, unless it raises."""
     start = time.perf_counter()
     yield
     seconds[stage] = time.perf_counter() - start
@@ -52,10 +52,10 @@ class PreparedRequest:
     """A decoded request.
 
     Attributes:
-        instances: its instances, in the order of their labels.
+        instances: the instances, in the order of their labels.
         seconds: stage -> duration.
-        label_map: the label image of the frame, if requested, and if the frame was segmented here.
-        frame: the frame of a view, which pictures of an explanation show.
+        label_map: the label image of the frame, if it was requested or if the frame was segmented here.
+        frame: the frame of a view, for the pictures of an explanation.
     """
 
     instances: list[PreparedInstance]
@@ -70,7 +70,7 @@ def prepare_frame(
     """Decode a frame, segment it if it has no labels, and compute the clouds of its instances.
 
     Raises:
-        RequestError: 422 if there are no labels and no segmenter, 500 if the segmenter fails, or as `decode_frame`.
+        RequestError: 422 if there are no labels and no segmenter, 500 if the segmenter fails; also as `decode_frame`.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
@@ -86,7 +86,7 @@ def prepare_frame(
 
 
 _segmenter = functools.cache(load_segmenter)
-"""The segmenter of a name; it is loaded once in each process."""
+"""Function that returns the segmenter with a name, which is loaded once in each process."""
 
 
 def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
@@ -101,9 +101,9 @@ def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
 
 
 def _warm_up(name: str) -> None:
-    """Load a segmenter and segment a small frame: a segmenter may load weights at its first frame.
+    """Load a segmenter and segment a small frame, since a segmenter may load weights at its first frame.
 
-    If that fails, requests report the reason.
+    If this fails, requests report the reason.
     """
     blank = RGBDFrame(np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), None, Intrinsics(60, 60, 32, 24))
     with contextlib.suppress(InputError):
@@ -111,10 +111,10 @@ def _warm_up(name: str) -> None:
 
 
 def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance, which is to be enrolled or explained.
+    """Decode a frame and compute the cloud of one instance for enrolment or explanation.
 
     Raises:
-        RequestError: 422 if there is no such instance or it has too few points, or as `prepare_frame`.
+        RequestError: 422 if there is no such instance or it has too few points; also as `prepare_frame`.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
@@ -185,7 +185,7 @@ class PreparationPool:
     def __init__(self, count: int, segmenter: str | None = None) -> None:
         """Start `count` processes, each of which loads the segmenter of this name."""
         self._segmenter = segmenter
-        # The fork server has imported this module and has no threads: a replacement process starts at once.
+        # The fork server has imported this module and has no threads, so that a replacement process starts at once.
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")

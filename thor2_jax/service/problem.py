@@ -1,4 +1,4 @@
-"""Errors of the API: an HTTP status and a JSON body that names the field concerned."""
+"""Errors of the API: an HTTP status and a JSON body that names the field."""
 
 import contextlib
 from collections.abc import Iterator

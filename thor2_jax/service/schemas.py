@@ -96,25 +96,25 @@ class InstanceAnswer(BaseModel):
 
 
 class AdaptationAnswer(BaseModel):
-    """The colours of the camera, as the service corrects them; 0 is no change."""
+    """The colour transform that the service applies to the camera's images; 0 is no change."""
 
-    instances: int = Field(description="Number of instances of the latest frames that the estimate is from.")
+    instances: int = Field(description="Number of instances of the latest frames in the estimate.")
     gamma: float = Field(description="Logarithm of the exponent.")
     gain: float = Field(description="Logarithm of the factor of all channels.")
     saturation: float = Field(description="Logarithm of the factor of the distance from grey.")
-    warmth: float = Field(description="Logarithm of the factor of red, and of one over that of blue.")
+    warmth: float = Field(description="Logarithm of the factor of red and of the inverse factor of blue.")
 
 
 class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
     instances: list[InstanceAnswer]
-    knows: str = Field(description="What the model knows, in words; other objects are unknown.")
+    knows: str = Field(description="Description of the objects of the model; other objects are unknown.")
     label_map: "LabelMap | None" = Field(
         default=None, description="Labels of a frame that was segmented; null if the request had labels."
     )
     adaptation: AdaptationAnswer | None = Field(
-        default=None, description="Estimated colours of the camera; null before the first estimate and without --adapt."
+        default=None, description="Estimated colour transform; null before the first estimate and without --adapt."
     )
     timings: Milliseconds = Field(description=FRAME_STAGES)
 
@@ -135,7 +135,7 @@ class SliceDetails(BaseModel):
 
 
 class Details(BaseModel):
-    """Evidence for a name. Lengths are in scaled units."""
+    """The cloud and the descriptor of an instance. Lengths are in scaled units."""
 
     points: list[tuple[float, float, float]] = Field(
         description="Aligned cloud, or a random sample of a large one; slices lie along z, strips along x."
@@ -150,7 +150,7 @@ class Details(BaseModel):
 
 
 class ExplainedInstance(InstanceAnswer):
-    """Recognition of an instance, with the evidence for its name."""
+    """Recognition of an instance, with its cloud and its descriptor."""
 
     details: Details | None = Field(
         description=f"null if the cloud cannot be used, and after the first {MAX_EXPLAINED} instances."
@@ -167,7 +167,7 @@ class LabelMap(BaseModel):
 
 
 class ExplainedFrame(BaseModel):
-    """All instances of a frame with the evidence for their names, in the order of their labels."""
+    """All instances of a frame with their clouds and descriptors, in the order of their labels."""
 
     instances: list[ExplainedInstance]
     label_map: LabelMap
@@ -178,23 +178,23 @@ class WhyPicture(BaseModel):
     """A picture of an explanation."""
 
     title: str
-    caption: str = Field(description="What it shows, in full sentences.")
+    caption: str = Field(description="Description of the picture in full sentences.")
     png: str = Field(description="The picture, a PNG file in base64.")
 
 
 class WhyAnswer(BaseModel):
-    """Why an instance has its answer; `thor2 explain` writes more."""
+    """Explanation of the answer for an instance; `thor2 explain` writes more."""
 
     label: int
     name: str | None = Field(description="Name of the object; null if it is unknown.")
-    explained_name: str = Field(description="The name that is explained: the most probable one.")
-    unit: str = Field(description="What is explained: log-odds of the classifiers, or similarity to enrolled views.")
-    margin: float = Field(description="The explained number: log-odds, or the lead over the most similar other object.")
+    explained_name: str = Field(description="The explained name, which is the most probable one.")
+    unit: str = Field(description="Explained quantity: log-odds of the classifiers, or similarity to enrolled views.")
+    margin: float = Field(description="Explained value: log-odds, or the lead over the most similar other object.")
     loss_without_most_attributed_tenth: float = Field(
-        description="What the margin loses without the tenth of the points that speaks most for the name."
+        description="Loss of the margin without the tenth of the points that supports the name most."
     )
-    mean_loss_without_random_tenth: float = Field(description="The same for random tenths of the points.")
-    changes: list[str] = Field(description="Smallest changes of colour and extents that give another name, in words.")
+    mean_loss_without_random_tenth: float = Field(description="Mean loss without a random tenth of the points.")
+    changes: list[str] = Field(description="Smallest changes of colour and extents to another name, in words.")
     pictures: list[WhyPicture]
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, explain, total.")
 
@@ -235,17 +235,17 @@ class ModelAnswer(BaseModel):
     """The model of the service."""
 
     classes: list[str]
-    knows: str = Field(description="What the model knows, in words.")
+    knows: str = Field(description="Description of the objects of the model.")
     classifiers: list[str]
     descriptor_version: int
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
     color_network: str = Field(description="Fingerprint of the colour network.")
     teaches: bool = Field(description="Whether objects can be enrolled and forgotten.")
-    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are refused.")
+    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are rejected.")
 
 
 class ObjectAnswer(BaseModel):
-    """An object that may be answered."""
+    """An object that the model can recognize."""
 
     name: str
     trained: bool = Field(description="Whether the classifiers have an output for it.")
@@ -255,7 +255,7 @@ class ObjectAnswer(BaseModel):
 
 
 class ObjectsAnswer(BaseModel):
-    """All objects that may be answered: trained classes, without forgotten ones, and enrolled objects."""
+    """All objects that the model can recognize: trained classes, without forgotten ones, and enrolled objects."""
 
     objects: list[ObjectAnswer]
     generation: int = Field(description="Number of changes of the gallery.")
@@ -264,7 +264,7 @@ class ObjectsAnswer(BaseModel):
 class ChangeAnswer(BaseModel):
     """A change of the gallery."""
 
-    generation: int = Field(description="Number of changes of the gallery; POST /v1/objects/undo takes this one back.")
+    generation: int = Field(description="Number of changes of the gallery; POST /v1/objects/undo undoes this change.")
 
 
 class EnrolmentAnswer(ObjectAnswer, ChangeAnswer):
@@ -331,15 +331,15 @@ _ENROLMENT: dict[str, Any] = {
     **_FRAME,
     "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
     "instance": _INSTANCE,
-    "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
-    "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
+    "extend": {"type": "boolean", "description": "Add the view to an existing object."},
+    "replace": {"type": "boolean", "description": "Discard the views of an existing object."},
 }
 
 ENROLMENT_FORM = _form(_ENROLMENT, "extend", "replace")
 """OpenAPI schema of the body of POST /v1/objects."""
 
 UNDO_FORM = _form(
-    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the answer of the change."}}
+    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the response to the change."}}
 )
 """OpenAPI schema of the body of POST /v1/objects/undo."""
 

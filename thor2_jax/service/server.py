@@ -34,10 +34,10 @@ __all__ = ["TimedConnection", "serve"]
 log = logging.getLogger(__name__)
 
 HEAD_SECONDS = 5.0
-"""Time limit for a complete request head, counted from the connection, the previous answer and its own first byte."""
+"""Time limit for a complete request head, in seconds from the connection, the previous response or its first byte."""
 
 EARLY_ANSWER_SECONDS = 30.0
-"""The same limit after an answer that preceded the end of its request: many clients send everything before reading."""
+"""This limit after a response that preceded the end of its request, since many clients send everything first."""
 
 MAX_HEAD = 2**20
 """Maximum number of bytes received between the first byte of a request head and its end."""
@@ -93,7 +93,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
 
 
 class _Supervisor(Multiprocess):
-    """uvicorn's supervisor; only it receives the SIGINT of a terminal, and ends its workers by SIGTERM."""
+    """uvicorn's supervisor; it alone receives the SIGINT of a terminal, and ends its workers with SIGTERM."""
 
     def init_processes(self) -> None:
         """Start the workers."""
@@ -112,7 +112,7 @@ def _create_worker(settings: Settings, workers: int) -> FastAPI:
     if parent is None:
         return create_app(settings, workers)
     threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
-    with ended_by_signals():  # uvicorn's handler would wait until everything is compiled.
+    with ended_by_signals():  # uvicorn's handler would wait for the compilation.
         return create_app(settings, workers)
 
 

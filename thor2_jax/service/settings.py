@@ -16,7 +16,7 @@ MAX_DEADLINE = 86_400
 
 
 def default_segmenter() -> str | None:
-    """Return the segmenter of a service for which none is chosen: the built-in one where OpenCV is installed."""
+    """Return the default segmenter of a service: the built-in one if OpenCV is installed, otherwise None."""
     return TABLE if importlib.util.find_spec("cv2") else None
 
 
@@ -26,20 +26,20 @@ class Settings:
 
     Attributes:
         model: run directory.
-        token: callers must send `Authorization: Bearer TOKEN`; None turns authentication off.
+        token: token of `Authorization: Bearer TOKEN`, which callers must send; None disables authentication.
         queue: maximum number of requests in progress; further requests receive status 429.
-        deadline: seconds from the arrival of a request to its answer; a later answer becomes status 504.
+        deadline: largest number of seconds from the arrival of a request to its response; after it, the status is 504.
         max_batch: maximum batch size, one of `capacity.BATCH_BUCKETS`.
         processes: number of processes that decode images and compute clouds.
         unknown_below: confidence below which an object is unknown, as in `Recognizer`; None is the run's own.
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
-        teach: callers may enroll and forget objects.
-        adapt: the colours of the camera are estimated from the latest frames, and corrected.
-        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
-            them. Default: that of `default_segmenter`.
-        allow_host: names that the header Host may have, besides loopback names and the address that is connected to.
-        warm_why: explanations are compiled in the background after the start; otherwise from the first request on.
+        teach: whether callers may enroll and forget objects.
+        adapt: whether the camera's colour transform is estimated from the latest frames and applied.
+        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None rejects
+            them. Default: the result of `default_segmenter`.
+        allow_host: names that the header Host may have, besides loopback names and the address of the connection.
+        warm_why: whether explanations are compiled in the background after the start, or from the first request on.
 
     Raises:
         InputError: a value is out of range, or the segmenter cannot be loaded.

@@ -1,4 +1,4 @@
-"""Handlers of Ctrl-C and SIGTERM, also while processes of the service and of worker pools start."""
+"""Handling of Ctrl-C and SIGTERM, also during the start of service processes and worker pools."""
 
 import contextlib
 import signal
@@ -11,7 +11,7 @@ __all__ = ["ended_by_signals", "handlers_replaced", "signals_blocked"]
 
 @contextlib.contextmanager
 def handlers_replaced(replace: Callable[[Any], Any]) -> Iterator[None]:
-    """Replace the handlers of SIGINT and SIGTERM by what `replace` returns for each of them, inside the context."""
+    """Replace the handlers of SIGINT and SIGTERM inside the context; `replace` returns the new handler for each."""
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number, handler in previous.items():
         signal.signal(number, replace(handler))
@@ -24,10 +24,10 @@ def handlers_replaced(replace: Callable[[Any], Any]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Let SIGINT and SIGTERM end this process at once, as long as there is nothing to finish.
+    """Let SIGINT and SIGTERM end this process at once inside the context, while there is no work to finish.
 
-    The exception of Python's handler can get lost while modules and models are loaded, and with it the signal: what is
-    raised in a callback, such as those of JAX for garbage collection, is ignored.
+    While modules and models are loaded, the exception of Python's handler can get lost, and with it the signal:
+    exceptions in callbacks, such as those of JAX for garbage collection, are ignored.
     """
     with handlers_replaced(lambda previous: previous if previous is signal.SIG_IGN else signal.SIG_DFL):
         yield
@@ -35,11 +35,11 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_blocked(*numbers: signal.Signals) -> Iterator[None]:
-    """Block signals for good in processes that start in the context, and in this thread for its duration.
+    """Block signals in this thread inside the context, and permanently in processes that start there.
 
-    A Ctrl-C reaches all processes of a terminal. Those that still import modules would end with a traceback.
+    A Ctrl-C reaches all processes of a terminal. Processes that still import modules would end with a traceback.
     """
-    resource_tracker.ensure_running()  # Its own start would unblock them.
+    resource_tracker.ensure_running()  # Its start would unblock the signals later.
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield

@@ -11,8 +11,8 @@
         describe = lambda clouds: thor2.describe_aligned(clouds, network, config)
         assert_permutation_invariant(describe, clouds, seed, config)
 
-Requires the extra `testing`: pip install -c constraints.txt '.[testing]'. All batches of a strategy have the same
-shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances (`comparing`).
+The package needs the extra `testing`: pip install -c constraints.txt '.[testing]'. All batches of a strategy have the
+same shape, so that a property compiles once. Assertions compare bit by bit or with derived tolerances (`comparing`).
 """
 
 from thor2_jax.testing import damage, laws, strategies, values

@@ -1,4 +1,4 @@
-"""Comparison of descriptors with derived tolerances, and rearrangement of batches.
+"""Comparison of descriptors with derived tolerances, and operations on batches.
 
 Tolerances are bounds on the difference of two float32 computations of the same quantity.
 
@@ -39,23 +39,23 @@ UNIT = 2.0**-24
 """Unit roundoff of float32."""
 
 _TABLE_ERROR = 8 * UNIT
-"""Error of an entry of the tables of an image, half a difference of two error functions: erf in float32 is accurate to
-5 units, and the rounding of its argument, 3 units relative, adds 3 max z erf'(z) < 1.5."""
+"""Error of an entry of an image's tables, which is half a difference of two error functions. erf in float32 is accurate
+to 5 units, and the rounding of its argument, 3 units relative, adds 3 max z erf'(z) < 1.5."""
 
 
 def image_rounding(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
     """Return a bound on the rounding error of an image, summed over its pixels.
 
-    A pixel is the sum over J pairs of weight x entry x entry. Over a row of P pixels the entries sum to at most 1, and
-    so do their errors to at most P table errors: 2 P of these a pair for both axes, and J + 2 units for the sum and the
-    products. Two computations differ by twice as much.
+    A pixel is the sum over J pairs of weight x entry x entry. Over a row of P pixels, the entries sum to at most 1 and
+    their errors to at most P table errors. This gives 2 P table errors per pair for both axes, plus J + 2 units for the
+    sum and the products. Two computations differ by at most twice this bound.
 
     Args:
         persistence: [...], sum of the weights of the pairs.
         config: gives P and J.
 
     Returns:
-        [...], as `persistence`.
+        [...], the shape of `persistence`.
     """
     return persistence * (2 * config.image_size * _TABLE_ERROR + (config.n_strips + 2) * UNIT)
 
@@ -63,9 +63,9 @@ def image_rounding(persistence: NDArray[np.float64], config: DescriptorConfig) -
 def image_lipschitz(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
     """Return the largest change of an image, summed over its pixels, per change of the persistence of a pair.
 
-    The weight p changes by 1 and the Gaussian by the total variation of its shift, sqrt(2 / pi) / sigma, of which there
-    is p. The theorem for Gaussians of Adams et al. (JMLR 2017, "Stability of persistence surfaces and images") allows
-    births to move as well and bounds the change by sqrt(5) times as much for a move of 1 in the 1-Wasserstein distance.
+    The weight p changes by 1, and the Gaussian with this weight by the total variation of its shift,
+    sqrt(2 / pi) / sigma. The theorem for Gaussians of Adams et al. (JMLR 2017, "Stability of persistence surfaces and
+    images") also allows births to move; its bound is sqrt(5) times as large for a 1-Wasserstein distance of 1.
 
     Args:
         persistence: [...], the larger persistence of each pair before and after the change.
@@ -77,7 +77,7 @@ def image_lipschitz(persistence: NDArray[np.float64], config: DescriptorConfig) 
 def embedding_rounding(n_regions: int) -> float:
     """Return the relative rounding error of an embedding of non-negative counts and similarities.
 
-    A product with the weights of at most 2^7 sets of regions, and one with the similarity; weights are rounded once.
+    It covers a product with the weights of at most 2^7 region sets, one with the similarity, and the rounded weights.
     """
     return (2**7 + n_regions + 3) * UNIT
 
@@ -85,12 +85,13 @@ def embedding_rounding(n_regions: int) -> float:
 def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
     """Return the distance by which rounding may move an aligned point, between two poses or orders of the same clouds.
 
-    For `decided_clouds`, whose box has the principal axes. Rounded and scaled, a coordinate of size D is off by 2 u D:
-    a point by d = 2 sqrt(3) u D. So second moments, of largest eigenvalue l, are off by at most 2 d sqrt(l), and by the
-    rounding of their sums over N points, N / 16 + 16 u times the trace; the symmetric eigensolver adds some ten units.
-    An axis turns by at most sqrt(2) times that over the gap of the eigenvalues (Davis and Kahan), and a point at a
-    distance R by R times the angle, by d, and by the rounding of two rotations, 16 u R. The shift to the first octant
-    is that of some point, hence twice as much, and both computations may err: four times.
+    The bound holds for `decided_clouds`, whose box has the principal axes. After rounding and scaling, the error of a
+    coordinate of size D is 2 u D, and that of a point d = 2 sqrt(3) u D. The error of the second moments, with largest
+    eigenvalue l, is at most 2 d sqrt(l), plus the rounding of their sums over N points, (N / 16 + 16) u times the
+    trace; the symmetric eigensolver adds about ten units. An axis rotates by at most sqrt(2) times this error over the
+    gap of the eigenvalues (Davis and Kahan). A point at a distance R moves by R times the angle, by d, and by the
+    rounding of two rotations, 16 u R. The shift to the first octant is the coordinate of some point, which doubles the
+    error, and both computations have it, which doubles it again.
 
     Args:
         clouds: metres, in the pose farther from the origin.
@@ -110,7 +111,7 @@ def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
 
 
 def with_points(clouds: PointClouds, points: NDArray[np.floating]) -> PointClouds:
-    """Replace the points [B, N, 3] of clouds, rounded to float32, with padding set to 0."""
+    """Return clouds with new points [B, N, 3], rounded to float32, and padding set to 0."""
     kept = np.where(np.asarray(clouds.mask)[..., None], points, 0)
     return dataclasses.replace(clouds, points=jnp.asarray(kept, jnp.float32))
 
@@ -141,9 +142,9 @@ def assert_within(
 def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float = 0.0) -> None:
     """Assert that descriptors are equal up to rounding, if each aligned point moved by at most `drift` in its strip.
 
-    Births and counts are then equal, and each persistence changes by at most 2 `drift`. An image, summed over its
-    pixels, changes by that times its Lipschitz constant plus twice its rounding error; an embedding changes by rounding
-    only. The sum of persistences is estimated from the image, which has at least 0.47 of the mass of each pair.
+    Births and counts are then equal, and each persistence changes by at most 2 `drift`. The change of an image, summed
+    over its pixels, is at most this times the Lipschitz constant plus twice the rounding error; an embedding changes
+    only by rounding. The sum of persistences is estimated from the image, which has at least 0.47 of each pair's mass.
 
     Args:
         actual: descriptors.
@@ -161,13 +162,13 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
 
 
 def map_points(function: Callable[..., jax.Array], *batches: PointClouds) -> PointClouds:
-    """Return the first batch with the result of a function of each array that has an entry for every point."""
+    """Return the first batch, with `function` of the batches' arrays for each field with an entry per point."""
     names = ("points", "colors", "mask", "boundary")
     return dataclasses.replace(batches[0], **{name: function(*(getattr(b, name) for b in batches)) for name in names})
 
 
 def joined(*batches: PointClouds) -> PointClouds:
-    """Unite the points of batches: cloud b has the points of cloud b of each batch."""
+    """Concatenate the points of batches: cloud b of the result has the points of cloud b of each batch."""
     return map_points(lambda *arrays: jnp.concatenate(arrays, axis=1), *batches)
 
 

@@ -22,7 +22,7 @@ _EXTREMES = [0, 1, 2**7, 2**8 - 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1
 
 
 def _place(content: bytearray, rng: np.random.Generator) -> int:
-    """Draw a position, half of the time among the first bytes, where headers are."""
+    """Draw a position; half of the positions are in the first bytes, where headers are."""
     return int(rng.integers(min(len(content), 128) if rng.random() < 0.5 else len(content)))
 
 
@@ -37,7 +37,7 @@ def _cut(content: bytearray, rng: np.random.Generator) -> bytearray:
 
 
 def _splice(content: bytearray, rng: np.random.Generator) -> bytearray:
-    """Replace a piece of the file by another one, insert one, or delete one."""
+    """Replace a piece of the file by another piece, insert a piece, or delete a piece."""
     source, target = _place(content, rng), _place(content, rng)
     length = int(rng.integers(1, 65))
     piece = content[source : source + length] if rng.random() < 0.7 else bytearray()

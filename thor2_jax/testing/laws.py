@@ -1,4 +1,4 @@
-"""Invariances of descriptors and of instance clouds: one assertion for each, for any function that computes them.
+"""Invariances of descriptors and of instance clouds, with one assertion each, for any function that computes them.
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
@@ -60,8 +60,8 @@ def assert_permutation_invariant(
 ) -> None:
     """Assert that the order of the points, including padding, does not matter.
 
-    Holds bit by bit for functions of aligned clouds: extremes are coordinates of points, and counts are integers below
-    2^24, exact in any order. In view normalization the order of sums changes the last bits.
+    This holds bit by bit for functions of aligned clouds: extremes are coordinates of points, and counts are integers
+    below 2^24, which are exact in any order. In view normalization, the order of sums changes the last bits.
     """
     order = np.argsort(np.random.default_rng(seed).random(clouds.mask.shape), axis=1)
     _compare(describe(taken(clouds, order)), describe(clouds), config, drift)
@@ -72,7 +72,7 @@ def assert_padding_invariant(
 ) -> None:
     """Assert that the padded number of points does not matter, up to rounding.
 
-    Another capacity is another compiled program, which may sum products in another order.
+    Another capacity needs another compiled program, which may sum products in another order.
 
     Args:
         describe: function that also accepts the other capacity.
@@ -89,9 +89,9 @@ def assert_padding_invariant(
 def assert_batch_size_invariant(
     describe: Describe, clouds: PointClouds, config: DescriptorConfig, drift: float = 0.0
 ) -> None:
-    """Assert that the batch size does not matter, up to rounding: each cloud is described as if it were alone.
+    """Assert that the batch size does not matter, up to rounding: each cloud has the same descriptor as alone.
 
-    Another batch size is another compiled program, which may sum products in another order.
+    Another batch size needs another compiled program, which may sum products in another order.
 
     Args:
         describe: function that also accepts batches of one cloud.
@@ -106,7 +106,7 @@ def assert_batch_size_invariant(
 def assert_company_invariant(describe: Describe, clouds: PointClouds, others: PointClouds) -> None:
     """Assert that a descriptor does not depend on the other clouds of the batch, bit by bit.
 
-    Equal shapes mean the same program, in which nothing crosses the batch axis.
+    Equal shapes use the same program, in which clouds do not interact.
     """
     expected = describe(clouds)
     for b in range(clouds.mask.shape[0]):
@@ -117,8 +117,8 @@ def assert_company_invariant(describe: Describe, clouds: PointClouds, others: Po
 def assert_translation_invariant(describe: Describe, clouds: PointClouds, shift: ArrayLike) -> None:
     """Assert that a translation of cloud and camera together changes nothing.
 
-    Holds bit by bit on `lattice_clouds` shifted by multiples of their step, up to 1 m, whose mean and centred
-    coordinates are exact. It therefore holds for every kind of cloud, including balls and cubes.
+    This holds bit by bit on `lattice_clouds` that are shifted by multiples of their step, up to 1 m, since their mean
+    and centred coordinates are exact. It therefore holds for every kind of cloud, including balls and cubes.
 
     Args:
         describe: function of camera clouds.
@@ -140,8 +140,8 @@ def assert_rigid_motion_invariant(
 ) -> None:
     """Assert that a rigid motion of cloud and camera together changes nothing, up to the drift by rounding.
 
-    Holds on `decided_clouds`. Where a choice is a tie, as between two boxes of equal volume, rounding decides it, and
-    the frame may be another of the equal ones.
+    This holds on `decided_clouds`. On other clouds, rounding decides ties, for example between two boxes of equal
+    volume, so the frame may be another one.
 
     Args:
         describe: function of camera clouds.
@@ -162,7 +162,7 @@ def assert_scale_invariant(
 ) -> None:
     """Assert that an object k times as large, described with sigma_s / k, has the same descriptor.
 
-    Holds bit by bit on every kind of cloud if k is a power of two.
+    This holds bit by bit on every kind of cloud if k is a power of two.
 
     Args:
         describe_at: function of camera clouds and sigma_s.
@@ -180,12 +180,12 @@ def assert_duplicates_count_twice(
 ) -> None:
     """Assert that duplicating every point keeps the images and doubles the embeddings.
 
-    Holds bit by bit for functions of aligned clouds: extremes stay, and doubled counts double every sum and product
-    exactly. Overflow counts points as well as pairs, and is left to `assert_overflow_told`.
+    This holds bit by bit for functions of aligned clouds: extremes do not change, and doubled counts double every sum
+    and product exactly. Overflow counts points as well as pairs and is checked by `assert_overflow_told`.
 
     Args:
-        describe: any function with the paper's convention; the released one divides by the number of points.
-        clouds: at most half full.
+        describe: function with the paper's convention; the released convention divides by the number of points.
+        clouds: clouds that are at most half full.
         config: config of the descriptor.
         drift: drift of the alignment, if `describe` aligns.
     """
@@ -203,8 +203,8 @@ def assert_duplicates_count_twice(
 def assert_backends_agree(first: Describe, second: Describe, clouds: PointClouds) -> None:
     """Assert that the closed form and gudhi give equal descriptors on every input, bit by bit.
 
-    gudhi returns indices, from which both take the same values. Within one larger program, XLA may fuse differently
-    around the callback; compare the stages separately in this case.
+    gudhi returns indices, by which both gather the same values. In a larger program, XLA may fuse operations around the
+    callback differently; compare the stages separately in this case.
     """
     assert_equal(second(clouds), first(clouds))
 
@@ -228,9 +228,9 @@ def assert_same_regions_alike(describe: Describe, clouds: PointClouds, network: 
 
 
 def assert_object_unity(describe: Describe, aligned: PointClouds, config: DescriptorConfig, m: int) -> None:
-    """Assert that removing all points from slice m on does not change the blocks of the slices before, bit by bit.
+    """Assert that removing all points from slice m on does not change the blocks of earlier slices, bit by bit.
 
-    This is the paper's reason for slices: the visible part of an object is described as if all of it were visible.
+    This is the paper's reason for slices: the visible part has the same description as in an unoccluded object.
 
     Args:
         describe: function of aligned clouds, with the paper's convention.
@@ -249,11 +249,11 @@ def assert_object_unity(describe: Describe, aligned: PointClouds, config: Descri
 def assert_flip_follows_rule(
     normalize: Callable[[PointClouds], PointClouds], clouds: PointClouds, seed: int
 ) -> NDArray[np.int64]:
-    """Assert that a cloud is turned by pi about z exactly if its first two x-bins hold more boundary points.
+    """Assert that a cloud is rotated by pi about z exactly if its first two x-bins contain more boundary points.
 
-    The points are counted in NumPy on the cloud normalized without a boundary. The turned cloud equals that cloud
-    mirrored in x and y, up to rounding by 8 units of the sides of the box. Boundary points are drawn on both ends, none
-    within 1e-4 of the border of a bin; clouds whose last bin is ambiguous by as little are skipped.
+    The points are counted in NumPy on the cloud that is normalized without a boundary. The rotated cloud equals that
+    cloud mirrored in x and y, up to rounding by 8 units of the sides of the box. Boundary points are drawn at both
+    ends, at least 1e-4 away from the borders of bins; clouds whose last bin is ambiguous by less are skipped.
 
     Args:
         normalize: `view_normalize` with a config.
@@ -289,8 +289,8 @@ def assert_mirrored_strips(
 ) -> None:
     """Assert that mirroring reverses the strips (x) or the slices (z), or exchanges low and high (y).
 
-    Clouds are mirrored in x and z about the middle of the grid of slices and strips. Holds bit by bit except for y,
-    whose extremes are rounded twice, 2 units of the height of the cloud.
+    Clouds are mirrored in x and z about the middle of the grid of slices and strips. This holds bit by bit except for
+    y, whose extremes are rounded twice, by 2 units of the height of the cloud.
 
     Args:
         strips: function of aligned clouds.
@@ -301,7 +301,7 @@ def assert_mirrored_strips(
     k = "xyz".index(axis)
     points = np.asarray(aligned.points, np.float64)
     mask = np.asarray(aligned.mask)[..., None]
-    # Mirrored, points on the border at 0 would leave the grid; they are settled like the others.
+    # Points on the border at 0 would leave the grid when mirrored, so they are settled like the others.
     spread = np.stack([settled(p + [1e-9, 0, 1e-9], config) for p in points])
     height = float(np.where(mask, points, 0).max(initial=0))
     size = (config.n_strips * config.sigma_2, height, config.n_slices * config.sigma_1)[k]

@@ -46,7 +46,7 @@ BODY_COPIES = 8
 
 
 def seeds() -> st.SearchStrategy[int]:
-    """Generate seeds for the generators of NumPy."""
+    """Generate seeds for NumPy's random generators."""
     return st.integers(0, 2**32 - 1)
 
 
@@ -147,8 +147,8 @@ def lattice_clouds(kinds: Sequence[str] = KINDS) -> st.SearchStrategy[Cloud]:
     """Generate camera clouds on which sums and means are exact in float32, so that properties hold without tolerance.
 
     Coordinates are integer multiples of `LATTICE` below 1 m, and the number of points is a power of two up to 512.
-    Multiplied by sigma_s = 5/2 they are integer multiples of 2^-12. A sum of 512 of them, even if shifted by up to 1 m,
-    is less than 2^24 such units, and a mean of 2^k of them needs no more bits than the sum.
+    Multiplied by sigma_s = 5/2, they are integer multiples of 2^-12. A sum of 512 coordinates, even if shifted by up to
+    1 m, is less than 2^24 such units, and a mean of 2^k coordinates needs no more bits than the sum.
     """
     return st.builds(_lattice_cloud, seeds(), st.sampled_from(kinds), st.integers(0, 9))
 
@@ -156,13 +156,13 @@ def lattice_clouds(kinds: Sequence[str] = KINDS) -> st.SearchStrategy[Cloud]:
 def settled(points: Points, config: DescriptorConfig, margin: float = 0.1) -> Points:
     """Move aligned points [n, 3] within their strip and slice, away from the borders of both.
 
-    Afterwards x and z are at least `margin` widths away from a border, so that rounding moves no point across one.
-    Coordinates of exactly 0 are kept: aligned clouds touch 0, and there is no strip below.
+    Afterwards x and z are at least `margin` widths away from a border, so that rounding moves no point across a border.
+    Coordinates of exactly 0 are kept, since aligned clouds touch 0 and there is no strip below.
 
     Args:
         points: scaled units, first octant.
         config: gives the widths of strips and slices.
-        margin: share of a width, below 1/2.
+        margin: fraction of a width, below 1/2.
     """
     moved = points.copy()
     for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
@@ -175,7 +175,7 @@ def _aligned_cloud(seed: int, kind: str, n: int, config: DescriptorConfig, margi
     rng = np.random.default_rng(seed)
     points = _MAKERS[kind](rng, n) @ Rotation.random(random_state=seed).as_matrix().T
     points = points - points.min(axis=0, initial=np.inf)
-    # Scale the longest side to a share of the extent of the descriptor along each axis.
+    # Scale the longest side to a fraction of the extent of the descriptor along each axis.
     window = np.array([config.n_strips * config.sigma_2, config.window, config.n_slices * config.sigma_1])
     points *= window * rng.uniform(0.2, reach, 3) / max(points.max(initial=0), 1e-9)
     return settled(points, config, margin).astype(np.float32), _colors(rng, len(points))
@@ -195,7 +195,7 @@ def aligned_clouds(
         kinds: a selection of `KINDS`.
         max_points: largest number of points; clouds may be empty.
         margin: the margin of `settled`.
-        reach: longest side as a share of the extent of the descriptor; above 1, some clouds overflow.
+        reach: longest side as a fraction of the extent of the descriptor; above 1, some clouds overflow.
     """
     make = functools.partial(_aligned_cloud, config=config, margin=margin, reach=reach)
     return st.builds(make, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
@@ -249,7 +249,7 @@ def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.Search
     on other clouds except for ties.
 
     Args:
-        config: with alpha = pi/4.
+        config: config with alpha = pi/4.
         max_points: largest number of points, at least 136.
 
     Raises:
@@ -271,7 +271,7 @@ def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.Sea
 def _network(seed: int, n_regions: int) -> ColorNetwork:
     rng = np.random.default_rng(seed)
     colors = grid_colors().astype(np.float64)
-    # Slabs along a random direction; a tenth of each is shared with the next.
+    # The regions are slabs along a random direction; each shares a tenth with the next.
     along = colors @ rng.normal(size=3)
     place = np.argsort(np.argsort(along)) / GRID_SIZE * n_regions
     region = place.astype(np.uint32)

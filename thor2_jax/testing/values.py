@@ -1,6 +1,6 @@
-"""Properties of the values of descriptors: masses, linearity, stability, the equations themselves, and their limits.
+"""Properties of the values of descriptors: masses, linearity, stability, agreement with the equations, and limits.
 
-`reference_descriptor` computes the equations in NumPy and float64.
+`reference_descriptor` evaluates the equations in NumPy and float64.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ class Reference(NamedTuple):
         embeddings: [S, R, J].
         persistence: [S, J], 0 for empty strips.
         counts: [S, J] int, number of points of each strip.
-        overflow: number of points outside plus number of strips whose persistence exceeds the window.
+        overflow: number of points outside the grid plus number of strips whose persistence exceeds the window.
     """
 
     images: NDArray[np.float64]
@@ -85,7 +85,7 @@ def reference_descriptor(
         points: [n, 3], scaled units, first octant.
         rgb: [n, 3].
         network: the colour network.
-        config: of either convention, without relaxation.
+        config: config with either convention, without relaxation.
     """
     i, j = cells(points, config)
     y = points[:, 1].astype(np.float64)
@@ -110,27 +110,27 @@ def reference_descriptor(
 def assert_image_mass(images: NDArray[np.floating], diagrams: Diagrams, config: DescriptorConfig) -> None:
     """Assert that the pixels of an image sum to the persistences, each times the mass of its Gaussian in the window.
 
-    The sum is at most that of the persistences, and close to it unless pairs lie within about 3 sigma of the border.
+    The sum is at most the sum of the persistences, and close to it unless pairs lie within about 3 sigma of the border.
     Masses are computed in float64; the tolerance is the rounding error of an image.
 
     Args:
         images: [..., S, P, P].
-        diagrams: fields [..., S, J], of the same clouds.
-        config: with a persistence weight of 1.
+        diagrams: diagrams of the same clouds, fields [..., S, J].
+        config: config with a persistence weight of 1.
     """
     births, deaths = (np.asarray(a, np.float64) for a in (diagrams.births, diagrams.deaths))
     persistence = np.where(diagrams.mask, deaths - births, 0)
     inside = [pixel_masses(centres, config).sum(axis=-1) for centres in (births, persistence)]
     expected = (persistence * inside[0] * inside[1]).sum(axis=-1)
     total, most = np.asarray(images, np.float64).sum(axis=(-2, -1)), persistence.sum(axis=-1)
-    # Births and deaths are rounded: their difference is off by 2 units of the death.
+    # Births and deaths are rounded, so the error of their difference is 2 units of the death.
     difference = image_rounding(most, config) + 2 * UNIT * (deaths * image_lipschitz(persistence, config)).sum(axis=-1)
     assert_within("mass", total, expected, difference)
     assert (total <= most + difference).all()
 
 
 def assert_color_mass(strips: Strips, clouds: PointClouds) -> None:
-    """Assert that colour vectors sum to the number of points without those that overflow.
+    """Assert that colour vectors sum to the number of points that do not overflow.
 
     Weights 1/m are rounded, and so are sums over at most 32 regions and over all strips.
     """
@@ -147,7 +147,7 @@ def assert_embedding_linear(
 ) -> None:
     """Assert that E = (C Delta)^T is linear in Delta and that images do not depend on Delta.
 
-    The tolerance is the rounding of products with entries of either sign, the counts times the absolute entries.
+    The tolerance is the rounding error of products with entries of any sign: the counts times the absolute entries.
 
     Args:
         describe_with: function of clouds and a similarity [R, R].
@@ -167,7 +167,7 @@ def assert_embedding_linear(
 
 
 def assert_embedding_additive(describe: Describe, first: PointClouds, second: PointClouds) -> None:
-    """Assert that the embedding of the union of two aligned clouds is the sum of theirs (paper's convention).
+    """Assert that the embedding of the union of two aligned clouds is the sum of both embeddings (paper's convention).
 
     Args:
         describe: function of aligned clouds.
@@ -205,11 +205,11 @@ def assert_stable(
 ) -> float:
     """Assert that moving points by at most eps within their strips changes each image by at most the proven bound.
 
-    Births stay and each extreme moves by at most eps, so that the 1-Wasserstein distance W1 of the diagrams is at most
-    2 eps for each pair. By the theorem for Gaussians of Adams et al. (JMLR 2017), the images then differ, summed over
-    pixels, by at most (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1 for the weight f = p, with |f'| = 1 and |f| the
-    largest persistence. Both steps are checked, and also the tighter constant for fixed births, smaller by sqrt(5),
-    pair by pair.
+    Births do not change and each extreme moves by at most eps, so that the 1-Wasserstein distance W1 of the diagrams is
+    at most 2 eps for each pair. By the theorem for Gaussians of Adams et al. (JMLR 2017), the difference of the images,
+    summed over pixels, is at most (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1 for the weight f = p, with |f'| = 1 and
+    |f| the largest persistence. Both steps are checked, and for each pair also the tighter constant for fixed births,
+    which is smaller by a factor of sqrt(5).
 
     Args:
         describe: function of aligned clouds.
@@ -217,7 +217,7 @@ def assert_stable(
         before: `settled` clouds.
         after: the same clouds, moved by `moved_within_strips`.
         eps: scaled units.
-        config: with a persistence weight of 1.
+        config: config with a persistence weight of 1.
 
     Returns:
         The largest quotient of the change of an image and its bound, at most 1 / sqrt(5) up to rounding.
@@ -250,14 +250,15 @@ def assert_follows_equations(
 ) -> None:
     """Assert that descriptors equal those of `reference_descriptor` up to rounding.
 
-    Holds for every cloud in the released convention and for `settled` clouds in the paper's convention: a quotient
-    rounded to float32 can cross the border of a strip. Coordinates below 2 add 2 units to the error of a persistence.
+    This holds for every cloud in the released convention, and for `settled` clouds in the paper's convention, where a
+    quotient rounded to float32 can cross the border of a strip. Coordinates below 2 add 2 units to the error of a
+    persistence.
 
     Args:
         describe: function of aligned clouds.
         aligned: aligned clouds.
         network: the colour network.
-        config: without relaxation.
+        config: config without relaxation.
     """
     descriptors = describe(aligned)
     for b, expected in enumerate(_references(aligned, network, config)):
@@ -317,6 +318,6 @@ def assert_relaxation_converges(
         most = (expected.persistence + moved).sum(axis=-1)
         bound = (moved * constant).sum(axis=-1) + 2 * image_rounding(most, config)
         assert_within("images", descriptors.images[b], hard.images[b], bound, summed=(-2, -1))
-        # Weights are sums of n exponentials and softmaxes of 27, each good to a few units.
+        # Weights are sums of n exponentials and softmaxes of 27 values, each accurate to a few units.
         bound = 100 * UNIT * np.asarray(hard.embeddings[b]) + n * (leak + 64 * UNIT)
         assert_within("embeddings", descriptors.embeddings[b], hard.embeddings[b], bound)

@@ -1,1 +1,1 @@
-"""Tracks: the instances of one object in several frames, and the fused answer for it."""
+"""Tracks: the instances of one object in several frames, and the fused answer for the object."""

@@ -1,4 +1,4 @@
-"""Tracker: the instances of successive frames are matched in space, and each object gets one fused answer.
+"""The tracker, which matches the instances of successive frames in space and fuses the answers for each object.
 
 >>> tracker = recognizer.track()                                                    # doctest: +SKIP
 >>> for frame in frames:                                                            # doctest: +SKIP
@@ -7,13 +7,13 @@
 >>> [(track.track, track.name, track.frames) for track in tracker.tracks()]        # doctest: +SKIP
 [(1, 'mug', 5), (2, 'bowl', 4)]
 
-The clouds of two frames that overlap most show the same object. The overlap is the share of the smaller one's voxels
-that the other one also occupies, averaged over the voxel sizes `VOXELS`. Small voxels distinguish neighbouring objects;
-large ones allow for motion between the frames.
+Clouds of two frames are matched so that their overlap is largest. The overlap is the fraction of the smaller cloud's
+voxels that the other cloud also occupies, averaged over the voxel sizes `VOXELS`. Small voxels distinguish neighbouring
+objects; large voxels allow for motion between the frames.
 
 The log-probabilities of each classifier and the scores of the gallery are averaged, with the weights of the views.
-Successive frames are nearly the same, so their probabilities are not multiplied as those of independent observations
-would be: a track whose frames all have the same probabilities has the confidence of a single frame.
+Successive frames are nearly the same, so their probabilities are not multiplied like those of independent observations:
+if all frames of a track have the same probabilities, the track has the confidence of a single frame.
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ MIN_OVERLAP = 0.2
 """Least overlap of two clouds of one object."""
 
 _OFFSET = 2**20
-"""Half the number of voxels along each axis that get a number of their own."""
+"""Half the number of voxels along each axis that have distinct numbers."""
 
 OccupiedVoxels = tuple[NDArray[np.int64], ...]
 """Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
@@ -88,11 +88,11 @@ def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
 
 
 def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> list[tuple[int, int]]:
-    """Return pairs of indices, one of each sequence, with the largest total overlap; each index occurs at most once.
+    """Return pairs of indices into both sequences with the largest total overlap; each index occurs at most once.
 
     Pairs with an overlap below `MIN_OVERLAP` are left out.
     """
-    from scipy.optimize import linear_sum_assignment  # takes .1 s to import, and one frame needs no matches
+    from scipy.optimize import linear_sum_assignment  # takes 0.1 s to import, and one frame needs no matches
 
     overlaps = np.array([[overlap(a, b) for b in second] for a in first]).reshape(len(first), len(second))
     overlaps[overlaps < MIN_OVERLAP] = 0
@@ -101,29 +101,29 @@ def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> 
 
 
 OCCLUDED_WEIGHT = 0.5
-"""Weight of a point of an occluded instance; other points weigh 1."""
+"""Weight of a point of an occluded instance; other points have weight 1."""
 
 HALF_LIFE = 30
-"""Views of an object after which the weight of an older one has halved, so that a track can change its mind."""
+"""Number of views of an object after which the weight of an older view has halved, so that the answer can change."""
 
 
 def view_weight(instance: PreparedInstance) -> float:
-    """Return the weight of a view: its number of points, which is its visible surface, less if it is occluded."""
+    """Return the weight of a view: its number of points, times `OCCLUDED_WEIGHT` if it is occluded."""
     return len(instance.points) * (OCCLUDED_WEIGHT if instance.occluded else 1.0)
 
 
 def _log_with_rest(probabilities: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the logarithms [C + 1] of probabilities [C] and of what they lack to 1."""
+    """Return the logarithms [C + 1] of probabilities [C] and of the rest to 1."""
     rest = max(1 - float(probabilities.sum(dtype=np.float64)), 0.0)
     return np.log(np.maximum(np.append(probabilities.astype(np.float64), rest), np.finfo(np.float32).tiny))
 
 
 class FusedEvidence:
-    """The evidence of the views of one object.
+    """The fused inferences of the views of one object.
 
     Attributes:
         weight: total weight of the views.
-        logs: classifier -> weighted sum [C + 1] of log-probabilities, the last one that of no class.
+        logs: classifier -> weighted sum [C + 1] of log-probabilities; the last one is for none of the classes.
         score_weight: total weight of the views with gallery scores.
         scores: weighted sum of the gallery's scores, by name of the object; None if the classifiers alone answer.
     """
@@ -140,10 +140,10 @@ class FusedEvidence:
         """Add a view.
 
         Args:
-            weight: its weight, see `view_weight`.
+            weight: weight of the view, see `view_weight`.
             probabilities: classifier -> class probabilities [C], which may sum to less than 1.
-            scores: object -> score of the gallery. Objects that were enrolled or forgotten since the last view start
-                the sums again.
+            scores: object -> score of the gallery. If objects were enrolled or forgotten since the last view, the sums
+                of the scores start again.
         """
         decay = 0.5 ** (1 / HALF_LIFE)
         self.weight = decay * self.weight + weight
@@ -169,10 +169,10 @@ class FusedEvidence:
 
 
 MAX_MISSED = 10
-"""Frames without a view of an object after which its track ends."""
+"""Number of frames without a view of an object after which its track ends."""
 
 MERGED_VIEWS = 6
-"""Latest views of an object whose clouds are merged; enough to see it from all sides."""
+"""Number of latest views of an object whose clouds are merged; they suffice to see it from all sides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,30 +181,30 @@ class TrackedRecognition(Recognition):
 
     Attributes:
         track: number of the track, from 1; None if the instance could not be described.
-        frames: number of frames in which the object was seen so far.
+        frames: number of frames so far in which the object was visible.
     """
 
     track: int | None = None
     frames: int = 0
 
     def renamed(self, other: Self) -> Self:
-        """Return this answer with the name, the confidence and the number of frames of another one of its track."""
+        """Return this answer with the name, the confidence and the number of frames of another answer of the track."""
         changed = ("name", "confidence", "classifier", "top", "reason", "frames")
         return dataclasses.replace(self, **{name: getattr(other, name) for name in changed})
 
 
 class _Track:
-    """An object that is followed.
+    """A tracked object.
 
     Attributes:
-        number: from 1, in the order of appearance.
-        voxels: those of its last view.
-        instance: the cloud that was described last: its last view, with poses merged with those before it.
-        overflow: points of that cloud outside the descriptor's grid.
-        seen: number of the frame of its last view.
-        views: its latest views and the poses of their cameras; empty without poses.
+        number: number of the track from 1, in the order of appearance.
+        voxels: voxels of the last view.
+        instance: the last described cloud, which is the last view, merged with earlier views if there are poses.
+        overflow: number of points of that cloud outside the descriptor's grid.
+        seen: number of the frame of the last view.
+        views: the latest views and the poses of their cameras; empty without poses.
         frames: number of views.
-        evidence: fused inferences of its views.
+        evidence: fused inferences of the views.
     """
 
     def __init__(self, number: int) -> None:
@@ -219,11 +219,11 @@ class Tracker:
     """The objects of a sequence of frames of one camera.
 
     Without poses, clouds are compared in camera coordinates: the camera may move by a few centimetres between frames.
-    With poses, each view of an object is described alone and as one cloud with those before it.
+    With poses, each view of an object is described twice: alone, and merged with the earlier views.
     """
 
     def __init__(self, recognizer: "Recognizer") -> None:
-        """Start without tracks; `Recognizer.track` calls this."""
+        """Create a tracker without tracks, as `Recognizer.track` does."""
         self._recognizer = recognizer
         self._tracks: list[_Track] = []
         self._frame = 0
@@ -232,15 +232,15 @@ class Tracker:
         self._numbers = itertools.count(1)
 
     def update(self, frame: RGBDFrame, pose: ArrayLike | None = None) -> list[TrackedRecognition]:
-        """Recognize the next frame and return its answers, fused with the earlier ones, in the order of the labels.
+        """Recognize the next frame and return its answers, fused with earlier frames, in the order of the labels.
 
         Args:
-            frame: of the size of the first frame.
-            pose: [4, 4] the camera's pose, see `check_pose`; for all frames or for none.
+            frame: a frame of the same size as the first one.
+            pose: [4, 4] the camera's pose, see `check_pose`; give it for all frames or for none.
 
         Raises:
-            InputError: the frame has another size than the first one, the pose is not a rigid motion, or it is missing
-                although the first frame had one, or the other way round. The tracks stay as they are.
+            InputError: the frame has another size than the first one, the pose is not a rigid motion, or only one of
+                this frame and the first frame has a pose. The tracks do not change.
         """
         world = None if pose is None else check_pose(pose)
         if self._frame and frame.depth.shape != self._size:
@@ -266,19 +266,19 @@ class Tracker:
         ]
 
     def tracks(self) -> list[TrackedRecognition]:
-        """Return the answers for all objects that are followed, with the label of their last view."""
+        """Return the answers for all tracked objects, with the labels of their last views."""
         return self._answers(self._tracks)
 
     def next_view(self, track: int, candidates: Sequence[ArrayLike], table: ViewTable) -> NextView:
-        """Return the camera pose from which an object should be seen next, so that its name becomes certain.
+        """Return the camera pose whose view of an object is expected to make its name most certain.
 
         Args:
-            track: number of its track.
+            track: number of the object's track.
             candidates: poses [4, 4] that the camera can reach and from which it sees the object.
             table: training views of the classes.
 
         Raises:
-            InputError: there is no such track, the frames had no poses, no classifier answers, or as `next_view`.
+            InputError: there is no such track, the frames had no poses, or no classifier answers; also as `next_view`.
         """
         followed = {each.number: each for each in self._tracks}.get(track)
         if followed is None:
@@ -296,7 +296,7 @@ class Tracker:
     def _extend(
         self, usable: Sequence[PreparedInstance], inference: Inference, world: NDArray[np.float64] | None
     ) -> None:
-        """Add every instance to its track, or start a track with it."""
+        """Add every instance to its track, or start a new track."""
         points = [each.points if world is None else transform(world, each.points) for each in usable]
         voxels = [occupied_voxels(cloud) for cloud in points]
         matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
@@ -315,7 +315,7 @@ class Tracker:
             self._add_evidence(several, self._recognizer.infer(track.instance for track in several)[1])
 
     def _add_evidence(self, tracks: Sequence[_Track], inference: Inference) -> None:
-        """Add the rows of an inference to those of the tracks, weighted by the clouds that were described."""
+        """Add each row of an inference to its track, weighted by the described cloud."""
         model = self._recognizer.model
         inference = jax.tree.map(lambda a: np.asarray(a)[: len(tracks)], inference)
         scores = object_scores(model, inference)

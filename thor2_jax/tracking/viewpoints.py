@@ -1,12 +1,12 @@
-"""Several viewpoints of one scene: camera poses, clouds that are merged over them, and the next view.
+"""Several viewpoints of one scene: camera poses, merged clouds, and the choice of the next view.
 
 A pose is a rigid motion from camera coordinates to coordinates that are fixed to the scene. Clouds of one object from
 several known poses are merged in space before they are described.
 
 The next view is the camera pose after which the name of an object is expected to be least uncertain. Training views of
-the plausible classes predict what the camera would see. Each view of a class whose answer is like the present one may
-be the present view; the motion of the camera then leads to another view of that class, whose answer is combined with
-the present one. The expected entropy is the mean over classes and views, by their probability.
+the plausible classes predict what the camera would see. Each training view whose answer is similar to the current
+answer may be the current view. The motion of the camera leads from it to another view of the same class, whose answer
+is combined with the current one. The expected entropy is the mean over classes and views, weighted by probability.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ PosedInstance = tuple[PreparedInstance, NDArray[np.float64]]
 """An instance and the pose [4, 4] of its camera, from camera to world coordinates."""
 
 MAX_DEVIATION = 1e-3
-"""Largest deviation of an entry from that of a rigid motion; files round to a few digits."""
+"""Largest deviation of a matrix entry from a rigid motion, since files contain only a few digits."""
 
 
 def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
@@ -46,10 +46,10 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
 
     Args:
         pose: matrix from camera coordinates (OpenCV: x right, y down, z forward) to world coordinates, in metres.
-        argument: its name in an error message.
+        argument: name of the pose in an error message.
 
     Raises:
-        InputError: it is not a finite [4, 4] matrix, or not a rigid motion: a rotation and a translation.
+        InputError: the pose is not a finite [4, 4] matrix, or not a rigid motion (a rotation and a translation).
     """
     try:
         matrix = np.array(pose, np.float64)
@@ -77,15 +77,15 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
         names: names of the frames.
 
     Raises:
-        InputError: the file is invalid, a frame has no pose, there is another number of poses than of frames, or a
-            pose is not a rigid motion. The message names the file.
+        InputError: the file is invalid, a frame has no pose, the numbers of poses and frames differ, or a pose is not a
+            rigid motion. The message names the file.
         OSError: the file cannot be read.
     """
     content = read_file(path)
     with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
         stored = json.loads(content)
         if not isinstance(stored, (dict, list)):
-            raise TypeError(f"it holds a {type(stored).__name__}")
+            raise TypeError(f"it contains a {type(stored).__name__}")
     if isinstance(stored, dict):
         missing = [name for name in names if name not in stored]
         if missing:
@@ -104,10 +104,10 @@ def transform(pose: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInstance:
-    """Return the last view with the points of all, in the coordinates of its camera, on the descriptors' voxel grid.
+    """Return the last view with the points of all views, in the last camera's coordinates, on the descriptors' grid.
 
-    What is occluded in one view may be visible in another one, so no point is on the occlusion boundary; likewise none
-    is on the rim of a mask.
+    A part that is occluded in one view may be visible in another one. Therefore no point of the result is on the
+    occlusion boundary or on the rim of a mask.
 
     Args:
         views: at least one view of the object.
@@ -122,21 +122,21 @@ def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInsta
 
 
 MIN_PROBABILITY = 0.02
-"""Least probability of a class in doubt."""
+"""Least probability of a plausible class."""
 
 SHARPNESS = 5.0
-"""A training view is as likely as exp(-SHARPNESS D), where D is the divergence of its answer from the present one."""
+"""A training view has the likelihood exp(-SHARPNESS D); D is the divergence of its answer from the current answer."""
 
 TINY = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ViewTable:
-    """Training views of all classes, and how they are answered.
+    """Training views of all classes, and the answers for them.
 
     Attributes:
         label: [V] class of each view.
-        rotations: [V, 3, 3] rotation of each view's camera, from camera to object axes; the camera looks at the object.
+        rotations: [V, 3, 3] rotation of each view's camera, from camera to object axes; cameras look at the object.
         probabilities: [V, C] fused class probabilities of each view.
     """
 
@@ -150,9 +150,9 @@ class NextView:
     """The best of several camera poses.
 
     Attributes:
-        index: its number among the candidates.
+        index: index of the best candidate.
         expected: [n] expected entropy after each candidate, nats.
-        entropy: entropy of the present answer, nats.
+        entropy: entropy of the current answer, nats.
     """
 
     index: int
@@ -163,13 +163,13 @@ class NextView:
 def next_view(
     probabilities: ArrayLike, centre: ArrayLike, pose: ArrayLike, candidates: Sequence[ArrayLike], table: ViewTable
 ) -> NextView:
-    """Choose the camera pose from which an object in doubt should be seen next.
+    """Choose the camera pose from which an object with an uncertain name should be seen next.
 
     Args:
         probabilities: [C] the object's fused class probabilities.
         centre: [3] the middle of the object's cloud, world coordinates in metres.
-        pose: [4, 4] the present camera, from camera to world.
-        candidates: poses [4, 4] that the camera can reach; those that look elsewhere should be left out.
+        pose: [4, 4] pose of the current camera, from camera to world.
+        candidates: poses [4, 4] that the camera can reach and from which it sees the object.
         table: training views.
 
     Raises:
@@ -183,7 +183,7 @@ def next_view(
     now = check_pose(pose)
     poses = [check_pose(each, f"candidates[{k}]") for k, each in enumerate(candidates)]
     p = np.maximum(p, TINY) / np.maximum(p, TINY).sum()
-    # Directions from the object to the candidates, in the axes of the present camera.
+    # Directions from the object to the candidates, in the axes of the current camera.
     towards = (np.array([each[:3, 3] for each in poses]) - np.asarray(centre, np.float64)) @ now[:3, :3]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), TINY)
     expected, total = np.zeros(len(poses)), 0.0
@@ -196,7 +196,7 @@ def next_view(
         divergences = (p * np.log(p / answers)).sum(axis=1)
         likely = np.exp(-SHARPNESS * (divergences - divergences.min()))
         rotations = table.rotations[views]
-        # The camera looks along its z axis, so that it is seen from the object in the direction -z.
+        # A camera looks along its z axis, so the direction from the object to the camera is -z.
         seen_from = np.einsum("vij,nj->vni", rotations, towards)
         nearest = (seen_from @ -rotations[:, :, 2].T).argmax(axis=2)  # [v, n]
         posterior = p * answers[nearest]

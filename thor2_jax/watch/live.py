@@ -33,10 +33,10 @@ from thor2_jax.service.hosts import check_host_names, is_allowed_host, listening
 __all__ = ["Broadcast", "LiveView", "paced", "serve_live"]
 
 FPS_FRAMES = 20
-"""Frames over which the frame rate is averaged."""
+"""Number of frames over which the frame rate is averaged."""
 
 LONGEST_PAUSE = 2.0
-"""Longest time that a recording is late, or pauses, without a new start of its time, seconds."""
+"""Largest time, seconds, that a frame may be late or early before the clock of the recording is reset."""
 
 _JPEG_QUALITY = 80
 
@@ -48,12 +48,12 @@ def paced(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], object] = time.sleep,
 ) -> Iterator[RecordedFrame]:
-    """Yield the frames of a recording at the speed at which they were taken; those that are late are left out.
+    """Yield the frames of a recording at the speed at which they were taken; late frames are skipped.
 
-    Where a frame is more than `LONGEST_PAUSE` late or early, as while programs are compiled or after a gap in the
-    recording, the time starts again with it.
+    If a frame is more than `LONGEST_PAUSE` late or early, because programs are compiled or the recording has a gap, the
+    clock is reset to this frame.
     """
-    offset: float | None = None  # of the clock to the time stamps
+    offset: float | None = None  # from the time stamps to the clock
     for frame in frames:
         stamp, now = frame.stamp / 1e9, clock()
         if offset is None or abs(stamp + offset - now) > LONGEST_PAUSE:
@@ -65,7 +65,7 @@ def paced(
 
 
 class Broadcast:
-    """The latest message, for which threads may wait. Readers that are slow skip messages."""
+    """The latest message, for which threads can wait. Slow readers skip messages."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -78,10 +78,10 @@ class Broadcast:
             self._changed.notify_all()
 
     def wait(self, after: int, timeout: float) -> tuple[int, str] | None:
-        """Return the number and the text of a message later than number `after`; None if there is none in time.
+        """Return the number and the text of a message later than number `after`; None at the timeout.
 
         Args:
-            after: number of the last message that is known; 0 for none.
+            after: number of the last received message; 0 for none.
             timeout: seconds to wait.
         """
         with self._changed:
@@ -91,20 +91,20 @@ class Broadcast:
 
 
 class LiveView:
-    """Recognizes frames, one after the other, and publishes each.
+    """A view that recognizes frames one after the other and publishes them.
 
     Attributes:
-        n_frames: frames that were recognized.
+        n_frames: number of recognized frames.
     """
 
     def __init__(
         self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: Segmenter, broadcast: Broadcast
     ) -> None:
-        """Publish that the first frame is awaited.
+        """Publish the state "waiting" for the first frame.
 
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
-            segmenter: gives labels to the frames that have none.
+            segmenter: segmenter of frames without labels.
             broadcast: receiver of the messages.
         """
         self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
@@ -114,11 +114,11 @@ class LiveView:
         self.publish_state("waiting", "Waiting for the first frame; the model is being compiled.")
 
     def publish_state(self, state: str, message: str) -> None:
-        """Publish a state with the last frame."""
+        """Publish a state together with the last frame."""
         self._broadcast.publish(json.dumps({**self._last, "state": state, "message": message}))
 
     def show(self, recorded: RecordedFrame) -> None:
-        """Recognize and publish a frame; one that fails is published with its `error`."""
+        """Recognize and publish a frame; if this fails, publish it with its `error`."""
         start = time.perf_counter()
         values: dict[str, Any] = {"frame": recorded.name, "error": None, "objects": []}
         try:
@@ -143,7 +143,7 @@ class LiveView:
 
 
 def _order(detection: Detection) -> tuple[bool, int]:
-    """Return the key by which detections are listed: named ones first, then by track or label."""
+    """Return the sort key of a detection in the list: recognized objects first, then by track or label."""
     answer = detection.recognition
     track = getattr(answer, "track", None)
     return answer.name is None, answer.label if track is None else track
@@ -199,7 +199,7 @@ class _Server(ThreadingHTTPServer):
         self.broadcast, self.allow_host, self.is_stopping = broadcast, allow_host, threading.Event()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore what goes wrong with a single connection: the browser has closed it."""
+        """Ignore errors of single connections, which the browser has closed."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -243,7 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.flush()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: a page makes one request for each file."""
+        """Log nothing, since a page makes one request for each file."""
 
 
 @contextlib.contextmanager
@@ -256,10 +256,10 @@ def serve_live(
         broadcast: the messages.
         host: address to listen on.
         port: port to listen on; 0 chooses a free one.
-        allow_host: names that the header Host may have, besides loopback names and the address that is connected to.
+        allow_host: names that the header Host may have, besides loopback names and the address of the connection.
 
     Raises:
-        InputError: the address cannot be used, or a name is none.
+        InputError: the address cannot be used, or a name is not a host name.
     """
     check_host_names(allow_host)
     with listening(host, port) as (listener, url), _Server(listener, broadcast, (*allow_host, host)) as server:

@@ -17,7 +17,7 @@ const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, mil
 const overlay = new Overlay(byId("overlay"), (click) => choose(click));
 const maskTools = new MaskTools(overlay, changeMasks, undoMasks);
 let loaded = null; // The model and the mean colours of its colour regions.
-let frame = null; // The answer that is shown, with the arguments of `recognize` that lead to it.
+let frame = null; // The shown answer, with the arguments of `recognize` that led to it.
 let currentRequest = new AbortController();
 
 function setStatus(text, busy = false) {
@@ -37,12 +37,12 @@ function clearProblems() {
   byId("problem").hidden = true;
 }
 
-/** Show the errors of a request, each beside its field if that is on the page, otherwise above the result. */
+/** Show the errors of a request, each beside its field if the field is on the page, otherwise above the result. */
 function showProblem(problem, fields = []) {
   setStatus("");
   if (problem.status === 401) {
     byId("token-section").hidden = false;
-    // The first request is sent without a token: that is not an error of the user.
+    // The first request is sent without a token, which is not an error of the user.
     if (byId("token").value) markField("token", problem.message);
     byId("token").focus();
     return;
@@ -91,7 +91,7 @@ async function recognize(title, fileSource, fields, selected = () => null, histo
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
     const { width, height } = answer.label_map;
     if (!files.labels && width === bitmap.width) {
-      // All further requests have these labels, for instance to name an object.
+      // All further requests have these labels, for example to enroll an object.
       files = { ...files, labels: await labelImage(decoded(answer.label_map), width, height) };
       history = [];
     }
@@ -137,7 +137,7 @@ function show(answer, bitmap, selected) {
   if (byId("overlay").getBoundingClientRect().bottom > innerHeight) byId("status").scrollIntoView();
 }
 
-/** Return what the model knows, and how to teach it. */
+/** Return a description of the model's objects, and of how to enroll others. */
 function unknownHint() {
   const { knows, teaches } = loaded.model;
   const how = teaches ? "Click an object to name it." : "Teach it by thor2 enroll, or here after thor2 serve --teach.";
@@ -168,10 +168,10 @@ function objectButton(instance, color) {
   return button;
 }
 
-/** Use a click on an object for the masks, or select it; return whether it was selected. */
+/** Use a click on an object to correct masks or to select the object; return whether it was selected. */
 function choose(click) {
   if (maskTools.takes(click) || !click.label) return false;
-  // On a phone, the picture that is tapped stays where it is: the answer is below it.
+  // On a phone, the tapped picture stays in place, since the answer is below it.
   select(click.label, click.x === undefined || !isNarrow.matches);
   return true;
 }
@@ -200,7 +200,7 @@ function select(label, byUser = false) {
   showDetails(instance, loaded.model, loaded.regions);
   showNaming(instance, loaded.model, frame.files);
   showWhy(instance);
-  // While masks are corrected, the image stays in view.
+  // The image stays visible while masks are corrected.
   if (byUser && !frame.history && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
 }
 
@@ -227,7 +227,7 @@ function showClasses({ classes, knows }) {
   byId("model").hidden = false;
 }
 
-/** Offer the sample frames all of whose objects the model knows or can be taught. */
+/** Offer the sample frames whose objects are all known, or can all be enrolled. */
 async function showSamples({ classes, teaches }) {
   const isKnown = (name) => teaches || classes.includes(name);
   const samples = (await service.samples()).filter(({ objects }) => objects.every(isKnown));
@@ -308,7 +308,7 @@ async function watchReady() {
   }
 }
 
-/** On a narrow screen, details unfold when they are asked for. */
+/** Fold the details on a narrow screen; the user can unfold them. */
 function fold() {
   for (const one of document.querySelectorAll(".fold")) one.open = !isNarrow.matches;
 }

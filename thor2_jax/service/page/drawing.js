@@ -29,7 +29,7 @@ export function keepDrawn(canvas, paint) {
   draw(canvas);
 }
 
-/** Whether the page is as narrow as on a phone: then details are folded. */
+/** Whether the page is as narrow as on a phone, where details are folded. */
 export const isNarrow = matchMedia("(max-width: 48rem)");
 
 /** Return a colour of the style sheet, for example `--muted`. */
@@ -45,7 +45,7 @@ export function percent(probability) {
   return `${(100 * probability).toFixed(digits)}\u00a0%`;
 }
 
-/** Return the calibrated confidence of an instance where there is one. */
+/** Return the calibrated confidence of an instance if it has one. */
 export const confidenceOf = ({ confidence, details }) => details?.calibrated_confidence ?? confidence;
 
 /** Split a name at its underscores, so that a line can break there. */

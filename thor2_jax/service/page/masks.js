@@ -1,4 +1,4 @@
-// Correction of masks that the service made: pieces are dropped, merged, and split along a straight cut, by clicks.
+// Correction of the service's masks by clicks: pieces are dropped, merged, and split along a straight cut.
 
 const byId = (id) => document.getElementById(id);
 const HINTS = {
@@ -13,8 +13,8 @@ export class MaskTools {
   /**
    * Correct the selected object of an overlay.
    *
-   * `changed(map, selected)` is called with the corrected labels and the label of the piece to select, and `undo()` if
-   * the last correction is to be taken back.
+   * `changed(map, selected)` is called with the corrected labels and the label of the piece to select, and `undo()` to
+   * undo the last correction.
    */
   constructor(overlay, changed, undo) {
     Object.assign(this, { overlay, changed, tool: null });
@@ -48,7 +48,7 @@ export class MaskTools {
     byId("masks-hint").textContent = HINTS[hint];
   }
 
-  /** Use a click on an object or a position for the current tool; return false if there is none. */
+  /** Use a click on an object or a position for the current tool; return false if no tool is active. */
   takes({ label, x, y }) {
     if (this.tool === "merge") {
       if (label && label !== this.overlay.selected) {

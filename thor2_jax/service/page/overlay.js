@@ -30,8 +30,8 @@ export const textColor = ([red, green, blue]) => (0.299 * red + 0.587 * green + 
 
 export class Overlay {
   /**
-   * Draw on `canvas`; `onClick({ label, x, y })` is called with the object, or 0, and the position in pixels of the
-   * label map that are clicked.
+   * Draw on `canvas`; `onClick({ label, x, y })` is called with the label of the clicked object (or 0) and the clicked
+   * position in pixels of the label map.
    */
   constructor(canvas, onClick) {
     Object.assign(this, { canvas, regions: null, tags: [], marked: null, takesPoints: false });
@@ -156,7 +156,7 @@ export class Overlay {
     });
   }
 
-  /** Return the box near an object that overlaps no tag and hides least of other objects, or undefined. */
+  /** Return the box near an object that overlaps no tag and hides the least of other objects, or undefined. */
   freePlace(label, room, others, costs, width, height) {
     const region = this.regions.of(label);
     if (!region || room.width > width) return;

@@ -65,7 +65,7 @@ export const explain = (files, signal) => json("v1/explain", { method: "POST", b
 /** Explain the answer for one object of a frame. */
 export const why = (files, instance, signal) => json("v1/why", { method: "POST", body: form({ ...files, instance }), signal });
 
-/** Enroll one object of a frame; a name that is known gets another view. */
+/** Enroll one object of a frame; an existing object gets a further view. */
 export const enroll = (files, instance, name) =>
   json("v1/objects", { method: "POST", body: form({ ...files, instance, name, extend: "true" }) });
 

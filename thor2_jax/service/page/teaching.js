@@ -1,11 +1,11 @@
-// Naming of objects: the form in the details, and the notice that takes a name back.
+// Naming of objects: the form in the details, and the notice with a button to undo.
 
 import { element } from "./drawing.js";
 import * as service from "./service.js";
 
 const byId = (id) => document.getElementById(id);
 
-/** Return whether an object can be named: its cloud was described, whether it is known or not. */
+/** Return whether an object can be named: known or not, its cloud must have been described. */
 export const canBeNamed = ({ name, unrecognized }) => name !== null || unrecognized.startsWith("unknown");
 
 function markName(message) {
@@ -16,7 +16,7 @@ function markName(message) {
 
 let shown = {}; // The frame and the object of the form.
 
-/** Show the form for an object of a frame if the service teaches; what is typed for the object that is shown stays. */
+/** Show the form for an object of a frame if the service can enroll; text typed for the same object is kept. */
 export function showNaming(instance, { teaches, classes }, files) {
   byId("naming").hidden = !teaches || !canBeNamed(instance);
   byId("name-label").textContent = instance.name === null ? "Name this object" : "Correct the name";
@@ -37,8 +37,8 @@ function showNotice(text, generation = null) {
 /**
  * Connect the form and the notice.
  *
- * `shownFiles()` returns the files of the frame that is shown, `changed(files)` is called after each change with the
- * files in which an object was named or taken back, and `failed(problem)` with a problem that belongs to no field.
+ * `shownFiles()` returns the files of the shown frame, `changed(files)` is called after each change with the files of
+ * the frame in which an object was named or a name was undone, and `failed(problem)` with a problem without a field.
  */
 export function connectNaming(shownFiles, changed, failed) {
   let files = null;
@@ -81,7 +81,7 @@ export function connectNaming(shownFiles, changed, failed) {
       try {
         await service.undo(byId("undo").dataset.generation);
       } catch (problem) {
-        // Only the last change can be taken back.
+        // Only the last change can be undone.
         if (problem.status === 409) return showNotice("Another change was made since, so this one stays.");
         return failed(problem);
       }

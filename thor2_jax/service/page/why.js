@@ -6,7 +6,7 @@ import * as service from "./service.js";
 const byId = (id) => document.getElementById(id);
 let request = new AbortController();
 
-/** Show the button for an object, without the explanation of another one. */
+/** Show the button for an object, without the explanation of another object. */
 export function showWhy({ label, details }) {
   request.abort();
   byId("why").hidden = details === null;
@@ -38,7 +38,7 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
   return `${subject}${what}: ${margin.toFixed(1)}. ${fall} ${found}`;
 }
 
-/** Return the answer of /v1/why; while the service compiles explanations, show that and ask again. */
+/** Return the response of /v1/why; while the service compiles explanations, show this and repeat the request. */
 async function explanation(files, label, signal) {
   for (;;) {
     try {

@@ -38,13 +38,13 @@ function span(name, text) {
   return made;
 }
 
-/** Returns what the list says below the name of an object. */
+/** Returns the text below the name of an object in the list. */
 function note(object) {
   const parts = [];
   if (object.track !== null) parts.push(`track ${object.track}, ${object.frames} ${object.frames === 1 ? "frame" : "frames"}`);
   if (object.position) parts.push(`${object.position[2].toFixed(2)} m away`);
   if (object.occluded) parts.push("occluded");
-  // Of an unknown object, the confidence is shown anyway.
+  // The reason of an unknown object repeats the confidence, which is shown anyway.
   if (object.reason && !object.reason.startsWith("unknown")) parts.push(object.reason);
   return parts.join("; ");
 }
@@ -74,7 +74,7 @@ function show(message) {
   setText("fps", message.fps ? message.fps.toFixed(1) : "–");
   setText("milliseconds", message.milliseconds ? `${Math.round(message.milliseconds)} ms` : "–");
   setText("number", message.number);
-  setText("frame", message.frame.replace(/(\.\d{3})\d{6}$/, "$1")); // of a time stamp, the milliseconds
+  setText("frame", message.frame.replace(/(\.\d{3})\d{6}$/, "$1")); // shortens a time stamp to milliseconds
   element("none").hidden = message.objects.length > 0;
   element("objects").replaceChildren(...message.objects.map(item));
 }
@@ -82,6 +82,6 @@ function show(message) {
 const events = new EventSource("events");
 events.onmessage = (event) => show(JSON.parse(event.data));
 events.onerror = () => {
-  // After the last message of a view that has failed, the server is gone.
+  // The server ends after the last message of a failed view.
   if (element("ready").textContent !== STATES.failed) setState("lost");
 };
