@@ -6,10 +6,10 @@
 >>> thor2.describe(clouds, network, config).tops2.shape
 (1, 11942)
 
-On CPUs, large batches are computed a chunk of clouds at a time so that intermediate tables stay in the caches:
-`map_chunks(function, clouds)` equals `function(clouds)`, the plain version, for any function that treats each cloud by
-itself. `map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators both are the plain
-version. `describe_stream` describes more clouds than fit into memory, and `describe_sharded` those of several devices:
+On CPUs, large batches are computed in chunks of clouds, so that intermediate tables stay in the caches:
+`map_chunks(function, clouds)` equals `function(clouds)` for any function that treats each cloud separately.
+`map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators, both simply call the function.
+`describe_stream` describes more clouds than fit into memory, and `describe_sharded` a batch on several devices:
 
 >>> mesh = batch_mesh()                                             # doctest: +SKIP   # all devices of all processes
 >>> clouds = shard_clouds(PointClouds.pack(local), mesh)            # doctest: +SKIP   # the clouds of this process

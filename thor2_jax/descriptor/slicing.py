@@ -12,8 +12,8 @@ renumbered from 0; a strip is numbered by its upper edge; colour vectors are div
 
 Hard slices, strips and colour regions are piecewise constant in points and colours, and their gradients vanish. With
 `DescriptorConfig(relaxation=Relaxation(...))` a point has a weight in each of them. As all four temperatures approach
-zero, the results approach the hard ones, for any cloud in the first octant that has no point on a border between two
-slices or strips and no colour halfway between two grid colours.
+zero, the results approach the hard ones. This holds for clouds in the first octant without points on the borders of
+slices and strips and without colours halfway between grid colours.
 """
 
 import dataclasses

@@ -184,7 +184,7 @@ def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[j
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing.
+    """Return `turn(view_normalize(clouds, config), config)`: aligned clouds in scaled units, ready for slicing.
 
     Raises InputError as both.
     """

@@ -6,10 +6,10 @@ The views are kept as compact clouds with a few bytes per point, from which any 
 >>> gallery.scores(embeddings).argmax(axis=-1)                                      # doctest: +SKIP
 
 A score is a kernel ridge regression on the views that are nearest to the query (`NEAREST`), with one indicator as the
-target of each name: about 1 amid the views of the object, about 0 far from them or amid the views of others. The views
-are those of the enrolled objects and the references of the embedding: views of the trained classes, and of a background
-of objects that are none of the names. The cost does not grow with the gallery, and nothing is fitted when an object is
-enrolled or forgotten. `Gallery.combine` combines the scores with the confidences of the classifiers.
+target of each name: about 1 among the views of the object, about 0 far from them or among the views of others. The
+regression includes the views of the enrolled objects and the references of the embedding: views of the trained classes
+and of background objects. The cost does not grow with the gallery, and nothing is fitted when an object is enrolled or
+forgotten. `Gallery.combine` combines the scores with the confidences of the classifiers.
 """
 
 import dataclasses

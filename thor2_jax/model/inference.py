@@ -121,7 +121,7 @@ def infer(
         model: the model.
         oriented: descriptors of the looks at B clouds.
         clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
-        classifiers: classifiers to evaluate, see `RunClassifiers.default`; empty if the gallery alone answers.
+        classifiers: classifiers to evaluate, see `Model.chosen_classifiers`; empty if the gallery alone answers.
     """
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}

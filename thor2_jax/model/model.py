@@ -179,11 +179,11 @@ class Model:
         return self.run.embedding or load_default()
 
     def chosen_classifiers(self, names: Sequence[str] | None = None) -> tuple[str, ...]:
-        """Return the names of the classifiers that are fused, without repetitions.
+        """Return the names of the classifiers to fuse, without repetitions.
 
         Args:
-            names: the wanted ones; by default the paper's two and the embedding, as far as the run has them, and all if
-                it has none of these.
+            names: wanted classifiers; by default the paper's two and the embedding, if the run has them, or all
+                classifiers of a run without any of these.
 
         Raises:
             InputError: no name is given, or the run lacks a classifier.

@@ -4,9 +4,9 @@ with Bag("table.mcap") as bag:
     for recorded in bag.frames():
         frame = segmented(recorded.read())
 
-Recordings are not trusted: ten kilobytes of their compressed parts may stand for gigabytes. The end of an MCAP file may
-be missing. Such a file is a sequence of records: a byte for the kind, the length in eight bytes, and the content. Its
-last record, the footer, says where the index lies; without an index, readers scan the records.
+Recordings are not trusted: ten kilobytes of their compressed parts can decompress to gigabytes. The end of an MCAP file
+may be missing. Such a file is a sequence of records: a byte for the kind, the length in eight bytes, and the content.
+Its last record, the footer, contains the position of the index; without an index, readers scan the records.
 """
 
 import bz2

@@ -1,4 +1,4 @@
-"""Bodies of requests: read into memory with a size limit, and decoded into fields of forms, frames and clouds.
+"""Reading of request bodies into memory, with a size limit, and decoding of forms, frames and clouds.
 
 Sizes are checked before anything is decompressed, nothing is written to temporary files, and every error names the
 field.

@@ -7,7 +7,7 @@ with serve_live(broadcast, port=0) as url:
 
 A message is JSON and a server-sent event. It has `state` (waiting, live, ended or failed), `message`, and the values of
 the last frame: `frame` (its name), `number`, `image` (JPEG in base64), `fps`, `milliseconds` for segmentation and
-recognition, `error`, and `objects`: name, confidence, track, frames, position, color and reason of each.
+recognition, `error`, and `objects` with name, confidence, track, frames, position, color and reason of each object.
 """
 
 import base64

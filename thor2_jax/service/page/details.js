@@ -49,7 +49,7 @@ function calibration(confidence, calibrated) {
 
 function confidenceHelp(calibrated, sources) {
   if (!sources.length) return "No object is enrolled.";
-  const gallery = "The score of the gallery is about 1 amid the enrolled views of an object and about 0 far from all of them. ";
+  const gallery = "The score of the gallery is about 1 among the enrolled views of an object and about 0 far from all of them. ";
   if (sources.length === 1 && sources[0] === "gallery") return `${gallery}It is the confidence; it is not calibrated.`;
   const both = "An object without training takes this score as its confidence, a trained class the geometric mean of its probabilities, and of its score if it has views, too. ";
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
