@@ -1,12 +1,12 @@
 """Gain of the adaptation to a camera: `python -m benchmarks.adaptation --model RUN --frames DIR... --out FILE.json`.
 
-The recognizer is adapted on one half of the frames (every second one) as a simulated camera sees them, without labels,
-and tested on the other half, and the other way round. The file has, for the frames as they are and for each camera of
-`training.augmentation.simulated_cameras`, the mean over both halves of the accuracy over placements before and after,
-the estimated colour transform, the number of instances that it was estimated from, and seconds. With --unknown, frames
-of objects that the run does not know are added to those for the adaptation, seen by the same camera.
+The recognizer is adapted to a simulated camera on one half of the frames (every second frame), without labels, and
+tested on the other half; then the halves are exchanged. The file has results for the original frames and for each
+camera of `training.augmentation.simulated_cameras`: the accuracy over placements before and after the adaptation (mean
+over both halves), the estimated colour transform, the number of instances used for it, and the time in seconds. With
+--unknown, the adaptation also gets frames of unknown objects, seen by the same camera.
 
-The command resumes: cameras that are in the file are kept.
+An interrupted command resumes: cameras that are already in the file are kept.
 """
 
 import argparse
@@ -33,22 +33,22 @@ from training.readers.labelled import LabelledFrame
 from training.storage.jobs import check_same_job
 
 LOST = 0.05
-"""Least loss of accuracy of a camera that counts as affected."""
+"""Smallest loss of accuracy at which a camera counts as affected."""
 
 
 def seen_by(camera: SimulatedCamera | None, item: LabelledFrame) -> LabelledFrame:
-    """Return a frame as a camera sees it; None changes nothing."""
+    """Return a frame as a camera sees it; None returns the frame unchanged."""
     return item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
 
 
 def only_labelled(item: LabelledFrame) -> RGBDFrame:
-    """Return the frame without instances that are not scored."""
+    """Return the frame with labels of scored instances only."""
     labels = np.where(np.isin(item.frame.label_image, list(item.truth)), item.frame.label_image, 0)
     return dataclasses.replace(item.frame, labels=labels)
 
 
 def answers_with(run: Run, frames: Sequence[LabelledFrame], transform: Any) -> list[FrameAnswers]:
-    """Return the answers of a run for frames whose colours are corrected by a transform, or by none."""
+    """Return the answers of a run for frames with colours corrected by a transform, or not corrected if it is None."""
     run.recognizer.model = dataclasses.replace(run.model, color_transform=transform)
     return [answers for _, answers in answer_frames([run], frames)]
 
@@ -94,7 +94,7 @@ def measure_camera(
 
 
 def summary(cameras: dict[str, Any]) -> dict[str, float]:
-    """Return the mean gain over all cameras and over those that lost at least `LOST`, and the gain on the originals."""
+    """Return the mean gain over all cameras, over cameras that lost at least `LOST`, and on the original frames."""
     changes = {name: row["after"] - row["before"] for name, row in cameras.items()}
     lost = [name for name, row in cameras.items() if cameras[ORIGINAL]["before"] - row["before"] >= LOST]
     others = [change for name, change in changes.items() if name != ORIGINAL]
@@ -108,14 +108,14 @@ def summary(cameras: dict[str, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure the cameras that are not in the file yet, and print the table."""
+    """Measure the cameras that are missing in the file, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, required=True, metavar="RUN")
     parser.add_argument("--frames", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--unknown", type=Path, nargs="*", default=[], metavar="DIR")
     parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
     parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
-    parser.add_argument("--instances", type=int, default=40, help="instances to adapt to, at most (%(default)s)")
+    parser.add_argument("--instances", type=int, default=40, help="largest number of instances (%(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()
     job = {name: str(value) for name, value in vars(options).items() if name != "out"}

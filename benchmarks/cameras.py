@@ -1,21 +1,21 @@
 """Accuracy under simulated cameras: `python -m benchmarks.cameras --model RUN... --frames DIR... --out FILE.json`.
 
-Every frame is recognized as it is and as ten simulated cameras see it (`training.augmentation.simulated_cameras`):
-those on which settings may be chosen, or those for the final report. For one or several runs on the same classes, the
+Every frame is recognized as it is and as seen by ten simulated cameras (`training.augmentation.simulated_cameras`):
+either those for choosing settings, or those for the final report. For one or several runs on the same classes, the
 file has the mean and the standard deviation over the runs of
 
-accuracy              mean over placements, all together and by group (directory) of frames
+accuracy              mean over placements, for all frames and by group (directory) of frames
 accuracy_of_instances
 steadiness            share of neighbouring frames with the most frequent answer of their placement
 calibration_error     expected calibration error on known objects
 auroc                 known against unknown objects, by the confidence
-unknown_named         share of unknown objects that are named where 95 % of the correct answers are kept
-kept_at_threshold, unknown_named_at_threshold    the two shares at the threshold that the run stores
+unknown_named         share of unknown objects that are named at a threshold that keeps 95 % of the correct answers
+kept_at_threshold, unknown_named_at_threshold    the two shares at the threshold stored in the run
 
-on the original frames, for each camera, and for all cameras together. Labelled objects that the runs do not know are
-unknown objects, except those with a name of --ignore, which are left out. Placements are those of the original frames;
-each camera has its own. --picture draws the first frame, or without --frames a scene of built-in objects, as all
-twenty cameras see it.
+on the original frames, for each camera, and for all cameras together. Labelled objects that are not classes of the runs
+are unknown objects; names that match --ignore are left out. Placements are found in the original frames and counted
+separately for each camera. --picture draws the first frame, or without --frames a scene of built-in objects, as seen by
+all twenty cameras.
 """
 
 import argparse
@@ -58,7 +58,7 @@ from training.rendering.scenes import compose_scene
 CAMERAS: dict[str, tuple[SimulatedCamera, ...]] = {"choose": CHOOSE, "report": REPORT, "none": ()}
 
 ORIGINAL, ALL = "original", "all cameras"
-"""Names of the frames as they are, and of all cameras together."""
+"""Names for the original frames, and for all cameras together."""
 
 METRICS = "accuracy", "accuracy_of_instances", "steadiness", "calibration_error", "auroc", "unknown_named"
 """Metrics of the table."""
@@ -73,24 +73,24 @@ SCENE = 5
 """Seed of the scene of built-in objects."""
 
 RunResults = dict[str, dict[str, float]]
-"""Results of a run: frames or camera -> metric -> value; NaN where there is none."""
+"""Results of a run: frames or camera -> metric -> value; NaN if there is no value."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a camera's name, frames done and the number of frames."""
 
 
 def labelled_frames(directories: Sequence[Path], ignore: Sequence[str] = ()) -> list[LabelledFrame]:
-    """Read frames, of which those in one directory are a group and a video.
+    """Read frames; the frames in one directory are a group and a video.
 
     Args:
-        directories: directories of frames, or of single frames, whose group is their parent directory.
-        ignore: patterns of object names that are left out.
+        directories: directories of frames, or directories of single frames, whose group is their parent directory.
+        ignore: patterns of object names to leave out.
 
     Returns:
         Frames with identifiers GROUP/FRAME.
 
     Raises:
-        InputError: a frame cannot be read, or two directories have one name.
+        InputError: a frame cannot be read, or two directories have the same name.
     """
     frames: dict[str, LabelledFrame] = {}
     for directory in directories:
@@ -111,7 +111,7 @@ def answers_by_camera(
     cameras: Sequence[SimulatedCamera],
     progress: Progress = lambda camera, done, total: None,
 ) -> dict[str, list[FrameAnswers]]:
-    """Return `ORIGINAL` or a camera's name -> the answers; every frame is described once for all runs."""
+    """Return `ORIGINAL` or a camera's name -> its answers; every frame is described once for all runs."""
 
     def seen(camera: SimulatedCamera | None) -> Iterator[LabelledFrame]:
         for item in frames:
@@ -135,17 +135,17 @@ def measure(
 ) -> list[RunResults]:
     """Return the results of every run: `ORIGINAL`, a camera's name or `ALL` -> metric -> value.
 
-    The metrics are those of the module's docstring; "accuracy in GROUP" is the accuracy in a group of frames.
+    The module's docstring explains the metrics; "accuracy in GROUP" is the accuracy in a group of frames.
     "instances", "placements" and "unknown_instances" are counts.
 
     Args:
         runs: the runs that gave the answers.
         answers: from `answers_by_camera`.
-        title: fusion of the classifiers, see `fusions`; by default the one that the first run answers by.
-        rule: rule of the fusion.
+        title: fusion of the classifiers, see `fusions`; by default the fusion that the first run uses for its answers.
+        rule: fusion rule.
 
     Raises:
-        InputError: no instance is of a class of the runs, or they have no such fusion.
+        InputError: no instance is of a class of the runs, or the runs do not have this fusion.
     """
     placements = find_placements(answers[ORIGINAL])
     parts = {name: [frames] for name, frames in answers.items()}
@@ -215,7 +215,7 @@ def _measure(
 def at_threshold(
     threshold: float, confidence: NDArray[np.floating], correct: NDArray[np.bool_], of_unknown: NDArray[np.floating]
 ) -> dict[str, float]:
-    """Return the shares of correct answers and of unknown objects that keep a name; NaN without a threshold."""
+    """Return the shares of correct answers and of unknown objects above a threshold; NaN without a threshold."""
     kept, named = (
         float((values >= threshold).mean()) if threshold and len(values) else np.nan
         for values in (confidence[correct], of_unknown)
@@ -224,12 +224,12 @@ def at_threshold(
 
 
 def summarize(results: Sequence[RunResults]) -> dict[str, dict[str, Any]]:
-    """Return `summarize_runs` over the runs, as JSON tables, in place of the values of `measure`."""
+    """Return the results of `measure` with the values replaced by `summarize_runs` over the runs (JSON tables)."""
     return {name: summarize_rows([of_run[name] for of_run in results]) for name in results[0]}
 
 
 def draw_cameras(frame: RGBDFrame, path: Path) -> None:
-    """Draw a labelled frame as all cameras see it (JPEG): black in masks has no depth, what is in no mask is dimmed."""
+    """Draw a labelled frame as seen by all cameras (JPEG); missing depth in masks is black, other pixels are dimmed."""
     figure = Figure(figsize=(15, 9.6), layout="constrained")
     for axes, camera in zip(figure.subplots(4, 5).flat, (*CHOOSE, *REPORT), strict=True):
         seen = through_camera(frame, camera)
@@ -256,7 +256,7 @@ def show(results: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def mean_and_deviation(statistics: Mapping[str, Any]) -> str:
-    """Return a mean, with the standard deviation if there are several runs."""
+    """Return a mean as text, with the standard deviation if there are several runs."""
     if statistics["mean"] is None:
         return "-"
     return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" +- {statistics['std']:.3f}")
@@ -275,7 +275,7 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, nargs="+", default=[], metavar="DIR")
     parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
     parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
-    parser.add_argument("--fusion", metavar="TITLE", help="such as CE+TOPS+TOPS2; default: what the run answers by")
+    parser.add_argument("--fusion", metavar="TITLE", help="such as CE+TOPS+TOPS2; default: as in recognition")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
     parser.add_argument("--picture", type=Path, metavar="FILE.jpg")
     options = parser.parse_args()

@@ -30,8 +30,8 @@ def _objects() -> tuple[str, list[TexturedMesh]]:
 def sample_clouds(count: int, n_points: int, seed: int = 0) -> tuple[str, list[Cloud]]:
     """Return a description of the clouds, and `count` clouds of exactly `n_points` points.
 
-    Points are drawn at random from the pixels of a view, without repetition if the view has enough of them. If there
-    are fewer views than clouds, views are reused with other random points.
+    Points are drawn at random from the pixels of a view, without repetition if there are enough pixels. If there are
+    fewer views than clouds, views are reused with other random points.
     """
     rng = np.random.default_rng(seed)
     name, meshes = _objects()

@@ -1,9 +1,9 @@
-"""Damaged set-ups and sound frames for `thor2 doctor`: share of right diagnoses, and of silence.
+"""Benchmark of `thor2 doctor`: share of damaged set-ups with a right diagnosis, and of sound frames without findings.
 
     python -m benchmarks.doctor --data ../shared/data --model run --out benchmarks/results/doctor.json
 
-Each of 20 damages is applied to each of some sound frames; a diagnosis is right if one of the findings has an expected
-code. Every sound frame must give no finding.
+Each of 20 kinds of damage is applied to each of several sound frames. A diagnosis is right if one of the findings has
+an expected code. Sound frames should have no findings.
 """
 
 import argparse
@@ -30,19 +30,19 @@ BASES = (
     "frames/ycbv_real_0000/000001",
     "frames/ycbv_real_0001/000001",
 )
-"""Frames that are damaged; the model must know their objects."""
+"""Frames to damage; their objects must be classes of the model."""
 
 
 @dataclasses.dataclass
 class SetUp:
-    """Files of a frame, which a damage changes.
+    """The contents of the files of a frame, to which damage is applied.
 
     Attributes:
         color: [H, W, 3] uint8.
         depth: [H, W], integers in depth units or floats in metres.
         labels: [H, W] or [H, W, 3].
         intrinsics: values of the file.
-        mesh_side: longest side of the mesh that is given, in its unit.
+        mesh_side: longest side of the mesh, in its unit.
     """
 
     color: np.ndarray
@@ -205,7 +205,7 @@ def sound(folders: Sequence[Path], recognizer: Recognizer | None) -> dict[str, A
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder with frames and hots")
-    parser.add_argument("--model", type=Path, required=True, help="run that knows the objects of frames")
+    parser.add_argument("--model", type=Path, required=True, help="run trained on the objects of frames")
     parser.add_argument("--sound", nargs="*", help="folders of sound frames in --data")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()

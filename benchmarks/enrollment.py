@@ -1,9 +1,9 @@
 """Accuracy of objects enrolled from labelled frames: `python -m benchmarks.enrollment DIR... [--test DIR]`.
 
-Frames are left out in four folds, and a gallery of the others recognizes their instances: with all views and with one,
-three and five views of each object, by groups of objects of one shape in several colours, and against unknown objects,
-a third of the objects at a time. With --test, the views of all DIRs are enrolled, and the frames of --test are
-recognized once.
+The frames are split into four folds. The instances of each fold are recognized with a gallery of the other folds, with
+all views and with one, three and five views of each object. The report also has the accuracy in groups of objects with
+the same shape and different colours, and the rejection of unknown objects, a third of the objects at a time. With
+--test, the views of all DIRs are enrolled, and the frames of --test are recognized once.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def embed(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np
 
 
 def gallery_of(instances: Instances, rows: NDArray[np.intp], n_views: int | None, seed: int = 0) -> Gallery:
-    """Return a gallery of the instances in `rows`, of at most `n_views` of each object."""
+    """Return a gallery of the instances in `rows`, with at most `n_views` of each object."""
     rng, gallery = np.random.default_rng(seed), Gallery("")
     for name in np.unique(instances.names[rows]):
         own = rows[instances.names[rows] == name]
@@ -74,13 +74,13 @@ def gallery_of(instances: Instances, rows: NDArray[np.intp], n_views: int | None
 
 
 def answers(gallery: Gallery, instances: Instances, rows: NDArray[np.intp]) -> tuple[NDArray[np.str_], NDArray[Any]]:
-    """Return names and scores."""
+    """Return the names and the scores of the answers."""
     scores = gallery.scores(instances.embeddings[rows])
     return np.array(gallery.names)[scores.argmax(axis=1)], scores.max(axis=1)
 
 
 def leave_frames_out(instances: Instances, n_views: int | None, seed: int = 0) -> tuple[NDArray[np.str_], NDArray[Any]]:
-    """Return the answer and its score for each instance by a gallery of the frames of the other folds."""
+    """Return the answer and its score for each instance, from a gallery of the other folds' frames."""
     frame = np.unique(instances.frames, return_inverse=True)[1]
     fold = np.random.default_rng(1).permutation(frame.max() + 1)[frame] % FOLDS
     names, scores = np.zeros_like(instances.names), np.zeros(len(instances.names))

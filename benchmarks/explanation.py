@@ -1,8 +1,9 @@
 """Faithfulness of attributions on real frames: `python -m benchmarks.explanation --model RUN DIR...`.
 
-For every instance, the most attributed tenth of the points is removed, and 20 random tenths, and recognition is
-computed again from the reduced cloud. An attribution is faithful if the log-odds of the answer fall by more than in
-the mean of the random tenths. DIRs are folders of frames with label images; names of objects are not read.
+For every instance, the tenth of the points with the highest attributions is removed, then each of 20 random tenths, and
+the reduced clouds are recognized again. An attribution is faithful if removing the first tenth reduces the log-odds of
+the answer more than removing a random tenth does on average. DIRs are folders of frames with label images; names of
+objects are not needed.
 """
 
 import argparse
@@ -23,7 +24,7 @@ __all__ = ["faithfulness_of", "summary"]
 
 
 def faithfulness_of(scores: ClassScores, directory: Path, sigma_s: float) -> Iterator[tuple[str, int, Faithfulness]]:
-    """Yield the name of the frame, the label and the check of every instance that can be described."""
+    """Yield, for every instance that can be described, the name of the frame, the label and the faithfulness check."""
     for source in find_frames([directory]):
         frame = source.read()
         for label in frame.instances:
@@ -35,7 +36,7 @@ def faithfulness_of(scores: ClassScores, directory: Path, sigma_s: float) -> Ite
 
 
 def summary(checks: list[Faithfulness]) -> dict[str, float]:
-    """Return the number of instances, the fraction that is faithful, and the median losses."""
+    """Return the number of instances, the fraction of faithful attributions, and the median losses."""
     return {
         "instances": len(checks),
         "faithful": float(np.mean([check.holds for check in checks])),

@@ -1,8 +1,8 @@
-"""Fit the TOPS2 classifier beside common libraries: `python -m benchmarks.fit_peers --python PYTHON`.
+"""Compare the time to fit the TOPS2 classifier with common libraries: `python -m benchmarks.fit_peers --python PYTHON`.
 
-PYTHON is an interpreter that has torch, scikit-learn and NumPy; its environment needs nothing else. All fit the same
-layers with Adam, on the same samples in batches of the same size, one epoch each in turns. This project expands its
-samples to descriptors in every step; the peers are given the descriptors. Compilation is not timed.
+PYTHON is an interpreter with torch, scikit-learn and NumPy; no other packages are needed. All libraries fit the same
+layers with Adam on the same samples in batches of the same size, in turns of one epoch. This project expands its
+samples to descriptors in every step, while the peers get the descriptors. Compilation is not timed.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import numpy as np
 
 BATCH, TURNS, RATE = 256, 7, 1e-3
 STEPS = ((20.0, 20.0), (60.0, 45.0))
-"""Camera steps in degrees, and those of --quick."""
+"""Camera steps in degrees, by default and with --quick."""
 
 
 def torch_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[], object]:
@@ -50,7 +50,7 @@ def sklearn_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[
 
 
 def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
-    """Write the arrays that the peers read; return a function that fits one epoch with this project."""
+    """Write the arrays for the peers, and return a function that fits one epoch with this project."""
     import jax
     import optax  # type: ignore[import-untyped]
     from flax import nnx
@@ -102,7 +102,7 @@ def serve_peer(name: str, folder: Path) -> None:
 
 
 def main() -> None:
-    """Print the samples that each library fits in a second, and its time divided by this project's in the same turn."""
+    """Print the samples per second of each library, and its time divided by this project's time in the same turn."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--python", required=True, help="interpreter with torch and scikit-learn")
     parser.add_argument("--quick", action="store_true", help="fewer samples")

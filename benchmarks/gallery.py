@@ -1,9 +1,9 @@
-"""Galleries: search among 100,000 objects, and the time to teach one: `python -m benchmarks.gallery search|teach`.
+"""Time to search a gallery of 100,000 objects, and to enroll an object: `python -m benchmarks.gallery search|teach`.
 
-search  synthetic embeddings: time of a query of 16 embeddings, memory, and the recall of the index
-teach   one object more in a warm process with a gallery of 60, from a mesh and from five views; forgetting it
+search  synthetic embeddings: time of a query of 16 embeddings, memory, and recall of the index
+teach   enrolling one more object from a mesh and from five views in a warm process with 60 objects; forgetting it
 
-Prints a table and writes gallery-search.json or gallery-teach.json.
+The command prints a table and writes gallery-search.json or gallery-teach.json.
 """
 
 import argparse
@@ -35,7 +35,7 @@ QUERIES = 16
 
 
 def synthetic_embeddings(n_objects: int, n_views: int, seed: int = 0) -> NDArray[np.float16]:
-    """Return views [n_objects * n_views, SIZE] of unit length, each object's around a random centre (cosine 0.8)."""
+    """Return unit vectors [n_objects * n_views, SIZE], the views of each object around a random centre (cosine 0.8)."""
     rng = np.random.default_rng(seed)
     embeddings = np.empty((n_objects * n_views, SIZE), np.float16)
     for first in range(0, n_objects, 1000):
@@ -48,7 +48,7 @@ def synthetic_embeddings(n_objects: int, n_views: int, seed: int = 0) -> NDArray
 
 
 def queries_near(embeddings: NDArray[np.float16], count: int, seed: int = 1) -> NDArray[np.float32]:
-    """Return queries [count, SIZE] of unit length, each near a random view."""
+    """Return unit vectors [count, SIZE] as queries, each close to a random view."""
     rng = np.random.default_rng(seed)
     queries = embeddings[rng.integers(len(embeddings), size=count)].astype(np.float32)
     queries += rng.standard_normal(queries.shape, np.float32) * np.float32(0.75 / np.sqrt(SIZE))
@@ -109,7 +109,7 @@ def measure_teaching(options: argparse.Namespace) -> dict[str, Any]:
         }
         recognizer.objects.add(views)
         report = {}
-        for attempt in range(options.repeats + 1):  # the first one compiles
+        for attempt in range(options.repeats + 1):  # the first repeat compiles
             before = [str(answer) for answer in recognizer.recognize(scenes[0].frame)]
             report["mesh"] = _seconds(lambda: _enroll_mesh(recognizer.objects, meshes[name]))
             report["forget"] = _seconds(lambda: recognizer.forget("new"))

@@ -1,17 +1,17 @@
 """Effects of settings on other cameras: `python -m benchmarks.levers --meshes DIR --frames DIR... --out OUT`.
 
-For each lever, a row of `LEVERS`, recognizers are trained with several seeds by `thor2 train` on views that
-`thor2 render` has rendered once, and evaluated as `benchmarks.cameras` does. Levers that differ in recognition only
-share their trainings. Results are in
+A lever is a row of `LEVERS`. For each lever, `thor2 train` trains recognizers with several seeds on views that are
+rendered once by `thor2 render`; they are evaluated like in `benchmarks.cameras`. Levers that differ only in recognition
+share their trainings. The results are in
 
 OUT/views/*, OUT/runs/*/seed-N    views and trained runs
 OUT/cells/LEVER/seed-N.json       results of one run
 OUT/levers.json, OUT/levers.md    mean and standard deviation of each lever; written again after each lever
 
-The command resumes when it is given again: finished views, runs and cells are kept, and more levers or seeds may be
-asked for. A cell of a lever whose row has changed since is computed again.
+When the command is repeated, it resumes: finished views, runs and cells are kept, and there may be more levers or
+seeds. The cells of a lever are computed again if its row has changed.
 
-Not among the levers is the relaxed descriptor: training with it takes several times as long.
+The relaxed descriptor is not among the levers, since training with it takes several times as long.
 """
 
 import argparse
@@ -49,21 +49,21 @@ from training.storage.jobs import begin_job
 from training.views.mesh_views import mesh_views
 
 RENDER = "--azimuth-step 20 --polar-step 15 --copies 2 --illumination --occlusion --sensor --segmentation"
-"""Default options of all renderings: the cameras and the first four augmentations of the default protocol."""
+"""Default options for all renderings: the cameras and the first four augmentations of the default protocol."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Lever:
-    """A change of training or recognition; by default it changes nothing.
+    """A change of training or recognition; the default values change nothing.
 
     Attributes:
         name: name in the table.
-        render: further options of `thor2 render`.
-        train: further options of `thor2 train`.
-        looks: looks at a cloud in recognition; None for those of the run.
-        fusion: column of an evaluation that answers, see `fusions`; None for the one that the run answers by. With
-            "gallery" or "both", the meshes are enrolled.
-        rule: rule of the fusion.
+        render: additional options of `thor2 render`.
+        train: additional options of `thor2 train`.
+        looks: number of looks at a cloud in recognition; None uses the number of the run.
+        fusion: evaluated column, see `fusions`; None uses the column with the run's answers. With "gallery" or "both",
+            the meshes are enrolled.
+        rule: fusion rule.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Lever:
 PLAIN = "--epochs 24 --orientation-copies 0 --embedding 0"
 ORIENTED = "--epochs 24 --orientation-copies 2 --embedding 0"
 DISTRACTED = "--epochs 24 --orientation-copies 2 --embedding 1500 --classifiers tops,tops2,ce"
-"""Options of trainings without orientation copies and embedding, with the copies, and with both."""
+"""Options of trainings without orientation copies and embedding, with the copies only, and with both."""
 
 LEVERS = (
     Lever("default", train=PLAIN),
@@ -111,8 +111,8 @@ LEVERS = (
     Lever("five copies in fewer epochs", render="--copies 5", train="--epochs 16 --orientation-copies 1 --embedding 0"),
     Lever("total", render="--registration --base --copies 5", looks=None, fusion=None),
 )
-"""The table's rows. The default is that of versions without orientation copies and distractors; "total" is what
-`thor2 train` and recognition do by default now."""
+"""The table's rows. The default is as in versions without orientation copies and distractors; "total" is the present
+default of `thor2 train` and of recognition."""
 
 COLUMNS = {
     "real frames": (ORIGINAL, "accuracy"),
@@ -138,7 +138,7 @@ def _slug(options: str) -> str:
 
 
 class Table:
-    """The cells of the table in a directory, and what is needed to compute them.
+    """The cells of the table in a directory, with the data for computing them.
 
     Attributes:
         out: directory of the table.
@@ -147,10 +147,10 @@ class Table:
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        """Read the frames, and check that the directory is new or of the same job.
+        """Read the frames, and check that the directory is new or belongs to the same job.
 
         Raises:
-            InputError: the directory is of another job, or a frame or a mesh table cannot be read.
+            InputError: the directory belongs to another job, or a frame or a mesh table cannot be read.
             OSError: a file cannot be read or written.
         """
         self.out: Path = options.out
@@ -168,7 +168,7 @@ class Table:
         begin_job(self.out, job)
 
     def cell(self, lever: Lever, seed: int) -> RunResults | None:
-        """Return the results of a lever with a seed; None if they are still to be computed."""
+        """Return the results of a lever with a seed; None if they are not computed yet."""
         file = self._cell_file(lever, seed)
         if not file.is_file():
             return None
@@ -196,7 +196,7 @@ class Table:
         return run
 
     def _load(self, lever: Lever, directories: Sequence[Path]) -> list[Run]:
-        """Load runs and change them as the lever does."""
+        """Load runs and apply the lever's changes to them."""
         runs = load_runs(directories)
         for run in runs:
             recognizer = run.recognizer
@@ -212,7 +212,7 @@ class Table:
         return runs
 
     def compute(self, levers: Sequence[Lever], seeds: Sequence[int]) -> None:
-        """Compute the missing cells of levers that differ in the fusion only, with one evaluation."""
+        """Compute the missing cells of levers that differ only in the fusion, with one evaluation."""
         missing = [seed for seed in seeds if any(self.cell(lever, seed) is None for lever in levers)]
         if not missing:
             return
@@ -241,7 +241,7 @@ class Table:
         write_text(file, json.dumps({"lever": dataclasses.asdict(lever), "results": plain}, indent=1) + "\n")
 
     def write(self, levers: Sequence[Lever], seeds: Sequence[int]) -> str:
-        """Write mean and standard deviation of the levers whose cells are complete, and return the table."""
+        """Write mean and standard deviation of the levers with complete cells, and return the table."""
         report = {}
         lines = ["| lever | runs | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
         for lever in levers:
@@ -271,7 +271,7 @@ def _report(text: str) -> None:
 
 
 def grouped(levers: Sequence[Lever]) -> list[list[Lever]]:
-    """Return levers that share trainings, descriptors and galleries together, in the order of the first ones."""
+    """Return groups of levers that share trainings, descriptors and galleries, in the order of their first levers."""
     groups: dict[tuple[Any, ...], list[Lever]] = {}
     for lever in levers:
         key = lever.training, lever.looks, lever.enrolls
@@ -290,8 +290,8 @@ def main() -> None:
     parser.add_argument("--levers", nargs="+", metavar="NAME", help=f"of: {', '.join(lever.name for lever in LEVERS)}")
     parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
     parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
-    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='of all renderings ("%(default)s")')
-    parser.add_argument("--train", default="", metavar="OPTIONS", help="of all trainings")
+    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='for all renderings ("%(default)s")')
+    parser.add_argument("--train", default="", metavar="OPTIONS", help="for all trainings")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes")
     options = parser.parse_args()
     by_name = {lever.name: lever for lever in LEVERS}

@@ -1,8 +1,8 @@
-"""Paired comparisons of two methods on the same instances: the difference of their accuracies, with an interval.
+"""Paired comparison of two methods on the same instances: difference of their accuracies with confidence interval.
 
-Neighbouring frames of a video are nearly equal, so the interval and the test concern placements: an object that does
-not move is one placement. The interval is a bootstrap over placements, and McNemar's exact test counts the placements
-on which only one of the methods is better.
+The interval and the test use placements instead of instances, since neighbouring frames of a video are nearly equal. A
+placement is an object that does not move. The interval is a bootstrap over placements, and McNemar's exact test counts
+the placements on which one of the methods is better.
 """
 
 import dataclasses
@@ -21,15 +21,15 @@ SIGNIFICANCE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class PairedDifference:
-    """The accuracy of a method minus that of another one.
+    """The accuracy of one method minus the accuracy of another method.
 
     Attributes:
-        difference: over the instances, mean over the folds.
+        difference: difference over the instances, as the mean over the folds.
         low: lower end of the 95 % interval.
-        high: its upper end.
-        better: placements on which the first method is better, on the mean over the folds.
-        worse: placements on which it is worse.
-        p_value: of McNemar's exact test, two-sided; 1 if no placement differs.
+        high: upper end of the 95 % interval.
+        better: number of placements on which the first method is better, in the mean over the folds.
+        worse: number of placements on which the first method is worse.
+        p_value: p-value of McNemar's exact test, two-sided; 1 if no placement differs.
         instances: number of instances.
         placements: number of placements.
     """
@@ -47,7 +47,8 @@ class PairedDifference:
     def verdict(self) -> str:
         """Return "holds" or "does not hold" if the whole interval is above or below 0 and the test agrees.
 
-        Otherwise return "undecided": the interval of a few placements that all differ alike is too narrow.
+        Otherwise, return "undecided". The test is needed, since the interval is too narrow if a few placements all
+        differ in the same way.
         """
         if self.p_value >= SIGNIFICANCE or self.low <= 0 <= self.high:
             return "undecided"
@@ -65,9 +66,9 @@ def paired_difference(
 
     Args:
         first: [F, N], whether the first method is correct on each of N instances, for each of F folds.
-        second: [F, N], the same of the second method.
+        second: [F, N], whether the second method is correct.
         placement: [N] int, the placement of each instance; at least one instance.
-        seed: seed of the bootstrap.
+        seed: seed for the bootstrap.
     """
     difference = np.mean(first, axis=0) - np.mean(second, axis=0)
     numbers = np.unique(placement, return_inverse=True)[1].ravel()
@@ -79,7 +80,7 @@ def paired_difference(
             method="percentile", rng=np.random.default_rng(seed),
         ).confidence_interval  # fmt: skip
         low, high = float(interval.low), float(interval.high)
-    # Means over folds are sums of multiples of 1/F: rounding errors are no differences.
+    # Means over folds are sums of multiples of 1/F, so smaller differences are rounding errors.
     better, worse = int((total > 1e-9).sum()), int((total < -1e-9).sum())
     p_value = float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0
     return PairedDifference(float(difference.mean()), low, high, better, worse, p_value, len(difference), len(count))

@@ -1,16 +1,16 @@
 """The paper's whole comparison: `python -m benchmarks.paper --meshes DIR --scenes DIR --frames DIR... --out OUT`.
 
 For each dataset, `thor2 render` renders views and crops, and `thor2 train` trains THOR2 and then each baseline on them,
-in folds; all are evaluated on the same instances. --scenes is a dataset in the layout of UW-IS Occluded, --frames are
-folders of labelled frames; either may be left out. The results are in
+in folds. All are evaluated on the same instances. --scenes is a dataset in the layout of UW-IS Occluded, and --frames
+are folders of labelled frames; one of the two may be left out. The results are in
 
 OUT/DATASET/views, run, evaluation*    views, trained models, answers and pages of each dataset
-OUT/paper.json, paper.md, paper.png    the tables of the paper beside ours, paired comparisons, time and memory
+OUT/paper.json, paper.md, paper.png    tables of the paper with our values, paired comparisons, time and memory
 
-The command resumes when it is given again with the same options: finished views, models, frames and measurements are
-kept. Networks are trained from scratch without --weights, and the report then makes no claim about the paper's.
-With --real, the labelled frames of these folders join the views, as in the last tables of the paper; THOR is left out
-then, since real frames have no camera angles.
+When the command is repeated with the same options, it resumes: finished views, models, frames and measurements are
+kept. Without --weights, networks are trained from scratch, and their accuracy does not represent the paper's networks.
+With --real, the labelled frames of these folders are added to the views, as in the last tables of the paper. THOR is
+then left out, since real frames have no camera angles.
 """
 
 import argparse
@@ -44,7 +44,7 @@ RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor 
 """Views and augmentations of the default protocol."""
 
 THOR2 = "THOR2"
-"""Name of the training of the classifiers of THOR2 among the costs."""
+"""Name under which the costs list the training of THOR2's classifiers."""
 
 
 class Comparison:
@@ -57,10 +57,10 @@ class Comparison:
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        """Read the datasets, and check that the directory is new or of the same job.
+        """Read the datasets, and check that the directory is new or belongs to the same job.
 
         Raises:
-            InputError: the directory is of another job, or a dataset, a table, meshes or weights cannot be used.
+            InputError: the directory belongs to another job, or a dataset, a table, meshes or weights cannot be used.
             OSError: a file cannot be read or written.
         """
         self.out: Path = options.out
@@ -104,7 +104,7 @@ class Comparison:
             self._run(name, baseline, *train, "--baselines", baseline, *weights)
 
     def _run(self, dataset: str, method: str, *arguments: object) -> None:
-        """Run a command of `thor2` and store its time and memory, unless that is done."""
+        """Run a command of `thor2` and store its time and memory, unless they are already stored."""
         file = self.out / dataset / "costs.json"
         costs = json.loads(file.read_bytes()) if file.is_file() else {}
         if method in costs:
@@ -182,21 +182,21 @@ def _report(text: str) -> None:
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Return the command line's options."""
+    """Parse the command line and return its options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--meshes", type=Path, required=True, metavar="DIR", help="as for thor2 render")
     parser.add_argument("--scenes", type=Path, metavar="DIR", help="dataset in the layout of UW-IS Occluded")
-    parser.add_argument("--scene-names", type=Path, metavar="FILE", help="its objects: table of name -> mesh")
+    parser.add_argument("--scene-names", type=Path, metavar="FILE", help="objects of --scenes: table of name -> mesh")
     parser.add_argument("--frames", type=Path, nargs="+", default=[], metavar="DIR", help="folders of labelled frames")
-    parser.add_argument("--frame-names", type=Path, metavar="FILE", help="their objects: table of name -> mesh")
+    parser.add_argument("--frame-names", type=Path, metavar="FILE", help="objects of --frames: table of name -> mesh")
     parser.add_argument("--real", type=Path, nargs="+", default=[], metavar="DIR", help="labelled frames to train on")
     parser.add_argument("--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--baselines", default=BASELINES, help="comma-separated (%(default)s)")
     parser.add_argument("--weights", type=Path, metavar="DIR", help="pretrained weights, as for thor2 train")
     parser.add_argument("--folds", type=int, default=5, help="as for thor2 train (%(default)s)")
-    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='of all renderings ("%(default)s")')
-    parser.add_argument("--train", default="", metavar="OPTIONS", help="further options of all trainings")
-    parser.add_argument("--note", default="", metavar="TEXT", help="about the machine, for the report")
+    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='for all renderings ("%(default)s")')
+    parser.add_argument("--train", default="", metavar="OPTIONS", help="additional options for all trainings")
+    parser.add_argument("--note", default="", metavar="TEXT", help="note on the machine, for the report")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes")
     options = parser.parse_args(arguments)
     if not options.scenes and not options.frames:
@@ -207,13 +207,13 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train and evaluate what is missing and write the report."""
+    """Train and evaluate missing models and write the report."""
     options = parse(arguments)
     try:
         comparison = Comparison(options)
         results: dict[str, Any] = {}
         for name in comparison.datasets:
-            comparison.train(name)  # all before the first evaluation: a process counts its parent's memory, too
+            comparison.train(name)  # before any evaluation, since a process counts its parent's memory, too
         for name in comparison.datasets:
             results[name] = comparison.evaluate(name)
         print(comparison.write(results))

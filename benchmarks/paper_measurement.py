@@ -1,4 +1,4 @@
-"""Measurements of `benchmarks.paper`: accuracy by column, paired comparisons of the claims, recognition time."""
+"""Measurements of `benchmarks.paper`: accuracy by column, paired comparisons for the claims, recognition time."""
 
 import dataclasses
 import time
@@ -45,7 +45,7 @@ CLAIMS = (
     Claim("THOR2 above CE + TOPS + TOPS2", "CE+TOPS+TOPS2"),
     *(Claim(f"THOR2 above {TITLES[name]}", TITLES[name]) for name in (*NETWORKS, "templates", "forest", "pointnet")),
 )
-"""Claims of the paper, and the comparisons with baselines that the paper does not have: templates, forest, PointNet."""
+"""Claims of the paper, and comparisons with baselines that are not in the paper: templates, forest, PointNet."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Dataset:
 
 
 def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict[str, Any]:
-    """Evaluate runs, or resume that, and return accuracies, published tables and claims.
+    """Evaluate runs and return accuracies, published tables and claims; an interrupted evaluation resumes.
 
     Args:
         dataset: the frames.
         runs: the folds.
-        directory: where the evaluations are written, one directory for each part and choice of runs and baselines.
+        directory: directory of the evaluations, each in a directory for its part and its choice of runs and baselines.
     """
     models = json_digest([run.digest for run in runs])[:8]
     frames: list[FrameAnswers] = []
@@ -93,7 +93,7 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
 
 
 def _accuracy_by_part(dataset: Dataset, runs: Sequence[Run], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
-    """Return part -> column -> accuracy, mean over the folds, by the default rule."""
+    """Return part -> column -> accuracy with the default rule, as the mean over the folds."""
     values: dict[str, Any] = {}
     for name in dataset.parts if len(dataset.parts) > 1 else ():
         own = [frame for frame in frames if frame.frame.startswith(f"{name}/")]
@@ -138,9 +138,9 @@ def claims(runs: Sequence[Run], frames: Sequence[FrameAnswers], rule: Rule) -> l
 
 
 def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
-    """Return method -> seconds for an instance, from the frame in memory to the probabilities, after compilation.
+    """Return method -> seconds per instance, from the frame in memory to the probabilities, after compilation.
 
-    Methods on clouds segment and describe the frame, image networks crop it.
+    Methods on clouds segment and describe the frame; image networks crop it.
     """
     part = next(iter(dataset.parts.values()))
     frames = [part[number].frame for number in range(min(TIMED_FRAMES, len(part)))]

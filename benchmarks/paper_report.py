@@ -75,8 +75,8 @@ def _dataset_text(name: str, results: Mapping[str, Any], folds: int) -> str:
     ]
     if results["scratch"]:
         parts[-1] += (
-            f" {', '.join(results['scratch'])}: trained from scratch, without pretrained weights. Their accuracy is no "
-            "claim about the published networks."
+            f" {', '.join(results['scratch'])}: trained from scratch, without pretrained weights. Their accuracy does "
+            "not represent the published networks."
         )
     parts.append("\n### Claims\n")
     for rule, claims in results["claims"].items():
@@ -118,12 +118,12 @@ def report_text(report: Mapping[str, Any]) -> str:
         f"Measured on {conditions['date']} on {conditions['processors']} processors. {conditions['note']} "
         f"Every method was trained on the same views ({trained}) and evaluated on the same instances. "
         f"Views: `thor2 render {conditions['render']}`. Training: `thor2 train {conditions['train']}`.{real} "
-        "A difference is that of the accuracies over all instances. Its interval is a 95 % bootstrap interval that "
+        "Differences are between the accuracies over all instances. Their interval is a 95 % bootstrap interval that "
         "resamples placements (an object that does not move is one placement), and McNemar's exact test counts "
         "placements. A claim "
-        "holds where the whole interval is above 0 and does not hold where it is below, if p is below 0.05; otherwise "
-        "this data does not decide. Times contain reading the views and compiling; a method on clouds also describes "
-        "the frame, a network crops it.\n\n"
+        "holds if the whole interval is above 0 and p is below 0.05; it does not hold if the whole interval is below 0 "
+        "and p is below 0.05; otherwise it is undecided. Times include reading the views and compiling; methods on "
+        "clouds also describe the frame, and networks crop it.\n\n"
     )
     return lead + "\n".join(_dataset_text(name, results, folds) for name, results in report["datasets"].items())
 

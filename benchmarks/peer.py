@@ -1,7 +1,7 @@
 """The same descriptor computed with common libraries, one cloud at a time, in float64.
 
-View normalization uses Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle. NumPy loops
-over slices and strips, persim's PersistenceImager and NumPy matrices compute the rest by the same equations.
+View normalization uses Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle. The rest is
+computed by the same equations with NumPy loops over slices and strips, persim's PersistenceImager and NumPy matrices.
 """
 
 import math
@@ -21,7 +21,7 @@ N_SLICES, N_STRIPS = 7, 31
 
 
 class Peer:
-    """Describes clouds one by one."""
+    """The peer, which describes clouds one by one."""
 
     def __init__(self) -> None:
         cv2.setNumThreads(1)

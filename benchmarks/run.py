@@ -41,7 +41,7 @@ PEER_CLOUDS, PEER_PROCESSES = 64, 2
 
 
 def peer_start() -> None:
-    """Create the peer, once for each process."""
+    """Create the peer of this process."""
     global peer
     from benchmarks.peer import Peer
 
@@ -53,7 +53,7 @@ def peer_describe(cloud: Any) -> float:
 
 
 def peer_agrees(clouds: list[Any]) -> float:
-    """Return the largest difference from the peer on the same aligned clouds, relative to the largest entry."""
+    """Return the largest difference to the peer on the same aligned clouds, relative to the largest entry."""
     from benchmarks.peer import Peer
 
     other, worst = Peer(), 0.0
@@ -67,9 +67,9 @@ def peer_agrees(clouds: list[Any]) -> float:
 
 
 def beside_peer(clouds: list[Any], rounds: int = 7) -> dict[str, Any]:
-    """Return the clouds per second of the peer in two warm processes, and the speed of the library relative to it.
+    """Return the clouds per second of the peer in two warm processes, and the library's speed relative to the peer.
 
-    The peer and the library take turns, so that other load on the machine affects both; values are medians of rounds.
+    The peer and the library take turns, so that other load on the machine affects both. Values are medians over rounds.
     """
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     few = clouds[:PEER_CLOUDS]
@@ -115,7 +115,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
 
 
 def align_share(clouds: list[Any], rounds: int = 20) -> float:
-    """Return the share of the alignment in the time of the pipeline (closed form), median of rounds."""
+    """Return the share of the alignment in the time of the pipeline (closed form), as the median over rounds."""
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     shares = []
     for _ in range(rounds):
@@ -168,7 +168,7 @@ def frame_latency(calls: int) -> dict[str, float]:
 
 
 def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
-    """Plot times against the numbers of points and of clouds, with a fitted constant plus linear model."""
+    """Plot times against the numbers of points and of clouds, with a fitted model: constant plus linear term."""
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):

@@ -1,7 +1,7 @@
 """Throughput on an accelerator, absolute and relative to its limits: `python -m benchmarks.run_gpu`.
 
-Prints a table and writes gpu.json with the name of the device. XLA's cost analysis counts the bytes and operations of
-the compiled functions; `LIMITS` holds the limits of the device.
+The command prints a table and writes gpu.json with the name of the device. XLA's cost analysis counts the bytes and
+operations of the compiled functions; `LIMITS` holds the limits of the device.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Load test of the service over loopback: `python -m benchmarks.run_service [--out FILE] [--soak N]`.
 
-Measures frames of six objects in a plain loop, with callers that wait for each answer, with requests at fixed rates
-(latency counts from the due time), and at twice the highest rate with a 99th percentile below 250 ms. Other options
-are passed to `thor2 serve`.
+Frames of six objects are recognized in a plain loop without the service, and then sent to it: by callers that wait for
+each answer, at fixed rates (latency counts from the due time), and at twice the highest rate with a 99th percentile
+below 250 ms. Other options are passed to `thor2 serve`.
 """
 
 import argparse
@@ -109,7 +109,7 @@ class Server:
             return answer.read().decode()
 
     def memory(self) -> float:
-        """Return the memory of the server and its subprocesses in MiB, with shared pages counted once (PSS)."""
+        """Return the memory of the server and its subprocesses in MiB, counting shared pages once (PSS)."""
         total, waiting = 0, [self.process.pid]
         while waiting:
             pid = waiting.pop()

@@ -1,9 +1,9 @@
-"""Segmentation beside true masks: `python -m benchmarks.segmentation GROUP... [--model RUN]`.
+"""Comparison of segmentation with true masks: `python -m benchmarks.segmentation GROUP... [--model RUN]`.
 
-A GROUP is a pattern of frame directories, such as "frames/kitchen/*". An instance is found if a piece overlaps it with
-an intersection over union above .75. It is over-segmented if two pieces that lie in it cover a tenth of it each, and
-under-segmented if a piece covers half of it and a quarter of another one. With --model, instances are recognized with
-the true and with the segmented masks.
+A GROUP is a pattern of frame directories, such as "frames/kitchen/*". An instance is found if its intersection over
+union with a piece is above 0.75. It is over-segmented if two pieces lie in it and cover a tenth of it each. It is
+under-segmented if a piece covers half of it and a quarter of another instance. With --model, instances are recognized
+with the true and with the segmented masks.
 """
 
 import argparse
@@ -23,16 +23,16 @@ from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame
 
 FOUND = 0.75
-"""Least intersection over union with an instance that is found."""
+"""Smallest intersection over union at which an instance is found."""
 
 THIN = ("pen_", "marker", "scissors", "fork", "knife", "spoon")
-"""Prefixes of names of objects of at most 2 cm."""
+"""Name prefixes of thin objects, at most 2 cm thick."""
 
 REPEATS = 5
 
 
 def overlaps(labels: NDArray[Any], truth: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the pixels that each true instance (row) and each piece (column) have in common."""
+    """Return the number of pixels that each true instance (row) shares with each piece (column)."""
     n = int(labels.max()) + 1
     pairs = np.bincount((truth.astype(np.int64) * n + labels).ravel(), minlength=(int(truth.max()) + 1) * n)
     return pairs.reshape(-1, n)
@@ -65,7 +65,7 @@ def compare(labels: NDArray[Any], item: LabelledFrame) -> tuple[list[dict[str, A
 
 
 def timed(segmenter: Any, item: LabelledFrame) -> tuple[NDArray[Any], float, float]:
-    """Return the labels of a frame and the least elapsed and processor time of several runs, seconds."""
+    """Return the labels of a frame, and the shortest elapsed and processor time of several runs, in seconds."""
     elapsed, processor = [], []
     for _ in range(REPEATS):
         start, start_processor = time.perf_counter(), time.process_time()
@@ -76,7 +76,7 @@ def timed(segmenter: Any, item: LabelledFrame) -> tuple[NDArray[Any], float, flo
 
 
 def names_of(recognizer: Recognizer, item: LabelledFrame, labels: NDArray[Any]) -> dict[int, str | None]:
-    """Return label -> name."""
+    """Return label -> recognized name."""
     from dataclasses import replace
 
     return {r.label: r.name for r in recognizer.recognize(replace(item.frame, labels=labels))}

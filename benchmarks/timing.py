@@ -1,4 +1,4 @@
-"""Timing of functions on a device: the first call, and the fastest and the median of later calls."""
+"""Timing of functions on a device: time of the first call, and best and median time of later calls."""
 
 import dataclasses
 import statistics

@@ -1,21 +1,21 @@
-"""Gain of several frames: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
+"""Gain from several frames: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
 
-For each run, every frame from the fifth of a video on is answered alone and by a tracker over it and the four frames
-before it. The file has the steadiness and the accuracy over placements of both, and the placements whose accuracy is
-lower with tracks. Answers are the most probable names, also below the threshold of unknown objects.
+For each run, every frame of a video from the fifth on is recognized alone, and by a tracker over this frame and the
+four frames before it. The file has the steadiness and the accuracy over placements of both, and the placements with a
+lower accuracy in tracks. Answers are the most probable names, even below the threshold for unknown objects.
 
-With --meshes DIR, scenes of these objects are rendered from six cameras as well, all around the table or, with --step,
-so many degrees apart, as a robot may reach them. For objects that are in the first view, and for those that are highly
-occluded there, the file has the accuracy by the number of views when
+With --meshes DIR, scenes of these objects are also rendered from six cameras all around the table or, with --step, at
+this angle from each other, as a robot may reach them. For the objects in the first view, and separately for objects
+that are highly occluded there, the file has the accuracy by the number of views for these methods:
 
-fused      the answers for the views are fused (`thor2_jax.tracking.tracker`), the views in the order around the table
-merged     fused, and each view is also described as one cloud with those before it (`merge_views`)
-random     fused, the further views in random order
-next_view  fused, each further view chosen by `thor2_jax.tracking.viewpoints.next_view`
+fused      the answers for the views are fused (`thor2_jax.tracking.tracker`), in the order around the table
+merged     fused; in addition, each view is described as one cloud with the views before it (`merge_views`)
+random     fused, with the other views in random order
+next_view  fused, with each following view chosen by `thor2_jax.tracking.viewpoints.next_view`
 
-and the number of views that each needs for an accuracy of .95. Objects are identified by their labels here.
+It also has the number of views that each method needs for an accuracy of 0.95. Objects are identified by their labels.
 
-The command resumes: finished runs and scenes are kept in the file.
+An interrupted command resumes: finished runs and scenes are kept in the file.
 """
 
 import argparse
@@ -48,13 +48,13 @@ from training.storage.jobs import check_same_job
 from training.view_table import view_table
 
 WINDOW = 5
-"""Frames of a track."""
+"""Number of frames of a track."""
 
 VIEWS = 6
-"""Cameras around a scene."""
+"""Number of cameras around a scene."""
 
 OBJECTS = 6
-"""Objects of a scene."""
+"""Number of objects in a scene."""
 
 CAMERA = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
 
@@ -91,7 +91,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
     """Return the results of one run on videos, as in the module's docstring; a placement is an object of a video.
 
     Args:
-        recognizer: its `unknown_below` is 0, so that every answer has a name.
+        recognizer: a recognizer with `unknown_below` 0, so that every answer has a name.
         frames: frames of one or more videos, in order.
     """
     cached = _Cached(recognizer)
@@ -129,7 +129,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
 
 
 def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstance]) -> list[dict[str, Any]]:
-    """Return classifier -> class probabilities [C] of each instance."""
+    """Return classifier -> class probabilities [C] for each instance."""
     computed: list[dict[str, Any]] = []
     for start in range(0, len(instances), 16):
         rows = instances[start : start + 16]
@@ -140,7 +140,7 @@ def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstanc
 
 
 def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probabilities]]) -> NDArray[np.floating]:
-    """Return the fused class probabilities [C] of views of one object."""
+    """Fuse the class probabilities of several views of one object; return [C]."""
     evidence = FusedEvidence()
     for instance, probabilities in views:
         evidence.add(view_weight(instance), probabilities, None)
@@ -150,7 +150,7 @@ def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probab
 def measure_scene(
     recognizer: Recognizer, views: Sequence[tuple[Scene, NDArray[np.float64]]], table: ViewTable, seed: int
 ) -> list[dict[str, Any]]:
-    """Return, for each object of the first view, its occlusion there and method -> correct by number of views."""
+    """Return the occlusion of each object in the first view, and method -> correctness by number of views."""
     classes, sigma_s = recognizer.run.classes, recognizer.run.config.sigma_s
     seen: dict[tuple[int, int], PreparedInstance] = {}
     for number, (scene, _) in enumerate(views):
@@ -191,7 +191,7 @@ def measure_scene(
         clouds = [merge_views(posed[:k], sigma_s) for k in range(2, len(posed) + 1)]
         of_views = [(seen[label, number], probabilities[label, number]) for number in orders["fused"]]
         of_clouds = list(zip(clouds, probabilities_of(recognizer, clouds), strict=True))
-        # In the order of a tracker: a view alone, then the cloud of it and those before it.
+        # The order is as in a tracker: a view alone, then the cloud merged from it and the views before it.
         both = [of_views[0], *(each for pair in zip(of_views[1:], of_clouds, strict=True) for each in pair)]
         correct["merged"] = [
             classes[int(_fuse(recognizer, both[: 2 * k - 1]).argmax())] == name for k in range(1, len(posed) + 1)
@@ -201,7 +201,7 @@ def measure_scene(
 
 
 def summarize_scenes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return method -> accuracy by number of views, and views needed; an object keeps the answer of its last view."""
+    """Return method -> accuracy by number of views, and views needed; objects keep the answer of their last view."""
     summary: dict[str, Any] = {}
     for part, chosen in (("all", rows), ("high", [row for row in rows if row["occlusion"] == "high"])):
         table: dict[str, Any] = {"objects": len(chosen)}
@@ -224,10 +224,10 @@ def read_meshes(directory: Path, names: Path | None, classes: Sequence[str]) -> 
 
 
 def main() -> None:
-    """Measure the runs and scenes that are not in the file yet, and print the summary."""
+    """Measure the runs and scenes that are missing in the file, and print the summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, nargs="+", required=True, metavar="RUN")
-    parser.add_argument("--frames", type=Path, nargs="*", default=[], metavar="DIR", help="videos, one for each folder")
+    parser.add_argument("--frames", type=Path, nargs="*", default=[], metavar="DIR", help="folders of one video each")
     parser.add_argument("--meshes", type=Path, metavar="DIR", help="meshes of the classes, for rendered scenes")
     parser.add_argument("--names", type=Path, metavar="FILE", help="as for thor2 render")
     parser.add_argument("--scenes", type=int, default=40, help="number of scenes, recognized by the first run")

@@ -1,4 +1,4 @@
-"""Run directories that are adapted to a camera: a copy whose record has the camera's colour transform."""
+"""Adaptation of a run directory to a camera: a copy whose record contains the camera's colour transform."""
 
 import dataclasses
 import errno
@@ -24,16 +24,17 @@ UNFINISHED = ("checkpoints", "views", ".*")
 
 
 def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
-    """Estimate a camera's colour transform and write a run directory that corrects colours by it.
+    """Estimate a camera's colour transform and write a run directory that corrects colours with it.
 
     Args:
-        model: run directory; a colour transform that it has is replaced.
+        model: run directory; its colour transform, if it has one, is replaced in the copy.
         sources: frames of the camera, with instance labels.
         out: new run directory.
         report: see `Recognizer.adapt`.
 
     Raises:
-        InputError: the run or a frame cannot be read, `out` is not empty, or as `Recognizer.adapt`. Nothing is written.
+        InputError: the run or a frame cannot be read, `out` is not empty, or `Recognizer.adapt` raises it. Nothing is
+            written.
         OSError: a file cannot be read or written. Nothing is written.
     """
     check_output_directory(out)
@@ -43,7 +44,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
         for source in sources:
             with with_context(source.name):
                 frame = source.read()
-                frame.label_image  # noqa: B018  a frame without labels is named in the error message
+                frame.label_image  # noqa: B018  raises here, so that the error message names a frame without labels
             yield frame
 
     adaptation = recognizer.adapt(frames(), report)
@@ -54,7 +55,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
         except shutil.Error as error:
             raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
         finally:
-            for directory, _, _ in os.walk(run):  # those of a read-only run could be neither moved nor removed
+            for directory, _, _ in os.walk(run):  # read-only directories could be neither moved nor removed
                 os.chmod(directory, os.stat(directory).st_mode | stat.S_IRWXU)
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
@@ -66,7 +67,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
 
 
 def _copy(source: str, target: str) -> None:
-    """Copy a file; one that cannot be read, such as a device, is an InputError."""
+    """Copy a file; raise InputError if it cannot be read, such as a device."""
     try:
         content = read_file(source)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The demo: built-in objects, synthetic views, the paper's classifiers, cluttered scenes and a report of one page.
+"""The demo: built-in objects, synthetic views, the paper's classifiers, cluttered scenes and a one-page report.
 
 summary = run_demo("demo-report", seed=0)
 summary.accuracy["all"]            # accuracy of CE, TOPS, TOPS2 and THOR2, in the order of summary.names
@@ -51,7 +51,7 @@ PROTOCOL = dataclasses.replace(
 """The default protocol with fewer views, copies and epochs: the demo fits the paper's classifiers in minutes."""
 
 N_SCENES = 40
-"""Each scene is seen by one of the ten cameras of `CHOOSE`, in turn."""
+"""Number of scenes. The ten cameras of `CHOOSE` take turns, one camera per scene."""
 
 COMPOSE, RECOGNIZE = "compose scenes", "recognize scenes"
 SCENE_STAGES = {COMPOSE: 0.2, RECOGNIZE: 0.4}
@@ -66,7 +66,7 @@ class DemoSummary:
     """Measurements of the demo.
 
     Attributes:
-        names: recognizers that are compared.
+        names: names of the compared recognizers.
         accuracy: subset of the instances ("all", "occlusion none", ...) -> one accuracy for each of `names`.
         instances: subset of the instances -> number of instances.
         seconds: wall time of the demo.
@@ -88,7 +88,7 @@ def run_demo(
     Writes `run/` (the run directory), `pictures/`, `demo.json` and, last, `report.html` to `out`.
 
     Args:
-        out: output directory: new, or of an interrupted demo.
+        out: output directory: new, or from an interrupted demo.
         seed: seed for the scenes and the training.
         progress: called with (stage, done, total, note).
         workers: rendering processes; they do not affect the result.
@@ -100,7 +100,7 @@ def run_demo(
     start = time.perf_counter()
     out = Path(out)
     pictures = out / "pictures"
-    # Without a run, pictures are not those of a demo.
+    # Pictures without a run were not written by a demo.
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
     job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
@@ -137,7 +137,7 @@ def run_demo(
 
 
 def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Progress) -> list[Scene]:
-    # Each scene has its own random stream, so that a change of one scene does not affect the following ones.
+    # Each scene has its own random stream, so that a change to one scene does not affect the later ones.
     seeds = np.random.SeedSequence(seed).spawn(N_SCENES)
     scenes = []
     for number, scene_seed in enumerate(seeds, 1):
@@ -149,7 +149,7 @@ def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Pr
 
 
 def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> list[FrameAnswers]:
-    """Return the answers for all scenes, the instances of a scene grouped by their degree of occlusion."""
+    """Return the answers for all scenes, with the instances of each scene grouped by their degree of occlusion."""
     frames = (LabelledFrame(f"scene {number}", scene.frame, scene.truth, {}) for number, scene in enumerate(scenes))
     grouped = []
     for number, (_, answers) in enumerate(answer_frames([run], frames)):

@@ -1,4 +1,4 @@
-"""Enrolling objects in the gallery of a run directory.
+"""Enroll objects in the gallery of a run directory.
 
 from training.views.mesh_views import mesh_views
 enroll_objects(Path("run"), (["mug"], iter([mesh_views(Path("mug.glb"))])))
@@ -35,26 +35,26 @@ def enroll_objects(
     gallery: Path | None = None,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> tuple[dict[str, int], ObjectGallery, Sequence[str]]:
-    """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
+    """Enroll objects in the gallery of a run directory, all or none; a missing run directory is created.
 
     Args:
         model: the run directory.
-        source: labelled frames, or the objects of meshes and an iterator of their views, in the same order.
-        name: the only object that is enrolled; its name is checked before anything is read. None enrolls all.
+        source: labelled frames, or names of objects and an iterator over their rendered views, in the same order.
+        name: the only object to enroll; its name is checked before anything is read. None enrolls all objects.
         label_name: name of this object in the frames; by default `name`.
         instance: number of this object in the frames, see `read_instances`.
-        extend: add the views to those of objects that exist.
-        replace: discard the views of objects that exist.
-        gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
+        extend: add the views to existing objects.
+        replace: replace the views of existing objects.
+        gallery: directory of the gallery, for an existing run directory; by default `gallery` in the run directory.
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery, the gallery, and why instances of the frames were not used.
+        Object -> number of its views in the gallery; the gallery; and for each unused instance the reason.
 
     Raises:
         InputError: the run directory cannot be read, a view cannot be used, the frames have no usable view (as
             `read_instances`), or a name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
-        OSError: a file cannot be written; the gallery is as before, and no run directory is created.
+        OSError: a file cannot be written; the gallery is unchanged, and no run directory is created.
     """
     model = model.resolve()
     is_new = _is_empty(model)

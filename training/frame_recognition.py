@@ -1,4 +1,4 @@
-"""Recognition of several frames or of a recording, one frame after the other.
+"""Recognition of several frames or of a recording, frame by frame.
 
 for answer in recognize_frames(recognizer.recognize, find_frames([Path("frames")])):
     print(answer.name, answer.error or answer.recognitions)
@@ -34,15 +34,15 @@ __all__ = [
 
 @dataclasses.dataclass(frozen=True)
 class FrameAnswer:
-    """The answers for a frame, or why there are none.
+    """The answers for a frame, or the error that prevented them.
 
     Attributes:
         name: name of the frame.
         frame: the frame; None if it could not be read.
         recognitions: one answer for each instance.
-        seconds: time for recognition, without reading the files.
+        seconds: time for recognition, without the time to read the files.
         error: why the frame could not be recognized; None if it was.
-        recorded: the frame's place in its recording; None if it is of files.
+        recorded: the frame's place in its recording; None if the frame is read from files.
     """
 
     name: str
@@ -54,11 +54,11 @@ class FrameAnswer:
 
     @functools.cached_property
     def detections(self) -> list[Detection]:
-        """The answers with the places of the objects; none without a frame."""
+        """The answers with the positions of the objects; empty without a frame."""
         return [] if self.frame is None else detections_of(self.frame, self.recognitions)
 
     def as_json(self) -> dict[str, Any]:
-        """Return {"frame", "instances"}, or {"frame", "error"}; in recordings also "depth_gap", and detections."""
+        """Return {"frame", "instances"} or {"frame", "error"}; for recordings with "depth_gap" and detections."""
         line: dict[str, Any] = {"frame": self.name}
         if self.recorded is not None:
             line["depth_gap"] = self.recorded.gap / 1e9
@@ -70,7 +70,7 @@ class FrameAnswer:
 
 
 def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
-    """Read a frame; raises InputError, also for a file that cannot be opened."""
+    """Read a frame; raise InputError if it is invalid or a file cannot be opened."""
     try:
         return source.read()
     except OSError as error:
@@ -80,7 +80,7 @@ def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
 def recognize_frames(
     recognize: Callable[[RGBDFrame], Sequence[Recognition]], sources: Iterable[FrameSource | RecordedFrame]
 ) -> Iterator[FrameAnswer]:
-    """Read and recognize frames; one that fails has an `error` and does not stop the others.
+    """Read and recognize frames; a frame that fails has an `error` and does not stop the others.
 
     Args:
         recognize: `Recognizer.recognize`, or `Tracker.update`.
@@ -99,7 +99,7 @@ def recognize_frames(
 
 
 def segmentation_failure(answer: FrameAnswer) -> str:
-    """Return why nothing was found in a segmented frame if it has no usable depth; otherwise an empty text."""
+    """Return why no instance was found in a segmented frame if its depth is unusable; otherwise an empty string."""
     if answer.frame is None or answer.recognitions:
         return ""
     depth = answer.frame.depth_m
@@ -111,22 +111,22 @@ def segmentation_failure(answer: FrameAnswer) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class RecognizerArguments:
-    """The arguments of `Recognizer.load`, from which each worker process loads the recognizer."""
+    """The arguments of `Recognizer.load`, with which each worker process loads its recognizer."""
 
     model: Path
     unknown_below: float | None = None
     answer_by: str | None = None
 
     def load(self) -> Recognizer:
-        """Load a recognizer of single frames; raises as `Recognizer.load`."""
+        """Load a recognizer for single frames; raise errors as `Recognizer.load`."""
         return Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by, chunk=BATCH_BUCKETS[-1])
 
     def segment(self, frame: RGBDFrame) -> NDArray[Any]:
-        """Segment a frame by `Recognizer.segment`, in a worker process, which loads the recognizer once."""
+        """Segment a frame with `Recognizer.segment` in a worker process, which loads the recognizer only once."""
         return _loaded(self).segment(frame)
 
     def answer(self, source: FrameSource) -> FrameAnswer:
-        """Return the answer of `recognize_frames` for a frame, in a worker process as `segment`."""
+        """Return the answer of `recognize_frames` for a frame, in a worker process like `segment`."""
         return next(recognize_frames(_loaded(self).recognize, [source]))
 
 
@@ -138,8 +138,8 @@ def track_frames(
 ) -> Iterator[FrameAnswer]:
     """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
 
-    The recognitions are `TrackedRecognition`s. Every instance of a track has the name and the confidence that the track
-    has at its end.
+    The recognitions are `TrackedRecognition`s. All instances of a track have the name and confidence of the track after
+    the last frame.
 
     Args:
         recognizer: the recognizer.
@@ -147,8 +147,8 @@ def track_frames(
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
 
     Raises:
-        InputError: a frame cannot be read, has another size than the first one, or a pose is not a rigid motion. The
-            message names the frame.
+        InputError: a frame cannot be read or has another size than the first frame, or a pose is not a rigid motion.
+            The message names the frame.
         OSError: a file cannot be opened.
     """
     tracker = recognizer.track()
@@ -162,5 +162,5 @@ def track_frames(
         last.update({each.track: each for each in recognitions})
     for source, (recognitions, seconds) in zip(sources, answered, strict=True):
         final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
-        # The frame is read again, since a long sequence of images does not fit into memory.
+        # The frame is read a second time, since a long sequence of images does not fit into memory.
         yield FrameAnswer(source.name, source.read(), final, seconds)

@@ -1,4 +1,4 @@
-"""Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
+"""Training protocols, from camera steps to learning rates: the paper's, a more accurate default and a quick one."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -32,35 +32,35 @@ DESCRIBE = "describe"
 """Name of the first stage."""
 
 CALIBRATE = "fit the confidence"
-"""Name of the last stage, with an embedding."""
+"""Name of the last stage of a training with an embedding."""
 
 RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS = "render distractors", "describe for the embedding", "fit networks"
 """Names of the stages of the embedding."""
 
 DESCRIBE_SHARE = 0.3
-"""Time of describing the views, divided by that of rendering them; for the time left."""
+"""Time to describe the views, divided by the time to render them; used to estimate the remaining time."""
 
 CALIBRATE_SHARE = 0.1
-"""The same of fitting the confidence."""
+"""Time to fit the confidence, divided by the time to render the views."""
 
 EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
-"""The same of an epoch of a classifier, or of one network of the embedding."""
+"""Time of an epoch of a classifier, or of one network of the embedding, divided by the time to render the views."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """A training protocol: everything that determines a trained run, beside the objects.
+    """A training protocol: everything that determines a trained run, except the objects.
 
     Attributes:
-        classifiers: descriptors that the classifiers read, any of "ce", "tops", "tops2"; with distractors, there may be
-            none.
-        fit: fit options of every classifier; the seed is also that of the embedding.
-        config: descriptor, with the number of looks in recognition; by default the paper's, in closed form.
-        folds: with more than one, one model per fold, with the fold as its held-out set.
+        classifiers: descriptors that the classifiers read, any of "ce", "tops", "tops2"; may be empty if there are
+            distractors.
+        fit: fit options of every classifier; the seed is also used for the embedding.
+        config: settings of the descriptor and number of looks in recognition; by default the paper's, in closed form.
+        folds: number of folds; if more than one, one model is trained per fold, with the fold as its held-out set.
         mirrors: mirrors in which the classifiers use each view.
-        orientation_copies: further samples of each view for the classifiers, in random orientations.
-        distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
-            some views are held out for it. None fits none.
+        orientation_copies: additional samples of each view in random orientations, for the classifiers.
+        distractors: objects on which an embedding is fitted together with the views, before the confidence is
+            calibrated; without folds, some views are held out for the calibration. None fits no embedding.
         azimuth_step: degrees between cameras around the object.
         polar_step: degrees between cameras from pole to pole.
         augmentations: augmented copies of each view; None adds none.
@@ -90,12 +90,12 @@ class Protocol:
         return colornet.load_default()
 
     def render_job(self, meshes: Mapping[str, Path | TexturedMesh]) -> RenderJob:
-        """Return the job that renders the views of meshes for this protocol; its seed is that of the fit."""
+        """Return the job that renders the views of meshes for this protocol, with the seed of the fit."""
         return RenderJob(meshes, self.azimuth_step, self.polar_step, self.augmentations, self.fit.seed)
 
     @property
     def stages(self) -> dict[str, float]:
-        """The stages of the training, in their order, with their times, divided by that of rendering the views."""
+        """The stages of the training in order, and the time of each, divided by the time to render the views."""
         of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.fit.epochs for name in self.classifiers}
         if self.distractors is not None:
             fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
@@ -107,11 +107,14 @@ class Protocol:
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
 
     def of_fold(self, stage: str, fold: int) -> str:
-        """Return the name of a stage of a fold."""
+        """Return the name of a stage in this fold."""
         return stage if self.folds == 1 else f"fold {fold}: {stage}"
 
     def record(self, digest: str) -> dict[str, Any]:
-        """Return everything that determines the run as JSON holds it; `digest` is that of the labelled views."""
+        """Return everything that determines the run, in the form in which JSON stores it.
+
+        `digest` is the digest of the labelled views.
+        """
         added = {} if self.distractors is None else {"distractors": self.distractors.record}
         return added | {
             "descriptor_version": DESCRIPTOR_VERSION,
@@ -127,10 +130,10 @@ class Protocol:
         }
 
     def with_distractors(self, procedural: int | None, meshes: Mapping[str, Path], workers: int) -> "Protocol":
-        """Return the protocol with an embedding fitted on these distractors; without any, with classifiers alone.
+        """Return the protocol with an embedding fitted on these distractors; if there are none, with classifiers only.
 
         Args:
-            procedural: number of procedural objects; None keeps the protocol's own number, 0 without an embedding.
+            procedural: number of procedural objects; None keeps the protocol's number (0 if it has no embedding).
             meshes: name -> file of other objects.
             workers: rendering processes.
 
@@ -146,10 +149,9 @@ class Protocol:
         return dataclasses.replace(self, distractors=others)
 
     def replace(self, **values: Any) -> "Protocol":
-        """Return the protocol with the given values of its fields or of those of `fit`; None keeps the protocol's own.
+        """Return the protocol with new values of its own fields or the fields of `fit`; None keeps a value.
 
-        The epochs are also those of the embedding. Without copies in other orientations, views are also used in a
-        mirror.
+        `epochs` also sets the epochs of the embedding. With `orientation_copies=0`, each view is also used mirrored.
 
         Raises:
             InputError: A value of the fit is invalid.
@@ -176,10 +178,10 @@ DEFAULT = Protocol(
     polar_step=15.0,
     augmentations=AUGMENTATIONS,
 )
-"""Fewer views than the paper's, each with five augmented copies; an embedding, and none of the paper's classifiers."""
+"""The default: fewer views than the paper, each with five augmented copies, and an embedding instead of classifiers."""
 
 QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
-"""The default with fewer distractors and networks: half of its time."""
+"""The default with fewer distractors and networks, which takes half of the time."""
 
 PAPER = Protocol(
     classifiers=FEATURES,

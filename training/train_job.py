@@ -1,4 +1,4 @@
-"""The job of `thor2 train`: render or open the views, join labelled instances, train the runs and their baselines."""
+"""The job of `thor2 train`: render or open the views, add labelled instances, train the runs and their baselines."""
 
 import contextlib
 import dataclasses
@@ -34,19 +34,19 @@ RENDER, RENDER_CROPS = "render", "render crops"
 
 @dataclasses.dataclass(frozen=True)
 class TrainJob:
-    """A training and its views: one of `meshes` and `dataset` is given, `frames`, or both.
+    """A training and its views: from `meshes` or `dataset`, from `frames`, or from both.
 
     Attributes:
-        out: run directory, or with `sequences` the directory of the run directories.
+        out: run directory; with `sequences`, the directory that contains the run directories.
         protocol: the settings of the runs and of their views.
-        meshes: directory of meshes, or name -> mesh in metres, for which `names` and `mesh_scale` are not used; their
-            views are rendered for this run and removed afterwards.
+        meshes: directory of meshes, or name -> mesh in metres (then `names` and `mesh_scale` are not used). Their views
+            are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
-        frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
+        frames: folders of labelled frames, see `FrameFolder`; their instances are used as views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         baselines: any of `BASELINES`.
         weights: directory of pretrained weights for the image networks; None trains them from scratch.
-        leave_out: objects to train without.
+        leave_out: objects to leave out of the training.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
         workers: rendering processes.
         mesh_scale: factor from the unit of the meshes to metres.
@@ -81,7 +81,7 @@ class TrainJob:
 def run_train_job(
     job: TrainJob, progress: Progress, later: Mapping[str, float] = MappingProxyType({})
 ) -> dict[Path, list[TrainedRun]]:
-    """Train everything that the job asks for and that is not finished yet.
+    """Train all runs and baselines of the job that are not finished yet.
 
     Args:
         job: the job.
@@ -89,10 +89,10 @@ def run_train_job(
         later: stages of the caller after the training, with their times, which are counted with those of the job.
 
     Returns:
-        Run directory -> the runs of its folds that this call has trained; none if they were finished.
+        Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
 
     Raises:
-        InputError: An option is invalid, or a directory holds the results of another job.
+        InputError: An option is invalid, or a directory holds results of another job.
         OSError: A file cannot be written.
     """
     baselines = check_baselines(job.baselines)
@@ -137,7 +137,7 @@ def run_train_job(
 
 
 def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
-    """Raise InputError if a batch is larger than all samples; the defaults are reduced to their number instead."""
+    """Raise InputError if a batch is larger than all samples; default batch sizes are reduced later instead."""
     size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
     n_samples = n_views * (len(protocol.mirrors) + protocol.orientation_copies)
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
@@ -147,9 +147,9 @@ def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
 
 
 def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
-    """Raise InputError if a finished run is of another job; without baselines, remove what a killed process left.
+    """Raise InputError if a finished run is of another job; without baselines, remove leftovers of a killed process.
 
-    Views of this job are removed, other ones stay: another training may read them.
+    Only views of this job are removed, since another training may read other views.
     """
     record = finished_record(job.out)
     dataset = job.protocol.render_job(_find_meshes(job)).record()
@@ -188,7 +188,7 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
     """Return the instances of the labelled frames; None if the job has no frames.
 
     Raises:
-        InputError: a frame cannot be read, or has no usable instance of an object; or the job cannot use frames.
+        InputError: a frame cannot be read or has no usable instance of an object, or the job cannot use frames.
     """
     if not job.frames:
         return None
@@ -203,7 +203,7 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
 
 
 def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
-    """Raise InputError if the classes cannot be trained, before views are rendered.
+    """Raise InputError before views are rendered if the classes cannot be trained.
 
     Args:
         job: the job.

@@ -1,14 +1,14 @@
-"""Train a run directory: an embedding that recognizes the classes, the paper's classifiers, or both; for each fold.
+"""Train the model of a run directory: an embedding that recognizes the classes, the paper's classifiers, or both.
 
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
-RUN/embedding.safetensors             with distractors: the embedding, whose networks are a classifier, too
+RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
 RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only
 
-An interrupted training resumes when it is called again. run.json is written last and makes RUN a run directory.
+An interrupted training resumes at the next call. run.json is written last: without it, RUN is not a run directory.
 """
 
 import contextlib
@@ -64,12 +64,12 @@ VIEWS = "views"
 JOB = f"{CHECKPOINTS}/{BEGUN}"
 METRICS = "metrics.jsonl"
 HELD_OUT = 12
-"""One view of so many is held out to calibrate the confidence of a run without folds."""
+"""In a run without folds, one in this many views is held out to calibrate the confidence."""
 
 CURVES = "curves.png"
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
-"""Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
+"""Metrics of an epoch that the record stores: only those that a repeated training reproduces."""
 
 
 def check_out(out: str | Path) -> None:
@@ -79,16 +79,16 @@ def check_out(out: str | Path) -> None:
 
 
 def is_finished(out: Path) -> bool:
-    """Return whether a directory holds a trained run, or all folds of one."""
+    """Return whether a directory holds a trained run or all of its folds."""
     trained = any((directory / RUN_FILE).is_file() for directory in (out, *out.glob("fold-*")))
     return trained and not (out / JOB).exists()
 
 
 def check_trained(digest: str, out: Path, settings: Protocol) -> None:
-    """Raise if a finished run differs from what `train_run` trains with these settings on views with this digest.
+    """Check that a finished run was trained with these settings on views with this digest.
 
     Raises:
-        InputError: The run was trained with another value, which is named, or cannot be read.
+        InputError: The run cannot be read, or was trained with another value; the message names it.
     """
     requested, record = settings.record(digest), finished_record(out)
     stored = {"orientation_copies": 0, **record, "dataset": record["dataset"]["digest"]}
@@ -97,7 +97,7 @@ def check_trained(digest: str, out: Path, settings: Protocol) -> None:
 
 
 def finished_record(out: Path) -> Mapping[str, Any]:
-    """Return the record of a finished run, or of the first fold of one.
+    """Return the record of a finished run, or of its first fold.
 
     Raises:
         InputError: The run cannot be read.
@@ -113,23 +113,23 @@ def train_run(
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
 
-    Trains on all devices of all processes; each process is called with the same arguments and sees the same files.
-    `training.fitting.fit` describes what is equal between two trainings with the same seed.
+    The training uses all devices of all processes. Every process must call this function with the same arguments and
+    access the same files. `training.fitting.fit` describes which results two trainings with the same seed share.
 
     Args:
         source: labelled views.
-        out: run directory: new, empty, or with the same training interrupted; with folds, they are `out`/fold-0, ...
+        out: run directory: new, empty, or of the same training, interrupted; the folds are written to `out`/fold-0, ...
         settings: everything else that determines the runs.
         progress: called with the `stages` of the settings.
 
     Returns:
-        The run of each fold, as read back.
+        The run of each fold, loaded from its directory.
 
     Raises:
-        InputError: Nothing is written if `out` holds something else, another process trains in it or it was begun with
-            other settings or views, a class has no views or fewer than folds, or the batch does not divide among the
-            devices. If a loss is not finite, the checkpoints so far stay.
-        OSError: A file cannot be written; the last complete checkpoints stay.
+        InputError: `out` holds something else, is in use by another process or was begun with other settings or views;
+            a class has no views, or fewer views than folds; or the batch size is not a multiple of the number of
+            devices. Nothing is written then. If a loss is not finite, the checkpoints written so far are kept.
+        OSError: A file cannot be written; the last complete checkpoints are kept.
     """
     out = Path(out).absolute()
     check_out(out)
@@ -156,7 +156,7 @@ def train_run(
         wait_for_all("checked")
         if first:
             if not resumed:
-                check_out(out)  # another process may have been quicker
+                check_out(out)  # another process may have begun in the meantime
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
@@ -172,7 +172,7 @@ def train_run(
 
 
 class _Views(NamedTuple):
-    """The views of a source: class [V] and number among the views of the class [V] of each."""
+    """The views of a source: the class of each view [V] and its number among the views of this class [V]."""
 
     label: NDArray[np.integer[Any]]
     view: NDArray[np.integer[Any]]
@@ -186,13 +186,13 @@ def _labelled_views(source: ViewSource) -> _Views:
 
 
 def _held_out_parts(samples: Samples | _Views) -> int:
-    """Return the number of parts of the views of which one is held out; fewer if a class has few views."""
+    """Return into how many parts the views are split to hold out one part; fewer if a class has few views."""
     fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(len(samples.classes)))
     return max(2, min(HELD_OUT, fewest))
 
 
 class _Fold(NamedTuple):
-    """One fold of a training: the arguments of `train_run`, its number, all samples, and which are held out."""
+    """One fold of a training: the arguments of `train_run`, the fold's number, all samples and the held-out mask."""
 
     settings: Protocol
     source: ViewSource
@@ -204,11 +204,11 @@ class _Fold(NamedTuple):
 
     @property
     def scratch(self) -> Path:
-        """The directory of its checkpoints."""
+        """The directory of the fold's checkpoints."""
         return self.out / CHECKPOINTS / f"fold-{self.number}"
 
     def train(self) -> TrainedRun:
-        """Train and publish the run, unless it is finished, and read it back."""
+        """Train and publish the run unless it is finished, and load it from its directory."""
         directory = self.out if self.settings.folds == 1 else self.out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
             classifiers, best_epochs, temperatures = self.fit_classifiers()
@@ -219,7 +219,7 @@ class _Fold(NamedTuple):
         return load_run(directory)
 
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
-        """Fit the classifiers; return them, the epochs that they are from, and their temperatures."""
+        """Fit the classifiers; return the classifiers, the epoch of each, and their temperatures."""
         settings, samples = self.settings, self.samples
         if not isinstance(samples, Samples):
             return {}, {}, {}
@@ -243,7 +243,7 @@ class _Fold(NamedTuple):
         best_epochs: Mapping[Feature, int],
         temperatures: Mapping[str, float],
     ) -> TrainedRun:
-        """Return the run with its classifiers, the embedding if it has one, the fitted confidence and the record."""
+        """Return the run: classifiers, the embedding if there are distractors, calibrated confidence and record."""
         settings = self.settings
         run = TrainedRun(settings.config, settings.network, self.samples.classes, classifiers, {})
         accuracy, confidence = {}, {}
@@ -268,8 +268,8 @@ class _Fold(NamedTuple):
         """Fit the embedding on the views and the distractors.
 
         Returns:
-            The embedding, which recognizes the classes, and label and cloud, in metres, of each view of the held-out
-            set: those of distractors have labels from the number of classes on.
+            The embedding, which recognizes the classes; and the label and the cloud, in metres, of each view in the
+            held-out set. Labels of distractors start at the number of classes.
         """
         settings, views, held_out, checkpoints = self.settings, self.samples, self.held_out, self.checkpoints(EMBEDDING)
         network, seed, n_classes = settings.network, settings.fit.seed, len(views.classes)
@@ -281,7 +281,7 @@ class _Fold(NamedTuple):
         samples, known = sample_views(self.source, kept, network, config, seed, shown)
         unknown = held_out_clouds(distractors, n_classes)
         samples = with_fitted_distractors(samples, others, n_classes)
-        del others  # takes as much memory as the samples
+        del others  # needs as much memory as the samples
         embedding = fit_embedding(
             samples,
             network,
@@ -298,7 +298,7 @@ class _Fold(NamedTuple):
         return dataclasses.replace(embedding, references=references), known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
-        """Open the checkpoints of a fit, which log its metrics; logged epochs without a checkpoint are removed."""
+        """Open the checkpoints of a fit, which log its metrics; remove logged epochs that have no checkpoint."""
         log = functools.partial(append_metrics, self.out / METRICS, self.number, name)
         checkpoints = Checkpoints(self.scratch / name, log)
         if jax.process_index() == 0:
@@ -311,7 +311,7 @@ class _Fold(NamedTuple):
 
 
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:
-    """Return the results of a fold for its record: curves, the epochs kept and the held-out accuracy."""
+    """Return the results of a fold for its record: curves, selected epochs and held-out accuracy."""
     curves: dict[str, list[dict[str, Any]]] = {}
     held_out: dict[str, float] = {}
     for row in rows:
@@ -324,7 +324,7 @@ def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, in
 
 def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
     """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
-    shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed just here
+    shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed in this function
     save_run(run, complete)
     for name in ("", "weights"):
         (directory / name).mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Training views of all classes with their answers, from which `next_view` chooses a viewpoint."""
+"""Table of rendered views of the classes and their answers, from which `next_view` chooses a viewpoint."""
 
 from collections.abc import Mapping
 
@@ -20,11 +20,11 @@ AZIMUTHS, POLARS = 8, (0.6, 1.2)
 
 
 def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> ViewTable:
-    """Render views of the trained classes from above, all around, and recognize them.
+    """Render views of the trained classes from cameras above and all around, and recognize them.
 
     Args:
-        recognizer: recognizer with classifiers.
-        meshes: name -> mesh, in metres, z up, of at least one class.
+        recognizer: a recognizer with classifiers.
+        meshes: name -> mesh, in metres, z up; at least one must be of a trained class.
 
     Raises:
         InputError: no mesh is of a trained class.

@@ -1,4 +1,4 @@
-"""Augmentations of training views: beyond the paper, each with its own switch.
+"""Augmentations of training views. They go beyond the paper, and each can be switched off.
 
     augmentations = Augmentations(illumination=Illumination(), occlusion=Occlusion())
     copy = augment(render_view(caster, pose), augmentations, np.random.default_rng(0))
@@ -41,7 +41,7 @@ KINDS: dict[str, tuple[type, Callable[[RenderedView, Any, np.random.Generator], 
 
 @dataclasses.dataclass(frozen=True)
 class Augmentations:
-    """Augmentations to apply; None disables one. False if all are disabled.
+    """Augmentations to apply; None disables one. The record is falsy if all are disabled.
 
     Attributes:
         illumination: light and camera response.
@@ -66,7 +66,7 @@ class Augmentations:
 
     @classmethod
     def of_names(cls, names: Iterable[str], copies: int = 5) -> "Augmentations":
-        """Return the augmentations of these names with their default settings."""
+        """Return the augmentations with these names, in their default settings."""
         return cls(**{name: KINDS[name][0]() for name in names}, copies=copies)
 
     def __post_init__(self) -> None:
@@ -77,25 +77,25 @@ class Augmentations:
         return any(getattr(self, name) for name in KINDS)
 
     def record(self) -> dict[str, Any]:
-        """Return all settings as JSON holds them: None for a disabled augmentation, ranges as lists."""
+        """Return all settings in JSON types: None for a disabled augmentation, lists for ranges."""
         record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
         return record
 
 
 def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:
-    """Return an augmented copy of a view; it is determined by the arguments and the state of `rng`.
+    """Return an augmented copy of a view, determined by the arguments and the state of `rng`.
 
     The order is illumination, registration, segmentation, base, occlusion, sensor. Flying pixels are removed after
     segmentation and sensor, as recognition does.
 
     Args:
         view: view as rendered; not modified.
-        augmentations: which augmentations to apply, with their settings; an empty view stays as it is.
+        augmentations: the augmentations to apply, with their settings; an empty view is returned unchanged.
         rng: random number generator.
 
     Returns:
-        A view with the same pose. If the mask is dilated, the image may be larger by some pixels on each side; corner
-        and intrinsics are adapted.
+        A view with the same pose. If the mask is dilated, the image may be larger by some pixels on each side, with
+        corner and intrinsics adapted.
     """
     if not view.depth.any():
         return view
@@ -106,7 +106,7 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
 
 
 def _without_flying(view: RenderedView) -> RenderedView:
-    """Remove flying pixels as recognition does: unless they are more than half of all pixels."""
+    """Remove flying pixels as recognition does, that is, unless they are more than half of all pixels."""
     pixels = np.flatnonzero(view.depth)
     flying = flying_pixels(view.frame, pixels)
     return view if 2 * flying.sum() > len(pixels) else view.without(pixels[flying])

@@ -2,9 +2,9 @@
 
 A view is occluded by the outline of a built-in object or a straight edge.
 
-A mask is some pixels too small or too large, so that points are missing or of the background. The background is a
-plane: the table, or a wall behind. Beyond the outline only background near the object in depth is added: outlier
-removal in recognition drops the rest, a strip a few millimetres wide, as strays or as a small component.
+A mask is too small or too large by some pixels, so that points are missing or from the background. The background is a
+plane: the table, or a wall behind. Outside the outline, only background with a depth close to the object's is added.
+Outlier removal in recognition discards the rest, a strip a few millimetres wide, anyway.
 
 Segmenters that remove the table plane also remove the base of an object, its lowest part.
 """
@@ -36,19 +36,19 @@ SILHOUETTE_PIXEL = 0.002
 """Side of a pixel of the silhouettes, metres."""
 
 POSES = tuple((azimuth, polar) for azimuth in (0.4, 2.0) for polar in (0.8, 1.3))
-"""Azimuth and polar angles of the silhouettes, radians: cameras that look down on a table."""
+"""Azimuth and polar angles from which the silhouettes are rendered, radians, as by cameras above a table."""
 
 PLACES = 32
-"""Candidate positions of a silhouette, on a line from outside the view to its centre."""
+"""Number of candidate positions of a silhouette, on a line from outside the view to its centre."""
 
 SAMPLE_PIXELS = 400
-"""Approximate number of pixels that estimate the occluded share at each position."""
+"""Approximate number of pixels from which the occluded share at each position is estimated."""
 
 MAX_TRIES = 4
-"""Silhouettes to try before a straight edge is used."""
+"""Number of silhouettes to try before a straight edge is used."""
 
 SHARE_TOLERANCE = 0.05
-"""Largest accepted difference between the drawn share and that of a silhouette."""
+"""Largest accepted difference between the drawn share and the share that a silhouette occludes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Occlusion:
     Attributes:
         share: occluded share of the view's pixels.
         none: probability that a view is not occluded.
-        straight: probability, for the others, that a straight edge (a large object) occludes it.
+        straight: probability that an occluded view is occluded by a straight edge (a large object).
         nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
     """
 
@@ -104,7 +104,7 @@ def _silhouettes() -> tuple[NDArray[np.bool_], ...]:
 def _behind_silhouette(
     x: NDArray[np.float64], y: NDArray[np.float64], share: float, scale: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Return which points (x [n], y [n], metres) a silhouette occludes that moves along x until it covers `share`."""
+    """Return which points (x [n], y [n], metres) a silhouette occludes after moving along x until it covers `share`."""
     bank = _silhouettes()
     silhouette = bank[rng.integers(len(bank))]
     pixel = SILHOUETTE_PIXEL * scale
@@ -113,7 +113,7 @@ def _behind_silhouette(
     places = np.linspace(x.min() - width / 2 * pixel, 0, PLACES)
 
     def hides(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points, relative to the silhouette's centre, it covers."""
+        """Return which points, relative to the silhouette's centre, are covered by the silhouette."""
         column = (x / pixel + width / 2).astype(np.intp).clip(0, width - 1)
         row = (y / pixel + height / 2).astype(np.intp).clip(0, height - 1)
         return silhouette[row, column]
@@ -124,7 +124,7 @@ def _behind_silhouette(
 
 
 MAX_BACKGROUND_GAP = 2 * PIECE_CELL
-"""Largest distance of remaining background, metres: outlier removal treats adjacent cells as one component."""
+"""Largest distance of added background, metres, since outlier removal treats adjacent cells as one component."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,10 +132,10 @@ class Segmentation:
     """Ranges of the mask's error; values are drawn once per view.
 
     Attributes:
-        pixels: by how many pixels of a real frame the mask is dilated; eroded if negative.
+        pixels: number of pixels of a real frame by which the mask is dilated; eroded if negative.
         tilt: angle between the background's normal and the optical axis, degrees.
         touching: probability that the background touches the visible object, as a table does.
-        gap: distance between object and background otherwise, metres.
+        gap: distance between object and background if they do not touch, metres.
     """
 
     pixels: Range = (-8.0, 6.0)
@@ -145,7 +145,7 @@ class Segmentation:
 
 
 def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
-    """Return the view in a mask with a drawn error; an eroded mask keeps at least half of the pixels."""
+    """Return the view with a random error of its mask; an eroded mask keeps at least half of the pixels."""
     seen = view.depth > 0
     steps = round(rng.uniform(*segmentation.pixels) * FRAME_PIXEL / view.pixel_width)
     return _dilated(view, steps, segmentation, rng) if steps > 0 else _eroded(view, seen, -steps)
@@ -192,7 +192,7 @@ def _background(
     tilt, azimuth = np.radians(rng.uniform(*segmentation.tilt)), rng.uniform(0, 2 * np.pi)
     gap = 0.0 if rng.random() < segmentation.touching else rng.uniform(*segmentation.gap)
     k, (height, width) = view.intrinsics, view.depth.shape
-    # n . ray: negative where the plane faces the camera; n . point is this times the depth.
+    # n . ray is negative where the plane faces the camera; n . point is this value times the depth.
     facing = (
         np.sin(tilt) * np.cos(azimuth) * (np.arange(width) - k.cx) / k.fx
         + (np.sin(tilt) * np.sin(azimuth) * (np.arange(height) - k.cy) / k.fy)[:, None]
@@ -204,7 +204,7 @@ def _background(
 
 
 MAX_CUT = 0.4
-"""Largest share of the visible pixels that is removed; a flat object would disappear."""
+"""Largest share of the visible pixels that may be removed; without it, a flat object would disappear."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +214,7 @@ class Base:
     Attributes:
         missing: probability that the base is missing.
         height: height of the missing part, metres.
-        upright: probability that the object stands as its mesh does; otherwise it lies in a random orientation.
+        upright: probability that the object stands upright like its mesh; otherwise its orientation is random.
     """
 
     missing: float = 0.4
@@ -223,7 +223,7 @@ class Base:
 
 
 def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> RenderedView:
-    """Return the view without the pixels near the table, or the view itself if that were most of it."""
+    """Return the view without the pixels near the table, or unchanged if too many pixels would be removed."""
     pixels = np.flatnonzero(view.depth)
     if rng.random() >= base.missing:
         return view

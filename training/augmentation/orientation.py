@@ -1,7 +1,7 @@
-"""Augmentation of orientation: normalized clouds in other frames of axes, as another view might be normalized.
+"""Augmentation of orientation: normalized clouds with other axes, as the normalization might choose in another view.
 
-The longer of two nearly equal sides and the end with more points differ between cameras, and a box is rarely found to
-the degree.
+Which of two nearly equal sides is longer, and which end has more points, differs between cameras. The axes of the box
+also have errors of some degrees.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from thor2_jax.types import PointClouds
 __all__ = ["reorient"]
 
 NEARLY_EQUAL = 0.85
-"""Least ratio of a side of the box to the next longer one at which the two may be swapped."""
+"""Smallest ratio of a side of the box to the next longer side at which the two may be swapped."""
 
 MAX_ROTATION = 10.0
 """Largest random rotation of a normalized cloud, degrees."""
@@ -25,7 +25,7 @@ MAX_ROTATION = 10.0
 
 @jax.jit
 def _reoriented(normal: PointClouds, axes: jax.Array, mirrored: jax.Array) -> PointClouds:
-    """Rotate normalized clouds to axes [B, 3, 3], then mirror some [B] in x; the camera stays on the side of -z."""
+    """Rotate normalized clouds to axes [B, 3, 3], then mirror those in `mirrored` [B] in x; the camera stays at -z."""
 
     def one(cloud: PointClouds, axes: jax.Array, mirrored: jax.Array) -> PointClouds:
         inside = cloud.mask[:, None]
@@ -44,7 +44,7 @@ def _reoriented(normal: PointClouds, axes: jax.Array, mirrored: jax.Array) -> Po
 
 
 def _random_axes(sides: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return axes [B, 3, 3]: some nearly equal sides [B, 3] swapped, then a small rotation about a random axis."""
+    """Return axes [B, 3, 3] after swaps of nearly equal sides [B, 3] and a small rotation about a random axis."""
     sides, axes = sides.copy(), np.tile(np.eye(3), (len(sides), 1, 1))
     for order, (i, j) in (([1, 0, 2], (0, 1)), ([0, 2, 1], (1, 2))):
         swap = (sides[:, j] > NEARLY_EQUAL * sides[:, i]) & (rng.random(len(sides)) < 0.5)
@@ -58,13 +58,13 @@ def _random_axes(sides: NDArray[np.float32], rng: np.random.Generator) -> NDArra
 def reorient(normal: PointClouds, rng: np.random.Generator) -> PointClouds:
     """Return normalized clouds [B, N] in random orientations.
 
-    Two neighbouring sides of the box that are nearly equal are swapped in half of the clouds, each cloud is rotated by
-    up to 10 degrees about a random axis, and half of the clouds are mirrored in x, which is a half turn about z to the
-    descriptor.
+    In half of the clouds, two neighbouring sides of the box that are nearly equal are swapped. Each cloud is rotated by
+    up to 10 degrees about a random axis. Half of the clouds are mirrored in x, which has the same effect on the
+    descriptor as a half turn about z.
 
     Args:
-        normal: clouds as `view_normalize` returns them.
-        rng: generator of the orientations.
+        normal: clouds as returned by `view_normalize`.
+        rng: random number generator for the orientations.
     """
     axes = _random_axes(np.asarray(normal.points.max(axis=1)), rng)
     oriented: PointClouds = _reoriented(normal, axes, rng.random(len(axes)) < 0.5)

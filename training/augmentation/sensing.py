@@ -1,14 +1,14 @@
-"""Augmentation of what a camera senses: light, its response, the registration of colour and depth, and depth.
+"""Augmentation of the images of a camera: light, response, registration of colour and depth, and depth.
 
 A camera image of an object differs from the scanned texture by the strength, colour and direction of the light and by
 the camera's response. Applied in this order to sRGB values in [0, 1]: c ** gamma; gain, colour cast and shading;
 saturation (distance from the grey of the same luma); a veil of stray light; noise.
 
 Some RGB-D cameras blur colour and shift it by up to ten pixels against depth. Points near the outline then have colours
-of the background. Compressed video has the differences between colours and their luma in half of the resolution.
+of the background. Compressed video stores chroma (the differences between colours and luma) at half of the resolution.
 
 Depth has noise, is smoothed and rounded to 1 mm, and has missing and flying pixels. Its lateral standard deviation is
-at most 0.8 pixels (Nguyen, Izadi and Lovell 2012, as the axial one).
+at most 0.8 pixels; it is from Nguyen, Izadi and Lovell (2012), like the axial one.
 """
 
 import dataclasses
@@ -31,13 +31,13 @@ Range = tuple[float, float]
 """Smallest and largest value of a uniform distribution."""
 
 STRIDE = 2
-"""Pixels between computed shading values: still finer than the voxels of the clouds."""
+"""Pixels between computed shading values; this is still finer than the voxels of the clouds."""
 
 SMOOTH = 5
-"""Side of the smoothing window for slopes, in strides: depth is rounded to 1 mm, a pixel is 1.4 mm wide."""
+"""Side of the smoothing window for slopes, in strides, since depth is rounded to 1 mm and a pixel is 1.4 mm wide."""
 
 STEEPEST = 3.0
-"""Steeper slopes (72 degrees) are depth discontinuities or rounding noise."""
+"""Largest slope of a surface; steeper slopes (72 degrees) are depth discontinuities or rounding noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +47,12 @@ class Illumination:
     Attributes:
         gamma: exponent of all channels.
         gain: factor of all channels.
-        cast: largest deviation from 1 of the factor of each channel. 0.1 remains of light of 3,000 K after a white
-            balance that corrects four fifths of it; the default is wider, so that networks depend less on colour.
-        shading: weight of the Lambert term of one distant light from a random direction on the camera's side, less its
-            mean over the view, so that only the gain changes the mean brightness.
+        cast: largest deviation of the factor of each channel from 1. Light of 3,000 K leaves 0.1 after a white balance
+            that corrects four fifths of it. The default is larger, so that networks depend less on colour.
+        shading: weight of the Lambert term of one distant light from a random direction on the camera's side. Its mean
+            over the view is subtracted, so that only the gain changes the mean brightness.
         saturation: factor of a colour's distance from grey.
-        veil: weight of white that is mixed in.
+        veil: weight of the white that is mixed in.
         noise: standard deviation per pixel and channel.
     """
 
@@ -72,7 +72,7 @@ def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> 
     gamma, gain, shading, saturation, veil, noise = (rng.uniform(*drawn) for drawn in ranges)
     cast = rng.uniform(1 - light.cast, 1 + light.cast, 3)
     response = ((np.arange(256) / 255) ** gamma).astype(np.float32)
-    # Gain, cast, saturation and veil are one matrix: the grey of a pixel is the same in all columns.
+    # One matrix applies gain, cast, saturation and veil, since the grey of a pixel is the same in all columns.
     mixing = saturation * np.eye(3) + (1 - saturation) * LUMA[:, None]
     matrix = 255 * (1 - veil) * gain * cast[:, None] * mixing
     color = view.color.copy()
@@ -102,10 +102,10 @@ def _lambert(view: RenderedView, pixels: NDArray[np.intp], rng: np.random.Genera
 
 
 def _slopes(depth: NDArray[np.float32], focal: float) -> NDArray[np.float32]:
-    """Return the smoothed slope of the surface along rows [h, w]: change of depth per length."""
+    """Return the smoothed slope of the surface along rows [h, w], as the change of depth per length."""
     slope, counted = np.zeros((2, *depth.shape), np.float32)
     slope[:, 1:] = focal * np.diff(depth, axis=1) / np.maximum(depth[:, 1:], 1)
-    # Next to missing depth the slope is treated like a discontinuity.
+    # The slope next to missing depth is treated like a discontinuity.
     counted[:, 1:] = (depth[:, 1:] > 0) & (np.abs(slope[:, 1:]) < STEEPEST)
     total, weight = (uniform_filter(array, SMOOTH, mode="constant") for array in (slope * counted, counted))
     return total / np.maximum(weight, np.float32(1e-6))
@@ -119,8 +119,8 @@ class Registration:
         shifted: probability of a shift.
         shift: largest shift along rows and columns, in pixels of a real frame.
         blur: standard deviation of the blur of the colour image, in pixels of a real frame.
-        chroma: standard deviation of the further blur of the differences between colours and their luma, in pixels of a
-            real frame: video has them in half of its resolution, and drivers smooth them against noise.
+        chroma: standard deviation of an additional blur of chroma (colour minus luma), in pixels of a real frame, since
+            video stores chroma at half of the resolution and drivers smooth it against noise.
     """
 
     shifted: float = 0.5
@@ -154,11 +154,11 @@ def misregistered(view: RenderedView, registration: Registration, rng: np.random
 
 
 TRUNCATE = 2.5
-"""Reach of the Gaussians, in standard deviations: beyond it lies about 1 % of their weight."""
+"""Range of the Gaussians, in standard deviations; about 1 % of their weight lies outside of it."""
 
 
 def blurred(values: NDArray[np.float32], seen: NDArray[np.bool_], deviation: float) -> NDArray[np.float32]:
-    """Return `values` [h, w] or [h, w, c] blurred by a Gaussian over the pixels `seen` [h, w]; others do not count.
+    """Return `values` [h, w] or [h, w, c] blurred by a Gaussian over the pixels `seen` [h, w], ignoring other pixels.
 
     Args:
         values: 0 outside of `seen`.
@@ -176,14 +176,14 @@ class Sensor:
 
     Attributes:
         distance: distance of objects in real frames, metres, which determines the noise.
-        axial: factor of `axial_deviation`; real frames have 0.4 to 0.55 of it within a centimetre.
+        axial: factor of `axial_deviation`; within a centimetre, it is 0.4 to 0.55 in real frames.
         lateral: standard deviation of the sampling position along rows and columns, in pixels of a real frame.
-        grazing: angle between surface normal and view direction from which a surface counts as an edge, degrees.
+        grazing: smallest angle between surface normal and view direction at which a surface counts as an edge, degrees.
         missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
-        flying: share of the other edge pixels whose depth lies between the surface's and the background's.
+        flying: share of flying pixels among the other edge pixels: their depth is between surface and background.
         background: distance of the background behind the object, metres.
-        smooth: standard deviation of the smoothing of depth, in pixels of a real frame. Stereo matching and the filters
-            of drivers smooth depth, so that noise is correlated and edges are round.
+        smooth: standard deviation of the smoothing of depth, in pixels of a real frame. Stereo matching and driver
+            filters smooth depth, which correlates the noise and rounds the edges.
         patches: share of the image in connected patches without depth, as on dark or shiny surfaces.
         patch: width of these patches, in pixels of a real frame.
     """
@@ -201,14 +201,14 @@ class Sensor:
 
 
 def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> RenderedView:
-    """Return the view as a depth camera drawn from `sensor` measures it."""
+    """Return the view as measured by a depth camera with errors drawn from `sensor`."""
     pixels = np.flatnonzero(view.depth)
     n = len(pixels)
     deviation = rng.uniform(*sensor.axial) * axial_deviation(rng.uniform(*sensor.distance))
     behind = rng.uniform(*sensor.background)
     width = view.pixel_width
     lateral = sensor.lateral * FRAME_PIXEL / width
-    # The margin has no depth, so that the border of the view is an edge and lateral samples can fall there.
+    # With a margin without depth, the border of the view is an edge, and lateral samples may fall into the margin.
     margin = 1 + math.ceil(4 * lateral)
     padded = np.pad(view.depth, margin).astype(np.float32)
     edge = depth_edges(padded, 1000 * width * math.tan(math.radians(sensor.grazing)))

@@ -1,10 +1,10 @@
-"""Twenty simulated cameras: how other RGB-D cameras and segmenters would have seen a real frame.
+"""Twenty simulated cameras, which show a real frame as other RGB-D cameras and segmenters would have seen it.
 
     seen = through_camera(frame, CHOOSE[0])
 
-A camera changes the whole image, as training/augmentation changes a single view: the response to light, a blurred
-colour image that is shifted against depth, noise, steps, holes and missing edges of depth, and masks that are too
-small, too large or end above the table. Everything is determined by the table below and the frame.
+A camera changes a whole image like the augmentations change a single view. It changes the response to light, and blurs
+colour and shifts it against depth. It adds noise, steps, holes and missing edges to depth. Its masks are too small, too
+large or end above the table. The result depends only on the table below and the frame.
 """
 
 import dataclasses
@@ -21,13 +21,13 @@ from training.rendering.camera import axial_deviation
 __all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]
 
 EDGE_STEP = 0.03
-"""Difference in depth within three pixels, metres, from which a pixel counts as an edge."""
+"""Smallest difference in depth within three pixels at which a pixel counts as an edge, metres."""
 
 MIN_MASK = 0.5
-"""Least share of a mask that remains; otherwise the mask stays as it is."""
+"""Smallest share of a mask that must remain; otherwise the mask is not changed."""
 
 TABLE_MARGIN = 15
-"""Pixels around the masks in which the table is searched."""
+"""Width of the region around the masks in which the table is searched, pixels."""
 
 TABLE_TOLERANCE = 0.006
 """Largest distance of a point of the table to its plane, metres."""
@@ -37,15 +37,15 @@ N_HYPOTHESES = 150
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedCamera:
-    """A camera, and the segmenter that makes its masks; by default it changes nothing.
+    """A camera and the segmenter that makes its masks; by default, a frame is not changed.
 
     Attributes:
         name: name in reports.
         gamma: exponent of all channels.
         gain: factor of all channels.
         saturation: factor of a colour's distance from grey.
-        warmth: share by which red is amplified and blue is weakened; negative for cool light.
-        veil: weight of white that is mixed in.
+        warmth: fraction by which red is amplified and blue attenuated; negative for cool light.
+        veil: weight of the white that is mixed in.
         blur: standard deviation of the blur of the colour image, pixels.
         noise: standard deviation per pixel and channel, of values from 0 to 1.
         shift: rows down and columns to the right by which colour is shifted against depth.
@@ -54,8 +54,8 @@ class SimulatedCamera:
         holes: number of elliptic holes in depth.
         radius: largest half axis of a hole, pixels.
         edges: share of the pixels without depth along edges of depth.
-        mask: pixels by which masks are dilated; eroded if negative.
-        base: height of the part above the table that masks lack, metres.
+        mask: number of pixels by which masks are dilated; eroded if negative.
+        base: height above the table up to which masks lack pixels, metres.
     """
 
     name: str
@@ -90,7 +90,7 @@ CHOOSE = (
         "worn", 1.2, 0.75, 0.7, 0.1, 0.05, 1.0, 0.015, (3, 5), 1.0, step=2, holes=20, edges=0.3, mask=-2, base=0.008
     ),
 )
-"""Cameras on which settings may be chosen."""
+"""Cameras that may be used to choose settings."""
 
 REPORT = (
     SimulatedCamera("cool daylight", 0.95, 1.1, 1.05, -0.16, noise=0.01, shift=(-2, 1), axial=0.5, edges=0.15),
@@ -106,15 +106,15 @@ REPORT = (
         "cheap", 0.8, 0.8, 1.3, -0.1, 0.1, 1.7, 0.02, (5, -4), 1.8, step=4, holes=15, edges=0.5, mask=2, base=0.012
     ),
 )
-"""Cameras for the final report, of other kinds or strengths than `CHOOSE`."""
+"""Cameras for the final report only; their errors differ from those of `CHOOSE` in kind or strength."""
 
 
 def through_camera(frame: RGBDFrame, camera: SimulatedCamera) -> RGBDFrame:
     """Return the frame as a simulated camera sees it; depth becomes uint16 millimetres.
 
     Args:
-        frame: a frame; without labels, the changes of masks are left out.
-        camera: one of `CHOOSE` or `REPORT`, or another one.
+        frame: a frame; without labels, masks are not changed.
+        camera: a camera of `CHOOSE` or `REPORT`, or any other.
     """
     rng = np.random.default_rng([zlib.crc32(camera.name.encode()), zlib.crc32(np.asarray(frame.depth).tobytes())])
     color = _color(frame.color, camera, rng)
@@ -175,7 +175,7 @@ def _labels(
 
 
 def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.integer]:
-    """Return the labels without `pixels` [H, W], except those of masks of which less than `MIN_MASK` would remain."""
+    """Return the labels without `pixels` [H, W]; masks that would keep less than `MIN_MASK` are not changed."""
     counts, lost = (np.bincount(values.ravel()) for values in (labels, labels[pixels]))
     share = np.zeros(len(counts))
     share[: len(lost)] = lost / np.maximum(counts[: len(lost)], 1)
@@ -185,7 +185,7 @@ def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.i
 def _near_table(
     frame: RGBDFrame, labels: NDArray[np.integer], height: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Return the pixels [H, W] less than `height` metres away from the plane of most points around the masks."""
+    """Return the pixels [H, W] within `height` metres of the plane that fits most points around the masks."""
     points = backproject(frame.depth_m, frame.intrinsics)
     seen = frame.depth_m > 0
     around = points[seen & (labels == 0) & (maximum_filter(labels, 2 * TABLE_MARGIN + 1) > 0)]

@@ -1,8 +1,8 @@
-"""The interface of a trained baseline, its inputs and its file, and what the fits of baselines share.
+"""The interface of a trained baseline, its inputs, its file, and functions shared by the fits of baselines.
 
-The file is RUN/baselines/NAME.safetensors. Its metadata entry "about" is JSON: the format, the classes, the temperature
-(null without a held-out set), the training time in seconds, the files of pretrained weights if there were any, and a
-digest of these entries and the arrays.
+The file is RUN/baselines/NAME.safetensors. Its metadata entry "about" is JSON. It has the format, the classes, the
+temperature (null without a held-out set), the training time in seconds, any files of pretrained weights, and a digest
+of these entries and the arrays.
 """
 
 import dataclasses
@@ -53,13 +53,12 @@ Integers = NDArray[np.integer[Any]]
 
 
 class BaselineInputs(NamedTuple):
-    """The B instances of a described frame, as baselines read them.
+    """The B instances of a described frame, as inputs of baselines.
 
     Attributes:
         normal: view-normalized clouds, scaled units.
-        tops: [B, F] float32, their TOPS descriptors.
-        crops: function of the side in pixels that returns the crops of the instances; only those of padding rows are
-            missing.
+        tops: [B, F] float32, TOPS descriptors of the instances.
+        crops: function of the side in pixels that returns the crops of the instances, without padding rows.
     """
 
     normal: PointClouds
@@ -69,7 +68,7 @@ class BaselineInputs(NamedTuple):
     def predicted(
         self, size: int, n_classes: int, predict: Callable[[ViewCrops], NDArray[np.float32]]
     ) -> NDArray[np.float32]:
-        """Return class probabilities [B, C] of the crops of a size, from `predict`; equal ones for padding rows."""
+        """Return class probabilities [B, C] from `predict` for the crops of a size; uniform ones for padding rows."""
         values = np.full((len(self.tops), n_classes), 1 / n_classes, np.float32)
         crops = self.crops(size)
         if len(crops):
@@ -78,7 +77,7 @@ class BaselineInputs(NamedTuple):
 
 
 def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: RGBDFrame) -> BaselineInputs:
-    """Return the instances of a frame, in the row order of `described.packed`; crops are made when a baseline asks."""
+    """Return the instances of a frame in the row order of `described.packed`; crops are computed on demand."""
 
     @functools.cache
     def crops(size: int) -> ViewCrops:
@@ -106,7 +105,7 @@ class StoredBaseline:
     Attributes:
         arrays: learned arrays by name.
         temperature: temperature fitted on the held-out set; None without one.
-        weights: files of pretrained weights it was fitted from -> SHA-256; empty if it was trained from scratch.
+        weights: files of pretrained weights from which it was fitted -> SHA-256; empty if it was trained from scratch.
     """
 
     arrays: Mapping[str, NDArray[Any]]
@@ -176,7 +175,7 @@ class FitTask:
     Attributes:
         name: name of the baseline.
         source: views of the run.
-        run: the run. Its fold is held out; nothing is if it is the only one.
+        run: the run. Its fold is held out, unless it is the only fold.
         directory: directory of the run.
         weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
@@ -191,7 +190,7 @@ class FitTask:
 
     @property
     def options(self) -> FitOptions:
-        """Options of the fit, those of the run."""
+        """Options of the fit, the same as for the run."""
         record, rates = self.run.record, tuple(self.run.record["learning_rates"])
         return FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
 
@@ -201,7 +200,7 @@ class FitTask:
         return self.directory / "baselines" / f".{self.name}"
 
     def held_out(self, label: Integers, view: Integers) -> NDArray[np.bool_]:
-        """Return which clouds [M] are held out, given class index and view number: the same views as in the run."""
+        """Return which clouds [M] are held out, given class index and view number; the same views as in the run."""
         folds = self.run.record["folds"]
         if folds == 1:
             return np.zeros(len(label), bool)
@@ -210,11 +209,11 @@ class FitTask:
     def temperature(
         self, label: Integers, held_out: NDArray[np.bool_], predict: Callable[[], NDArray[np.float32]]
     ) -> float | None:
-        """Return the temperature for the probabilities of the held-out clouds, from `predict`; None without any."""
+        """Return the temperature for the probabilities from `predict` for held-out clouds; None if there are none."""
         return fit_temperature(predict(), label[held_out]) if held_out.any() else None
 
     def shards(self, stage: str, unit: str) -> Iterator[tuple[int, slice, NormalizedViews]]:
-        """Yield index, rows among all clouds, and views of each shard, and show the progress of a stage."""
+        """Yield index, rows among all clouds, and views of each shard, while showing the progress of a stage."""
         done, total = 0, self.n_clouds
         for index, shard in enumerate(self.source.shards):
             yield index, slice(done, done + shard.views), self.source.read(index)
@@ -228,15 +227,15 @@ class FitTask:
 
 
 class NetworkFit(NamedTuple):
-    """How a network is fitted.
+    """Settings for fitting a network.
 
     Attributes:
         directory: directory of its checkpoints.
-        draw: function of the rows of a batch and a generator that returns the batch, a tuple of arrays.
+        draw: function of the rows of a batch and a random number generator; returns the batch, a tuple of arrays.
         inputs: function of these arrays that returns the arguments of the network. Static.
-        batch_size: samples of a step.
-        optimizer: function of the learning rate. Static.
-        rate: function of the number of a step and the number of all steps.
+        batch_size: samples per step.
+        optimizer: function of the learning rate that returns an optimizer. Static.
+        rate: function of the number of a step and the number of all steps that returns the learning rate.
     """
 
     directory: str
@@ -264,7 +263,7 @@ def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, 
 def fit_network(
     task: FitTask, fit: NetworkFit, model: nnx.Module, label: Integers, rows: NDArray[np.intp], n_samples: int
 ) -> Any:
-    """Return a network that is fitted on these rows, `n_samples` of them in an epoch; an interrupted fit resumes.
+    """Return a network fitted on these rows, `n_samples` of them per epoch; an interrupted fit resumes.
 
     Raises:
         InputError: the loss is not finite.
@@ -297,12 +296,12 @@ def _apply(models: Sequence[Any], arrays: tuple[Any, ...], inputs: Any, output: 
 def compiled_network(
     model: nnx.Module, inputs: Callable[..., tuple[Any, ...]], output: Callable[[Any], Any] = jax.nn.softmax
 ) -> Callable[[tuple[Any, ...]], jax.Array]:
-    """Return a compiled function of a tuple of arrays: `output` of a network that is applied to `inputs` of them."""
+    """Return a compiled function of a tuple of arrays: `output` of the network applied to `inputs` of the arrays."""
     return compiled(_apply, [nnx.split(model)], inputs, output)
 
 
 def in_batches(function: Callable[[tuple[Any, ...]], Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the results [V, ...] of a function of `size` rows of arrays [V, ...]; V is at least 1."""
+    """Apply a function to arrays [V, ...], `size` rows at a time, and return the results [V, ...]; V is at least 1."""
     count, results = len(arrays[0]), []
     for first in range(0, count, size):
         rows = np.resize(np.arange(first, min(first + size, count)), size)

@@ -42,8 +42,9 @@ def _measure(normal: PointClouds, cut: Strips, config: DescriptorConfig) -> jax.
 def forest_features(normal: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> NDArray[np.float32]:
     """Return [B, R + 3 + 2 S] features of view-normalized clouds, lengths in scaled units.
 
-    In order: the fraction of each of the R colour regions among the points inside the strips; the three side lengths
-    of the bounding box; the extent of each of the S slices along x, in whole strips; and their extent along y.
+    The features are, in this order: the fraction of each of the R colour regions among the points inside the strips;
+    the three side lengths of the bounding box; the extent of each of the S slices along x, in whole strips; and the
+    extent of each slice along y.
     """
     return np.asarray(_measure(normal, strips(turn(normal, config), network, config), config))
 
@@ -55,13 +56,13 @@ each tree."""
 
 
 def load_forest(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
-    """Return a forest of the arrays `NODES`; raises KeyError if one is missing."""
+    """Return a forest built from the arrays `NODES`; raise KeyError if one is missing."""
     nodes = {name: arrays[name] for name in NODES}
     return lambda inputs: predict(nodes, forest_features(inputs.normal, run.network, run.config))
 
 
 def predict(nodes: Mapping[str, NDArray[Any]], features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return class probabilities [B, C] for `forest_features`, the mean over the trees."""
+    """Return class probabilities [B, C] for `forest_features` as the mean over the trees."""
     rows = np.arange(len(features))[:, None]
     at = np.tile(nodes["root"], (len(features), 1))  # [B, T]
     while (inner := nodes["left"][at] >= 0).any():

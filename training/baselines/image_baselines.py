@@ -47,10 +47,10 @@ __all__ = [
 ]
 
 TEMPLATES = "templates"
-"""The nearest template by the features of a frozen backbone, which may be that of a network of the same run."""
+"""The nearest template by features of a frozen backbone, which may be the backbone of a network of the same run."""
 
 INFERENCE_BATCH = 8
-"""Crops that a network reads at a time, about the instances of a frame: one compiled program for all."""
+"""Number of crops that a network reads at a time, about the instances of a frame, so that one program is compiled."""
 
 
 def _crop_function(
@@ -58,14 +58,14 @@ def _crop_function(
     inputs: Callable[..., tuple[Any, ...]] = network_inputs,
     output: Callable[[Any], Any] = jax.nn.softmax,
 ) -> Callable[[ViewCrops], NDArray[np.float32]]:
-    """Return a function of V crops, at least 1: `output` [V, ...] of a network that is applied to `inputs` of them."""
+    """Return a function of V >= 1 crops that returns `output` [V, ...] of the network applied to their `inputs`."""
     model.eval()
     function = compiled_network(model, inputs, output)
     return lambda crops: in_batches(function, INFERENCE_BATCH, crops.color, crops.normals)
 
 
 def load_image_network(name: str, arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
-    """Return the network of `ARCHITECTURES` called `name` of its weights; equal probabilities for padding rows.
+    """Build a network of `ARCHITECTURES` from its weights; padding rows get uniform probabilities.
 
     Raises:
         ValueError: an array is missing or has another shape.
@@ -81,7 +81,7 @@ SCRATCH_RATE, PRETRAINED_RATE = 1e-3, 1e-4
 """Highest learning rates, without and with pretrained weights."""
 
 WARM_UP = 0.05
-"""Fraction of the steps in which the learning rate rises."""
+"""Fraction of the steps in which the learning rate increases."""
 
 OPTIMIZER = partial(optax.adamw, weight_decay=0.05)
 
@@ -92,10 +92,10 @@ def _rows_of(crops: ViewCrops, rows: Any) -> ViewCrops:
 
 
 def _read_samples(task: FitTask, size: int) -> tuple[ViewCrops, NDArray[np.int32], NDArray[np.int32]]:
-    """Return the crops, class indices and view numbers of all views, with 6 bytes for each pixel of a crop.
+    """Return the crops, class indices and view numbers of all views; a crop needs 6 bytes per pixel of memory.
 
     Raises:
-        InputError: the source has no crops, or smaller ones.
+        InputError: the source has no crops, or only smaller crops.
     """
     shape = task.n_clouds, size, size, 3
     crops = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
@@ -108,7 +108,7 @@ def _read_samples(task: FitTask, size: int) -> tuple[ViewCrops, NDArray[np.int32
 
 
 def _learning_rate(highest: float, number: int, n_steps: int) -> float:
-    """Return the learning rate of a step: it rises, and falls along a cosine."""
+    """Return the learning rate of a step, which first increases and then decays along a cosine."""
     progress = (number + 0.5) / n_steps
     if progress < WARM_UP:
         return highest * progress / WARM_UP
@@ -118,10 +118,10 @@ def _learning_rate(highest: float, number: int, n_steps: int) -> float:
 def fit_image_network(task: FitTask) -> StoredBaseline:
     """Fit a network of `ARCHITECTURES`; an interrupted fit resumes after its last epoch.
 
-    An epoch uses as many crops as there are views, drawn from all their copies, each mirrored at random.
+    An epoch uses as many crops as there are views. They are drawn from all copies of the views and randomly mirrored.
 
     Raises:
-        InputError: the source has no crops, a file of weights does not fit, or the loss is not finite.
+        InputError: the source has no crops, a weights file does not match the network, or the loss is not finite.
     """
     architecture = ARCHITECTURES[task.name]
     model: Any = architecture.build(len(task.source.classes), task.options.seed)
@@ -159,7 +159,7 @@ BACKBONES = (DINOV2, "rgbd-vit", "rgbd-vit-small")
 
 
 def _create_backbone(source: str) -> ViT:
-    """Return a backbone of BACKBONES with random weights."""
+    """Return a backbone from BACKBONES with random weights."""
     if source == DINOV2:
         return ViT(VIT_DINOV2_SMALL, DINOV2_SIZE, rngs=nnx.Rngs(0))
     return ARCHITECTURES[source].create(1, rngs=nnx.Rngs(0)).color
@@ -179,7 +179,7 @@ def _unit(features: jax.Array) -> jax.Array:
 
 
 def load_templates(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
-    """Return the comparison with templates: equal probabilities for padding rows.
+    """Build the predictor that compares with templates; padding rows get uniform probabilities.
 
     Raises:
         KeyError, ValueError: an array is missing or has another shape.
@@ -202,7 +202,7 @@ def compare(
     Args:
         features: the features.
         stored: [T, D] unit features of the templates.
-        label: [T] their classes; every class has a template.
+        label: [T] classes of the templates; every class has a template.
         n_classes: number of classes.
     """
     similarity = features @ stored.astype(np.float32).T
@@ -211,7 +211,7 @@ def compare(
 
 
 def _backbone(task: FitTask) -> tuple[int, ViT, Mapping[str, str]]:
-    """Return the number of the backbone, the backbone, and the digests of its files of weights.
+    """Return the number of the backbone, the backbone, and the digests of its weights files.
 
     Raises:
         InputError: there is no backbone, or its file cannot be used.
@@ -233,7 +233,7 @@ def _backbone(task: FitTask) -> tuple[int, ViT, Mapping[str, str]]:
 
 
 def fit_templates(task: FitTask) -> StoredBaseline:
-    """Store the features of all crops that are not held out.
+    """Compute the features of all crops that are not held out, as templates.
 
     Raises:
         InputError: there is no backbone, or the source has no crops.
@@ -252,18 +252,18 @@ def fit_templates(task: FitTask) -> StoredBaseline:
 
 
 def pretrained_files(name: str) -> list[str]:
-    """Return the files of pretrained weights that a baseline reads, without the suffix; none for most baselines."""
+    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
     if name == TEMPLATES:
         return [DINOV2]
     return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
 
 
 def crop_size(names: Sequence[str], weights: bool) -> int | None:
-    """Return the side of the crops in pixels that baselines are trained on, the largest one; None if they need none.
+    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
 
     Args:
         names: names of the baselines.
-        weights: whether there are pretrained weights: DINOv2, by which templates are compared then, reads large crops.
+        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
     """
     sizes = [ARCHITECTURES[name].size for name in names if name in ARCHITECTURES]
     if TEMPLATES in names:

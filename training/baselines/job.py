@@ -76,8 +76,8 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
     **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in NETWORKS},
     TEMPLATES: (fit_templates, load_templates),
 }
-"""Name -> functions that fit a baseline and that build it from its arrays and run; the second raises KeyError or
-ValueError for unfit arrays."""
+"""Name -> function that fits a baseline, and function that builds it from its arrays and run. The second one raises
+KeyError or ValueError for unsuitable arrays."""
 
 
 def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
@@ -113,17 +113,17 @@ def train_baselines(
     An interrupted fit of a network resumes; the forest and the templates start again.
 
     Args:
-        path: run directory, or a directory with the folds of a training: then for each fold.
-        source: the views that the run was trained on; those that its fold holds out are held out here too.
-        names: any of BASELINES, in their order.
+        path: run directory, or a directory with the folds of a training, each of which gets the baselines.
+        source: the views on which the run was trained; the held-out views of its fold are held out here, too.
+        names: names from BASELINES, in the same order.
         progress: called with (stage, done, total, note).
         weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
     Raises:
-        InputError: `path` is not a run directory, the views are not those of the run, or a baseline cannot be trained
-            on them; or `weights` lacks a file, or has one of another architecture, or a network of the run was trained
-            without it.
+        InputError: `path` is not a run directory; the run was trained on other views; a baseline cannot be trained on
+            them; `weights` lacks a file or has a file of another architecture; or a network of the run was trained
+            without these weights.
         OSError: A file cannot be written.
     """
     for directory in find_run_directories([Path(path)]):
@@ -141,7 +141,7 @@ def train_baselines(
 
 
 def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path) -> None:
-    """Raise InputError if a trained baseline was not trained from these files of weights."""
+    """Raise InputError if an existing baseline was not trained from these weights files."""
     file = baseline_file(directory, name)
     paths = [weights_file(weights, each) for each in pretrained_files(name)]
     if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
@@ -155,7 +155,7 @@ def _train(task: FitTask) -> None:
     file, start = baseline_file(task.directory, task.name), time.perf_counter()
     fitted = _METHODS[task.name][0](task)
     write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
-    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, also those of earlier versions
+    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, including those of earlier versions
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:

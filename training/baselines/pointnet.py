@@ -36,7 +36,7 @@ SAMPLING_SEED = 0
 
 
 class PointNet(nnx.Module):
-    """Layers 6-64-128-384 on each point, maximum over the points, a layer of 256, logits; ReLU in between."""
+    """PointNet: layers 6-64-128-384 on each point, maximum over points, layer of 256, logits; ReLU in between."""
 
     def __init__(self, n_classes: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""
@@ -53,7 +53,7 @@ class PointNet(nnx.Module):
 
 
 def point_features(xyz: Any, rgb: Any, box: Any) -> tuple[jax.Array]:
-    """Return the [B, P, 6] input: points relative to the centre of their box, scaled units, and colours minus 0.5.
+    """Return the input [B, P, 6]: points relative to the centre of their box, scaled units, and colours minus 0.5.
 
     Args:
         xyz: [B, P, 3] points.
@@ -64,12 +64,12 @@ def point_features(xyz: Any, rgb: Any, box: Any) -> tuple[jax.Array]:
 
 
 def random_indices(count: int, points: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return the indices of `points` random points of `count`, repeated if there are too few points."""
+    """Return the indices of `points` random points out of `count`, repeated if there are too few points."""
     return np.resize(rng.permutation(count), points)
 
 
 def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
-    """Return a PointNet of its weights; which points are sampled depends only on the number of points.
+    """Build a PointNet from its weights; the sampled points of a cloud depend only on its number of points.
 
     Raises:
         ValueError: an array is missing or has another shape.
@@ -93,7 +93,7 @@ def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predic
 
 
 STORED_POINTS = 2 * POINTS
-"""Points stored for each view, so that every epoch can use a different sample of them."""
+"""Number of points stored for each view, so that every epoch can use a different sample."""
 
 RATES = 2e-3, 2e-5
 """First and last learning rate of the cosine schedule."""
@@ -114,7 +114,7 @@ def fit_pointnet(task: FitTask) -> StoredBaseline:
         InputError: the loss is not finite.
     """
     total, sampling = task.n_clouds, np.random.default_rng(task.options.seed)
-    # Points and colours of each view in random order.
+    # The points and colours of each view are stored in random order.
     xyz, rgb = (np.zeros((total, STORED_POINTS, 3), kind) for kind in (np.float16, np.uint8))
     box, (label, view) = np.zeros((total, 3), np.float32), np.zeros((2, total), np.int32)
     for _, rows, views in task.shards("read for pointnet", "views"):
@@ -124,7 +124,7 @@ def fit_pointnet(task: FitTask) -> StoredBaseline:
             xyz[row], rgb[row], box[row] = points[sample], colors[sample], points.max(axis=0)
 
     def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.float32]]:
-        """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
+        """Return network inputs for some views: a random sample of their points, randomly mirrored in x and y."""
         first = int(rng.integers(STORED_POINTS - POINTS + 1))
         window = slice(first, first + POINTS)
         (features,) = point_features(xyz[rows, window].astype(np.float32), rgb[rows, window], box[rows])

@@ -1,16 +1,16 @@
 """THOR, the predecessor (Samani and Banerjee, "Persistent Homology Meets Object Unity", T-RO 2024; arXiv 2305.03815).
 
-A library of MLPs on TOPS: one for each view type (front, side, top) and each number of slices k, which reads the first
-k slices. The classifiers of a type are trained on the views of that type's cameras. Two rules select the classifiers
-for a cloud:
+THOR is a library of MLPs on TOPS: one for each view type (front, side, top) and each number of slices k, which reads
+the first k slices. The classifiers of a type are trained on the views of that type's cameras. Two rules select the
+classifiers for a cloud:
 
-- number of slices: those that the cloud has if its far end is occluded, otherwise all slices;
-- view types: one or two, from the areas of the three visible faces of the bounding box. Of two classifiers, the more
-  confident one names the object.
+- number of slices: the number of slices of the cloud if its far end is occluded, otherwise all slices;
+- view types: one or two, from the areas of the three visible faces of the bounding box. With two classifiers, the more
+  confident one determines the class.
 
-Two parts of the published code are left out. Where all areas differ and the middle one faces the camera, it decides by
-the curvature of the faces; here front and side are both used. It also knows which area relations each object of its
-dataset can have.
+Two parts of the published code are left out. If all areas differ and the middle one faces the camera, the published
+code decides by the curvature of the faces; here, both front and side are used. It also contains a table of the area
+relations that each object of its dataset can have.
 """
 
 import dataclasses
@@ -52,10 +52,10 @@ def _equal(a: float, b: float) -> bool:
 
 
 def view_types(facing: float, second: float, third: float) -> tuple[ViewType, ...]:
-    """Return the view types of a cloud from the areas of the visible faces of its box, first the one facing the camera.
+    """Return the view types of a cloud from the areas of its box's visible faces, starting with the facing one.
 
     - All areas equal: front.
-    - The two others equal: top if the facing area is smaller than them, front if it is larger.
+    - The other two areas equal: top if the facing area is smaller than them, front if it is larger.
     - The facing area equal to one other, or all areas different: front and side if the facing area is among the larger
       ones, side and top if it is among the smaller ones.
     """
@@ -71,18 +71,18 @@ def view_types(facing: float, second: float, third: float) -> tuple[ViewType, ..
 
 
 def _face_areas(normal: PointClouds) -> NDArray[np.float64]:
-    """Return [B, 3] areas of the visible faces, first the one facing the camera."""
+    """Return the areas [B, 3] of the visible faces, starting with the face towards the camera."""
     points = np.where(np.asarray(normal.mask)[..., None], np.asarray(normal.points), 0).astype(np.float64)
     box = points.max(axis=1)
     sight = np.abs(np.asarray(normal.camera, np.float64) - box / 2)
-    # Face k is spanned by the other two axes. The two faces that do not face the camera stay in the order of the axes.
+    # Face k is spanned by the other two axes. The two faces not towards the camera stay in the order of the axes.
     faces = np.stack([box[:, 1] * box[:, 2], box[:, 0] * box[:, 2], box[:, 0] * box[:, 1]], axis=1)
     facing = np.arange(3) == sight.argmax(axis=1)[:, None]
     return np.take_along_axis(faces, np.argsort(~facing, axis=1, kind="stable"), axis=1)
 
 
 def _far_end_occluded(normal: PointClouds) -> NDArray[np.bool_]:
-    """Return [B], whether the last two x-bins hold more occlusion boundary points than the first two."""
+    """Return whether the last two x-bins of each cloud hold more occlusion boundary points than the first two, [B]."""
     x = np.asarray(normal.points)[..., 0]
     edge = np.asarray(normal.boundary & normal.mask)
     number = np.floor(x / OCCLUSION_BIN)
@@ -91,7 +91,7 @@ def _far_end_occluded(normal: PointClouds) -> NDArray[np.bool_]:
 
 
 def _slice_counts(normal: PointClouds, config: DescriptorConfig) -> NDArray[np.intp]:
-    """Return [B], the number of slices of each cloud, at least 1."""
+    """Return the number of slices of each cloud, at least 1, [B]."""
     aligned = turn(normal, config)
     top = np.where(np.asarray(aligned.mask), np.asarray(aligned.points)[..., 2], 0).max(axis=1)
     return np.clip(np.floor(top / config.sigma_1).astype(np.intp) + 1, 1, config.n_slices)
@@ -102,7 +102,7 @@ def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
 
 
 def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
-    """Return the library of its weights, `<type>-<slices>/<path>`.
+    """Build the library from its weights, named `<type>-<slices>/<path>`.
 
     Raises:
         ValueError: an array is missing or has another shape.
@@ -116,9 +116,9 @@ def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
 
 
 def predictor(library: Library, config: DescriptorConfig) -> Predictor:
-    """Return the rules that select from a library, with a classifier for every view type and number of slices.
+    """Return a predictor from a library with a classifier for every view type and number of slices.
 
-    The class probabilities of a cloud are those of the most confident classifier that is selected for it.
+    The class probabilities of a cloud are from the most confident classifier that the rules select for it.
     """
     predict = {key: compiled_network(model, as_given) for key, model in library.items()}
     size = config.image_size**2
@@ -142,7 +142,7 @@ def predictor(library: Library, config: DescriptorConfig) -> Predictor:
 
 
 def library_arrays(library: Library) -> dict[str, NDArray[Any]]:
-    """Return the weights of a library, as `load_thor` reads them."""
+    """Return the weights of a library in the format that `load_thor` reads."""
     arrays: dict[str, NDArray[Any]] = {}
     for (name, k), model in library.items():
         arrays |= model_arrays(model, f"{name}-{k}/")
@@ -162,11 +162,11 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     """Fit the library, each classifier in the same way as the run's own; an interrupted fit resumes.
 
     Raises:
-        InputError: as `fit`.
+        InputError: `fit` raises it.
     """
     job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
-    types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # of each view number
+    types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # by view number
     config = task.run.config
     samples = build_samples(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
@@ -190,7 +190,7 @@ def fit_thor(task: FitTask) -> StoredBaseline:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
         for k in range(1, config.n_slices + 1):
             library[name, k] = fit_classifier(name, rows, k)
-        # Held-out views are not occluded: they are classified by all slices, as `THOR` does.
+        # Held-out views are not occluded, so they are classified by all slices, as in `THOR`.
         context, held_rows = FitContext("tops", task.run.network, config), rows[held_out[rows]]
         values = sample_probabilities(library[name, config.n_slices], samples, held_rows, context)
         better = values.max(axis=1) > best[held_rows].max(axis=1)

@@ -14,15 +14,15 @@ from training.cli.app import app, console, finish, show_progress
 def adapt(
     model: options.ModelOption,
     given: options.FrameOptions,
-    out: Annotated[Path, typer.Option(help="Directory for the adapted run, which recognizes as the model does.")],
+    out: Annotated[Path, typer.Option(help="Directory for the adapted run, which is used like the original.")],
     segment: options.SegmentOption = None,
     quiet: options.QuietOption = False,
 ) -> None:
-    """Adapt a run to a camera: its colours are corrected before recognition.
+    """Adapt a run to a camera: correct its colours before recognition.
 
-    The frames are of one camera. They need instance masks (or --segment) and no names; unknown objects may be among
-    them. The warmth (red against blue) is estimated from at least ten instances, best of many objects: with it, the
-    model is most certain of its answers.
+    All frames must be from one camera. They need instance masks (or --segment) but no names, and may contain unknown
+    objects. The warmth (red against blue) is estimated from at least ten instances, preferably of many objects: it is
+    the value that minimizes the uncertainty of the model's answers.
     """
     from training.camera_adaptation import adapt_run
     from training.storage.jobs import of_stage

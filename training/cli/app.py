@@ -1,4 +1,4 @@
-"""The typer application and what its commands share: console, progress, and the cache of compiled programs.
+"""The Typer application and the parts that its commands share: console, progress, and cache of compiled programs.
 
 Invalid input ends a command with one line on standard error and exit code 2. Progress is drawn as bars on a terminal,
 otherwise printed as plain lines every few seconds. Compiled programs are kept in the user's cache directory, so that
@@ -35,7 +35,7 @@ MAX_BYTES = 2**30
 
 
 def enable_compilation_cache() -> None:
-    """Set the environment variables that JAX reads when it is imported; without a writable directory, set none.
+    """Set the environment variables of JAX's compilation cache; set none if the directory is not writable.
 
     Raises:
         InputError: THOR2_CACHE names a file.
@@ -50,7 +50,7 @@ def enable_compilation_cache() -> None:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(directory)
         os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-        # A damaged entry, or a full disk, costs a compilation and nothing else.
+        # After a damaged entry or on a full disk, the program is only compiled again.
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
 
 
@@ -75,10 +75,10 @@ def _bars() -> Iterator[Progress]:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:
-                # A live display is cut at the height of the terminal, so that its first stages leave it.
+                # A live display is cut off at the height of the terminal, so the oldest stages are hidden.
                 for task in bars.tasks[: max(0, len(bars.tasks) + 3 - bars.console.height)]:
                     bars.update(task.id, visible=False)
-                # A resumed stage starts at what is already done, so that the remaining time is estimated correctly.
+                # A resumed stage starts at the work already done, so that the remaining time is estimated correctly.
                 tasks[stage] = bars.add_task(stage, total=total, completed=done, note=note)
             bars.update(tasks[stage], completed=done, total=total, note=note)
 
@@ -86,7 +86,7 @@ def _bars() -> Iterator[Progress]:
 
 
 def _lines() -> Progress:
-    """Return a callback that prints a line when a stage begins, every few seconds, and when it ends."""
+    """Return a callback that prints a line when a stage begins, every few seconds while it runs, and when it ends."""
     begun: dict[str, tuple[float, int]] = {}
     printed, following = ("", 0), 0.0
 
@@ -120,18 +120,18 @@ sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.std
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
-"""Packages that recognition and the service do not import (docs/install.md)."""
+"""Packages that only training imports; recognition and the service do not need them (docs/install.md)."""
 
 COLLECTION_THRESHOLD = 5_000
-"""Number of new objects after which Python collects garbage. With 700, the default of Python 3.11, collections take an
-eighth of a short command."""
+"""Number of new objects after which Python collects garbage. With the default of Python 3.11, 700, garbage collection
+takes an eighth of the time of a short command."""
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
-"""Options whose value may be empty, or that check it themselves."""
+"""Options whose value may be empty, or whose command checks the value itself."""
 
 
 def finish(result: str, purpose: str, *command: object, file: TextIO | None = None) -> None:
-    """Print where the result of a command is, and the most likely next command: `thor2` with these words."""
+    """Print where the result of a command is, and the most likely next command: `thor2` with the words of `command`."""
     words = shlex.join(map(str, ("thor2", *command)))
     print(escape_characters(f"{result}; {purpose} with: {words}"), file=file, flush=True)
 
@@ -142,7 +142,7 @@ def print_note(text: str) -> None:
 
 
 def show_help(context: typer.Context) -> None:
-    """Print the help of a group of commands if none of them is given."""
+    """Print the help of a command group if no command is given."""
     if context.invoked_subcommand is None:
         print(context.get_help(), end="")
 
@@ -164,10 +164,10 @@ def thor2(
 
 
 def _repeat_interrupt(report: Callable[[Any], Any], lost: Any) -> None:
-    """Send Ctrl-C again if its exception was lost; `report` other lost exceptions.
+    """Send Ctrl-C again if its exception was lost; pass other lost exceptions to `report`.
 
-    What finalizers and callbacks of the garbage collection raise, JAX's among them, is ignored, and Python only calls
-    `sys.unraisablehook`.
+    Python ignores exceptions that are raised in finalizers and in callbacks of the garbage collector, including those
+    of JAX. It only calls `sys.unraisablehook`.
     """
     if issubclass(lost.exc_type, KeyboardInterrupt):
         threading.Timer(0.01, os.kill, [os.getpid(), signal.SIGINT]).start()
@@ -195,7 +195,7 @@ def main() -> None:
         package = (error.name or "").partition(".")[0]
         if package not in TRAINING_PACKAGES:
             raise
-        _exit_with(f"{package} is not installed; recognition works without it, this does not: see docs/install.md")
+        _exit_with(f"{package} is not installed; this command needs it, recognition does not: see docs/install.md")
     except RuntimeError as error:
         if "Symlink loop" not in str(error):  # of Path.resolve
             raise
@@ -208,7 +208,7 @@ def main() -> None:
 
 
 def _check_not_empty(arguments: list[str]) -> None:
-    """Raise InputError for an empty argument: as a path it would be the current directory."""
+    """Raise InputError for an empty argument, since an empty path would mean the current directory."""
     for previous, argument in itertools.pairwise(["the first argument", *arguments]):
         option, _, value = argument.rpartition("=") if argument.startswith("--") else (previous, "", argument)
         if not value and option not in MAY_BE_EMPTY:
@@ -217,7 +217,7 @@ def _check_not_empty(arguments: list[str]) -> None:
 
 
 def _given_value(error: Exception) -> str:
-    """Return what was given for the option that a usage error concerns."""
+    """Return the value given for the option that caused a usage error, as an addition to its message."""
     options = getattr(getattr(error, "param", None), "opts", [])
     split = [part for each in sys.argv for part in (each.split("=", 1) if each.startswith("--") else [each])]
     given = [argument for option, argument in itertools.pairwise(split) if option in options]

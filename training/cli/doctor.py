@@ -1,4 +1,4 @@
-"""`thor2 doctor`: say what is likely wrong with a set-up."""
+"""`thor2 doctor`: find likely errors in a set-up."""
 
 import dataclasses
 import json
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 def doctor(
     given: options.FrameOptions,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Run directory that knows the objects: checks the channel order.")
+        Path | None, typer.Option("--model", help="Run directory trained on the objects, to check the channel order.")
     ] = None,
     meshes: Annotated[
         Path | None,
-        typer.Option(help="Mesh, or directory of meshes, of the objects: checks units, sizes and the focal length."),
+        typer.Option(help="Mesh of the object, or directory of meshes, to check units, sizes and the focal length."),
     ] = None,
     mesh_scale: options.MeshScaleOption = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: findings and notes, of each FRAME.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print findings and notes for each FRAME as JSON.")] = False,
 ) -> None:
-    """Say what is likely wrong with frames: units, intrinsics, registration, labels, colours.
+    """Find likely errors in frames: units, intrinsics, registration, labels, colours.
 
-    The exit code is 0 if nothing is found, 1 if something is likely wrong, and 2 if a file is missing.
+    The exit code is 0 if no error is found, 1 if an error is likely, and 2 if a file is missing.
     """
     from training.diagnosis.setup import diagnose
     from training.frame_recognition import RecognizerArguments

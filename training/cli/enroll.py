@@ -1,4 +1,4 @@
-"""`thor2 enroll`: teach a run new objects, without training."""
+"""`thor2 enroll`: add new objects to a run, without training."""
 
 import contextlib
 import dataclasses
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
 def enroll(
     *,
     model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
-    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every object there is.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: enroll every object.")] = None,
     given: options.FrameOptions,
     mesh: Annotated[
         Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), its folder, or a folder of objects.")
     ] = None,
     labelled: Annotated[
         list[Path] | None,
-        typer.Option("--frames", metavar="FRAME...", help="FRAME without a NAME before: every labelled object."),
+        typer.Option("--frames", metavar="FRAME...", help="Frames whose labelled objects are all enrolled; no NAME."),
     ] = None,
     label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None,
     instance: Annotated[
-        int | None, typer.Option(help="Label number of the object. Default: by labels.json, or the only instance.")
+        int | None, typer.Option(help="Label number of the object. Default: as in labels.json, or the only instance.")
     ] = None,
     segment: options.SegmentOption = None,
     mesh_scale: options.MeshScaleOption = 1.0,
-    extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
+    extend: Annotated[bool, typer.Option("--extend", help="Add the views to an existing object.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the views of an existing object.")] = False,
     gallery: options.GalleryOption = None,
     processes: options.RenderWorkers,
     quiet: options.QuietOption = False,
 ) -> None:
-    """Enroll an object from a mesh or from frames; it is recognized at once.
+    """Enroll an object from a mesh or from frames, so that it is recognized from then on.
 
-    Without NAME, every object that the frames name in labels.json, or every object in the folder of --mesh, is
-    enrolled. With NAME, frames without names need --instance, or the object as their only instance. A frame is a
-    folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which an object
-    is unknown depends on its number of views; see --unknown-below of `thor2 recognize`.
+    Without NAME, every object that is named in the labels.json of the frames, or every object in the folder of --mesh,
+    is enrolled. With NAME, frames without labels.json need --instance, unless the object is their only instance. A
+    frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which
+    an answer is "unknown" depends on the object's number of views; see --unknown-below of `thor2 recognize`.
     """
     name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
@@ -72,7 +72,7 @@ def enroll(
     with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
-        # It takes seconds to import.
+        # This import takes seconds, so the meshes are checked first.
         from training.enrollment import enroll_objects
 
         with show_progress(quiet) as progress:
@@ -101,9 +101,9 @@ def enroll(
 def _rendered(
     meshes: Mapping[str, Path], mesh_scale: float, processes: options.WorkerOptions
 ) -> Iterator[Iterator[Sequence["PreparedInstance"]]]:
-    """Yield an iterator of the views of each mesh; the first ones are rendered now.
+    """Yield an iterator over the views of each mesh; rendering starts at once.
 
-    Several meshes are rendered by other processes, which start while this one imports JAX.
+    Several meshes are rendered by worker processes, which start while this process imports JAX.
     """
     if not meshes:
         yield iter(())

@@ -20,7 +20,7 @@ evaluate_app = typer.Typer(
 app.add_typer(evaluate_app, name="evaluate")
 
 MAX_LISTED = 10
-"""Labels that the summary lists."""
+"""Largest number of labels that the summary lists."""
 
 DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
 MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
@@ -28,7 +28,7 @@ MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", hel
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluationOptions(options.WorkerOptions):
-    """What is evaluated, and where the report is written."""
+    """The models to evaluate, and the directory of the report."""
 
     model: Annotated[
         list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
@@ -52,9 +52,9 @@ def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = No
 @evaluate_app.command()
 @options.grouped_options
 def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
-    """Frames whose objects labels.json names: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
+    """Frames with named objects: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
-    A FRAME that is a run directory, or has the folds of a training, is a further model.
+    A FRAME that is a run directory, or the directory of a training with several folds, is used as a further model.
     """
     from thor2_jax.model.run_record import RUN_FILE
     from training.readers.frames import FrameFolder
@@ -129,7 +129,7 @@ def _evaluate(
     result = "no report was written (--out)"
     if out is not None:
         result = f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}"
-    finish(result, "see why names are wrong", "explain", *(given or ["FRAME"]), "--model", models[0], "--out", "why")
+    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), "--model", models[0], "--out", "why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

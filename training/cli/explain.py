@@ -1,4 +1,4 @@
-"""`thor2 explain`: say why instances have their answers."""
+"""`thor2 explain`: explain the answers for instances."""
 
 import functools
 from pathlib import Path
@@ -26,9 +26,9 @@ def explain(
     answer_by: options.AnswerByOption = None,
     gallery: options.GalleryOption = None,
 ) -> None:
-    """Explain answers: the points that decided, slices, colours, smallest changes, nearest views.
+    """Explain answers by decisive points, slices, colours, smallest changes and nearest views.
 
-    For each instance, writes a page that contains its pictures, the same pictures as PNG, and explanation.json.
+    For each instance, this command writes a page with its pictures, the same pictures as PNG, and explanation.json.
     """
     from thor2_jax.explanation.explain import explain as explain_answer
     from thor2_jax.files import check_output_directory
@@ -61,8 +61,8 @@ def explain(
             console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
-    if segment == MODEL:  # enrolling takes no labels that depend on the model
-        finish(f"{explained} pages in {out}", "see the objects that the model knows", "objects", "--model", model)
+    if segment == MODEL:  # enrolling does not accept labels that depend on the model
+        finish(f"{explained} pages in {out}", "list the objects of the model", "objects", "--model", model)
         return
     segmented = ["--segment", segment] if segment else []
     again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", last, "--model", model, "--extend"]

@@ -1,4 +1,4 @@
-"""`thor2 fetch`: download meshes, the only command that downloads anything."""
+"""`thor2 fetch`: download meshes. No other command downloads anything."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,13 +18,13 @@ def ycb(
         str, typer.Option(help="Comma-separated names as in the set, such as 003_cracker_box,011_banana.")
     ],
     out: Annotated[Path, typer.Option(help="Directory for the meshes, one folder for each object.")],
-    url: Annotated[str | None, typer.Option(help="Address of a mirror, the folder that has the archives.")] = None,
+    url: Annotated[str | None, typer.Option(help="Address of the folder of archives on a mirror.")] = None,
     quiet: options.QuietOption = False,
 ) -> None:
     """Download scans of the YCB Object and Model Set (CC BY 4.0), about 10 MB for each object.
 
-    An interrupted download resumes, and objects that are there are not downloaded again. `thor2 train --meshes` takes
-    the directory.
+    An interrupted download resumes, and existing objects are not downloaded again. Pass the directory to
+    `thor2 train --meshes`.
     """
     from training.objects.fetch_ycb import LICENCE, YCB_URL, fetch_ycb
 

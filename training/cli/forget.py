@@ -14,7 +14,7 @@ def forget(
     model: options.ModelOption,
     gallery: options.GalleryOption = None,
 ) -> None:
-    """Forget an object: its views are removed, and a trained class is never answered again."""
+    """Forget an object: remove its views; a trained class is no longer predicted."""
     from thor2_jax.recognizer import Recognizer
 
     recognizer = Recognizer.load(model, gallery=gallery)

@@ -20,7 +20,8 @@ def objects(
         bool,
         typer.Option(
             "--reembed",
-            help="Embed all enrolled views again, after a change of the embedding; rebuild a lost index.json.",
+            help="Compute the embeddings of all enrolled views again, after a change of the embedding, and restore a "
+            "lost index.json.",
         ),
     ] = False,
 ) -> None:

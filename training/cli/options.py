@@ -1,4 +1,4 @@
-"""Options that several commands share, by themselves and in groups."""
+"""Options that several commands share, single ones and groups."""
 
 import dataclasses
 import functools
@@ -50,20 +50,20 @@ UnknownOption = Annotated[
     float | None,
     typer.Option(
         "--unknown-below",
-        help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own for trained "
-        "classes; for enrolled objects, it depends on the number of their views.",
+        help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own threshold for "
+        "trained classes; for enrolled objects, a threshold that depends on their number of views.",
     ),
 ]
 AnswerByOption = Annotated[
-    str | None, typer.Option("--answer-by", help="classifiers, gallery or both. Default: what the run has.")
+    str | None, typer.Option("--answer-by", help="classifiers, gallery or both. Default: all that the run has.")
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
 SegmentOption = Annotated[
     str | None,
     typer.Option(
         "--segment",
-        help="Segment the frames instead of reading labels: table, model (for piles; only recognize and explain), or "
-        "another segmenter.",
+        help="Segmenter to use instead of labels: table, model (for piles; only in recognize and explain), or another "
+        "one.",
     ),
 ]
 GalleryOption = Annotated[
@@ -81,43 +81,43 @@ AllowHostOption = Annotated[
     typer.Option(
         "--allow-host",
         metavar="NAME",
-        help="Further name or address by which browsers and clients address this machine, such as robot.local; may be "
-        "repeated. localhost and the address of the connection are always allowed.",
+        help="Additional name or address of this machine in requests, such as robot.local; repeatable. localhost and "
+        "the address of the connection are always allowed.",
     ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
 recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
-"""An option of recordings, which the help lists in a panel of its own."""
+"""Option for recordings; the help lists these in a panel of their own."""
 
 
 def given_values(record: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass that do not have their defaults: the options that are given."""
+    """Return the fields of a dataclass that differ from their defaults: the options that were given."""
     values = ((field, getattr(record, field.name)) for field in dataclasses.fields(record))
     return {field.name: value for field, value in values if value != field.default}
 
 
 def given_options(record: Any, without: str = "") -> list[str]:
-    """Return the options that give another command the values of a record.
+    """Return the command-line options that pass the values of a record to another command.
 
     Args:
         record: a dataclass, such as `FrameOptions` or `RecognizerArguments`.
-        without: name of a field that is no option.
+        without: name of a field that is not an option.
     """
     given = [(f"--{name.replace('_', '-')}", value) for name, value in given_values(record).items() if name != without]
     return [str(part) for pair in given for part in pair]
 
 
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
-    """Raise InputError if an option that needs `owner` is given without it; values of None are not given."""
+    """Raise InputError if an option that needs `owner` is given without it; None means that it was not given."""
     for name, value in values.items():
         if value is not None and not is_given:
             raise InputError(f"{name} is {value}; it belongs to {owner}")
 
 
 def check_alone(option: str, given: object, **values: object) -> None:
-    """Raise InputError if `option` is given together with one that it excludes."""
+    """Raise InputError if `option` is given together with an option that it excludes."""
     for name, value in values.items():
         value = ", ".join(map(str, value)) if isinstance(value, list) else value
         if value and given:
@@ -130,34 +130,34 @@ class FrameOptions:
 
     frames: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="FRAME", help="Folders of frames, or frames: color, depth, mask, intrinsics."),
+        typer.Argument(metavar="FRAME", help="Frames: folders with color, depth, mask, intrinsics; or their parents."),
     ] = None
-    color: Annotated[Path | None, typer.Option(help="Color image, PNG or JPEG, in place of FRAME.")] = None
+    color: Annotated[Path | None, typer.Option(help="Colour image, PNG or JPEG, in place of FRAME.")] = None
     depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None
     labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None
     intrinsics: Annotated[
         Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
     ] = None
     depth_scale: Annotated[
-        float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
+        float | None, typer.Option(help="Depth units per metre. Default: as in the intrinsics, or 1000.")
     ] = None
     bag: Annotated[
         Path | None, recording_option(help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags).")
     ] = None
-    color_topic: Annotated[str | None, recording_option(help="Colour images. Default: the topic that has them.")] = None
-    depth_topic: Annotated[str | None, recording_option(help="Depth aligned to colour. Default: likewise.")] = None
-    camera_topic: Annotated[str | None, recording_option(help="camera_info of this camera. Default: likewise.")] = None
-    max_gap: Annotated[float, recording_option(help="Seconds between colour and depth, at most.")] = DEFAULT_MAX_GAP
+    color_topic: Annotated[str | None, recording_option(help="Topic of colour images. Default: the only one.")] = None
+    depth_topic: Annotated[str | None, recording_option(help="Topic of aligned depth. Default: the only one.")] = None
+    camera_topic: Annotated[str | None, recording_option(help="Topic of camera_info. Default: the only one.")] = None
+    max_gap: Annotated[float, recording_option(help="Largest gap from colour to depth, seconds.")] = DEFAULT_MAX_GAP
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     @property
     def arguments(self) -> list[str]:
-        """The arguments that give the same frames to another command."""
+        """The arguments that pass the same frames to another command."""
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in self.frames or ()]
         return [*frames, *given_options(self, without="frames")]
 
     def check(self) -> None:
-        """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""
+        """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
         of_bag = ("color_topic", "depth_topic", "camera_topic", "max_gap", "every")
         given = given_values(self)
@@ -168,12 +168,12 @@ class FrameOptions:
     def sources(
         self, segment: str | None = None, model: "Segmenter | None" = None, *, masks: bool = True
     ) -> list["FrameSource"]:
-        """Return the frames, of which none is read yet.
+        """Return the frames, without reading them yet.
 
         Args:
-            segment: segmenter whose labels replace those of the frames; None reads them, and segments recordings.
-            model: the segmenter "model", where the command has one.
-            masks: whether the frames need labels; without, recordings are not segmented.
+            segment: segmenter that replaces the labels of the frames; None reads the labels, and segments recordings.
+            model: the segmenter "model", if the command has one.
+            masks: whether the frames need labels; if not, recordings are not segmented.
 
         Raises:
             InputError: the options contradict each other, or a folder or a recording cannot be read.
@@ -206,7 +206,7 @@ class FrameOptions:
         return [segmented_source(source, segmenter) for source in sources]
 
     def open_bag(self) -> "Bag":
-        """Return the recording, which is not opened yet."""
+        """Return the recording, without opening it yet."""
         from thor2_jax.frames.frames import read_intrinsics
         from thor2_jax.recordings.bags import Bag
 
@@ -217,17 +217,17 @@ class FrameOptions:
 
 
 def find_segmenter(name: str, model: "Segmenter | None" = None) -> "Segmenter":
-    """Return the segmenter of this name; `model` is the segmenter "model", where the command has one."""
+    """Return the segmenter with this name; `model` is the segmenter "model", if the command has one."""
     from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
 
     if model is None or name != MODEL:
         return load_segmenter(name)
-    load_segmenter(TABLE)  # "model" begins with its pieces, and its package may be missing
+    load_segmenter(TABLE)  # "model" starts from its segments; this raises if its package is missing
     return model
 
 
 def grouped_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command take the fields of its parameters that are dataclasses of options, such as `FrameOptions`."""
+    """Decorate a command: replace parameters that are dataclasses of options (`FrameOptions`) by their fields."""
     own = inspect.signature(command).parameters.values()
     groups: dict[str, Any] = {one.name: one.annotation for one in own if dataclasses.is_dataclass(one.annotation)}
     fields = {name: inspect.signature(group).parameters for name, group in groups.items()}
@@ -247,7 +247,7 @@ class ManyFrames(TyperCommand):
     """A command whose option --frames takes all values up to the next option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, with --frames before each value that follows it."""
+        """Parse the arguments after repeating --frames before each value that follows it."""
         expanded: list[str] = []
         taking = False
         for argument in args:
@@ -265,7 +265,7 @@ def split_names(names: str) -> list[str]:
 
 
 MAX_WORKERS = 1024
-"""Largest number of processes of a command: each needs memory and open files."""
+"""Largest number of processes of a command; each process needs memory and open files."""
 
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
@@ -274,22 +274,22 @@ WorkersOption = Annotated[
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
-    """Where a command computes."""
+    """Options that choose where a command computes: in this process, in worker processes or on a Ray cluster."""
 
     workers: WorkersOption = 1
     engine: Annotated[
         Literal["local", "ray"],
-        typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),
+        typer.Option(help="Compute on this machine or on a Ray cluster (extra `cluster`) with the same paths."),
     ] = "local"
     address: Annotated[
-        str | None, typer.Option(help="Address of the Ray cluster. Default: the one on this machine.")
+        str | None, typer.Option(help="Address of the Ray cluster. Default: the cluster on this machine.")
     ] = None
 
     def pool(self) -> "WorkerPool | None":
-        """Return the worker pool of these options; None stands for this process alone.
+        """Return the worker pool of these options; None means this process alone.
 
         Raises:
-            InputError: `address` without Ray, or Ray is not installed.
+            InputError: `address` is given without Ray, or Ray is not installed.
         """
         from training.storage.workers import local_workers, ray_workers
 
@@ -302,6 +302,6 @@ class WorkerOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RenderWorkers(WorkerOptions):
-    """Where views are rendered; by default, in two processes."""
+    """Options that choose where views are rendered; by default, in two processes."""
 
     workers: WorkersOption = 2

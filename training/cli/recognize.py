@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
 
 MAX_LISTED = 5
-"""Failed frames that the last line lists."""
+"""Largest number of failed frames that the last line lists."""
 
 
 @app.command()
@@ -41,7 +41,7 @@ def recognize(
         Path | None, typer.Option(help="JSON of camera poses for --track: frame -> 4 x 4 matrix, camera to world.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory for recognition.json and overlay.png, of each FRAME in OUT/<frame>.")
+        Path | None, typer.Option(help="Directory for recognition.json and overlay.png; OUT/<frame> for each FRAME.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each frame.")] = False,
     coco: Annotated[Path | None, typer.Option(metavar="FILE", help="Write COCO results (JSON with masks).")] = None,
@@ -60,7 +60,7 @@ def recognize(
     """Recognize every instance of RGB-D frames.
 
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
-    the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
+    the frames are a sequence of one camera, in the order of their names, and an object has one name in all frames.
     """
     from thor2_jax.files import check_output_directory, check_output_file
     from thor2_jax.model import result_files

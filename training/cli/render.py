@@ -12,7 +12,7 @@ from training.cli.app import app, finish, show_progress
 
 @dataclasses.dataclass(frozen=True)
 class AugmentationOptions:
-    """The augmentations of the copies."""
+    """The augmentations applied to the copies."""
 
     illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False
     sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise, smoothing and gaps of depth.")] = False
@@ -21,7 +21,7 @@ class AugmentationOptions:
     registration: Annotated[
         bool, typer.Option("--registration", help="Augment: blurred colour, shifted against depth.")
     ] = False
-    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest part.")] = False
+    base: Annotated[bool, typer.Option("--base", help="Augment: masks that lack the lowest part.")] = False
 
 
 @app.command()
@@ -46,9 +46,9 @@ def render(
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes.
 
-    With --crops, the views are rendered once more, also for a finished dataset, and their crops of colour and surface
-    normals are written to OUT/crops: the networks among the baselines of `train` are trained on them (224 pixels, their
-    small variants 96).
+    With --crops, the views are rendered a second time, and crops of their colour and surface normals are written to
+    OUT/crops. This also works for a finished dataset. The image networks among the baselines of `train` are trained on
+    the crops (224 pixels; 96 for their small variants).
     """
     from training.augmentation.augmentations import Augmentations
     from training.objects.meshes import find_meshes, scaled_meshes

@@ -16,25 +16,25 @@ def serve(
     model: options.ModelOption,
     host: options.HostOption = "127.0.0.1",
     allow_host: options.AllowHostOption = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one, named in the log.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free port, which is logged.")] = 8080,
     workers: Annotated[
         int, typer.Option(min=1, max=options.MAX_WORKERS, help="Server processes, each with its own model and queue.")
     ] = 1,
     processes: Annotated[
         int, typer.Option(min=1, max=options.MAX_WORKERS, help="Processes per worker that decode and prepare frames.")
     ] = 2,
-    queue: Annotated[int, typer.Option(min=1, help="Requests per worker at a time; others get status 429.")] = 32,
+    queue: Annotated[int, typer.Option(min=1, help="Concurrent requests per worker; others get status 429.")] = 32,
     deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0,
     max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32,
     unknown_below: options.UnknownOption = None,
     cache: Annotated[
-        Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
+        Path | None, typer.Option(help="Directory for compiled programs, which makes the next start faster.")
     ] = None,
     gallery: options.GalleryOption = None,
-    teach: Annotated[bool, typer.Option("--teach", help="Let callers enroll and forget objects.")] = False,
+    teach: Annotated[bool, typer.Option("--teach", help="Let clients enroll and forget objects.")] = False,
     segment: Annotated[
         str | None,
-        typer.Option(help="Segmenter of frames without labels, or none. Default: table, if OpenCV is installed."),
+        typer.Option(help="Segmenter for frames without labels, or none. Default: table, if OpenCV is installed."),
     ] = None,
     adapt: Annotated[
         bool, typer.Option("--adapt", help="Estimate the camera's colours from the latest frames, and correct them.")
@@ -42,7 +42,7 @@ def serve(
     warm_why: Annotated[
         bool,
         typer.Option(
-            help="Compile explanations (/v1/why) in the background after the start, not only from the first request on."
+            help="Compile explanations (/v1/why) in the background after the start, rather than at the first request."
         ),
     ] = True,
     token: Annotated[
@@ -59,7 +59,7 @@ def serve(
 
         settings = Settings(
             model,
-            os.environ.get("THOR2_TOKEN") if token is None else token,  # typer ignores an empty one
+            os.environ.get("THOR2_TOKEN") if token is None else token,  # Typer ignores an empty variable
             queue,
             deadline,
             max_batch,

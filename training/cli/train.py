@@ -11,10 +11,10 @@ from training.cli.app import app, console, finish, show_progress
 
 
 class _TrainCommand(options.ManyFrames):
-    """The command, whose help states the defaults of the protocols."""
+    """The train command. Its help states the defaults of the protocols."""
 
     def insert_values(self) -> None:
-        """Insert the values into the help; the protocols take a second to import, so this is not done before."""
+        """Insert the values into the help, only when it is shown, since importing the protocols takes a second."""
         from training.protocol import DEFAULT, PAPER, QUICK
 
         parameters: list[Any] = self.params
@@ -36,7 +36,7 @@ def train(
     ] = None,
     frames: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR...", help="Folders of labelled frames, whose instances are views, too."),
+        typer.Option(metavar="DIR...", help="Folders of labelled frames; their instances are used as views, too."),
     ] = None,
     names: options.NamesOption = None,
     paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
@@ -58,7 +58,7 @@ def train(
     classifiers: Annotated[
         str | None,
         typer.Option(
-            help="The paper's classifiers to train beside the embedding, comma-separated: tops, tops2, ce. (none; "
+            help="The paper's classifiers to train, too, comma-separated: tops, tops2, ce. (none; "
             "without an embedding, as with --paper: all)"
         ),
     ] = None,
@@ -78,20 +78,20 @@ def train(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
     folds: Annotated[
-        int, typer.Option(min=1, max=1000, help="More than 1: one model per fold, which is its held-out set.")
+        int, typer.Option(min=1, max=1000, help="Number of folds; if more than 1, one model per held-out fold.")
     ] = 1,
     baselines: Annotated[
         str,
         typer.Option(
-            help="Comma-separated baselines to train too: thor, forest, pointnet; rcfusion, vit-cnn, rgbd-vit, each "
-            "also with -small; templates."
+            help="Comma-separated baselines to train, too: thor, forest, pointnet, templates, rcfusion, vit-cnn, "
+            "rgbd-vit; the last three also with -small."
         ),
     ] = "",
     weights: Annotated[
         Path | None,
         typer.Option(help="Directory of pretrained weights (safetensors) for the networks. Default: from scratch."),
     ] = None,
-    leave_out: Annotated[str, typer.Option(help="Comma-separated objects to train without.")] = "",
+    leave_out: Annotated[str, typer.Option(help="Comma-separated objects to leave out of the training.")] = "",
     sequences: Annotated[
         Path | None,
         typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
@@ -109,12 +109,12 @@ def train(
         int | None,
         typer.Option(
             min=0,
-            help="Further samples of each view for the classifiers, in random orientations. "
+            help="Additional samples of each view in random orientations, for the classifiers. "
             "({default.orientation_copies}; paper: {paper.orientation_copies})",
         ),
     ] = None,
     distractors: Annotated[
-        Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
+        Path | None, typer.Option(help="Directory of meshes of further distractors: objects of none of the classes.")
     ] = None,
     mesh_scale: options.MeshScaleOption = 1.0,
     workers: Annotated[int, typer.Option(min=1, max=options.MAX_WORKERS, help="Rendering processes.")] = 2,
@@ -127,22 +127,23 @@ def train(
 ) -> None:
     """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
 
-    A run recognizes objects by an embedding: several small networks, fitted on the views and on distractors, objects
-    that are none of the classes, so that unknown objects get a low confidence. New objects are enrolled with it, too.
+    A run recognizes objects by an embedding: several small networks, fitted on the views and on distractors. Since
+    distractors are objects of none of the classes, unknown objects get a low confidence. The embedding is also used to
+    enroll new objects.
 
     With --meshes, each view is used as rendered and in augmented copies, with other light, partial occlusion, depth
-    sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --quick fits fewer networks
-    on fewer distractors. --paper trains the paper's classifiers as the paper does, and no embedding: more
+    sensor errors and inexact masks. A --dataset already contains its augmented copies. --quick fits fewer networks
+    on fewer distractors. --paper trains the paper's classifiers as the paper does, without an embedding: more
     views, no augmented copies, four mirrors of each view and more epochs.
 
-    With --frames, labelled real instances are views of their objects, too, each with augmented copies. Objects may have
+    With --frames, labelled real instances are used as views, too, each with augmented copies. Each object may have
     a mesh, frames or both. A frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json.
 
-    With --baselines, a finished run gets the baselines that it lacks. The image networks among them read crops (see
+    With --baselines, the missing baselines are added to a finished run. The image networks among them read crops (see
     `thor2 render --crops`) and are trained from scratch or from --weights.
 
     With --sequences, one run is trained for each sequence, on its objects only (see `thor2 evaluate ocid
-    --per-sequence`); finished runs must have the same options.
+    --per-sequence`). Finished runs must have been trained with the same options.
     """
     import jax
 

@@ -15,7 +15,7 @@ from training.cli import options
 from training.cli.app import app, finish, print_note
 
 NOTICE_SECONDS = 1.0
-"""Time that pages have to show an error before the server ends."""
+"""Time for which an error is shown on open pages before the server stops."""
 
 
 @app.command()
@@ -25,14 +25,14 @@ def watch(
     folder: Annotated[Path | None, typer.Option(help="Folder of frames.")] = None,
     realsense: Annotated[bool, typer.Option("--realsense", help="A RealSense camera (extra realsense).")] = False,
     segment: Annotated[
-        str | None, typer.Option(help="Segmenter. Default: table; in folders, for frames without labels.")
+        str | None, typer.Option(help="Segmenter. Default: table, in folders only for frames without labels.")
     ] = None,
     track: Annotated[
         bool, typer.Option("--track/--no-track", help="Follow the objects, and fuse the answers of their frames.")
     ] = True,
-    color_topic: Annotated[str | None, typer.Option(help="Colour images of the bag.")] = None,
-    depth_topic: Annotated[str | None, typer.Option(help="Aligned depth images of the bag.")] = None,
-    camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
+    color_topic: Annotated[str | None, typer.Option(help="Topic of the colour images in the bag.")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Topic of the aligned depth images in the bag.")] = None,
+    camera_topic: Annotated[str | None, typer.Option(help="Topic of camera_info in the bag.")] = None,
     unknown_below: options.UnknownOption = None,
     answer_by: options.AnswerByOption = None,
     host: options.HostOption = "127.0.0.1",
@@ -41,10 +41,10 @@ def watch(
 ) -> None:
     """Show the recognized objects of a recording or a camera on a live page, until Ctrl-C.
 
-    A bag plays at the speed at which it was recorded; frames for which there is no time are left out. All frames of a
+    A bag is played at the speed at which it was recorded; frames are dropped if recognition is slower. All frames of a
     folder are shown.
     """
-    # `main` repeats a KeyboardInterrupt that is lost in a finalizer or in a callback of JAX.
+    # `main` repeats a KeyboardInterrupt that was lost in a finalizer or in a callback of JAX.
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
         from thor2_jax.frames.frames import RecordedFrame
         from thor2_jax.recordings.realsense import RealSenseCamera
@@ -85,6 +85,6 @@ def watch(
         view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
         shown = f"no more frames, {view.n_frames} were recognized; Ctrl-C ends"
         source = [folder or "FRAME"] if bag is None else ["--bag", bag]
-        finish(shown, "keep the names", "recognize", *source, "--model", model, "--out", "answers", file=sys.stderr)
+        finish(shown, "store the answers", "recognize", *source, "--model", model, "--out", "answers", file=sys.stderr)
         while True:
             time.sleep(60)

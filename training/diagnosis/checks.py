@@ -1,4 +1,4 @@
-"""Findings of the diagnosis of a set-up, and checks of intrinsics, the label image and the unit of meshes."""
+"""Findings of a diagnosis, and checks of the intrinsics, the label image and the unit of meshes."""
 
 import dataclasses
 import math
@@ -19,12 +19,12 @@ __all__ = ["Diagnosis", "check_camera", "check_labels", "check_meshes"]
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something that is likely wrong.
+    """A likely mistake in a set-up.
 
     Attributes:
         code: short name of the problem, for machines: "depth-unit", "intrinsics-size", ...; docs/frames.md lists them.
-        message: the measurement and its meaning, in plain words.
-        advice: remedy for the user.
+        message: the measurement and its meaning, for users.
+        advice: what the user can do.
     """
 
     code: str
@@ -38,7 +38,7 @@ class Diagnosis:
 
     Attributes:
         findings: likely mistakes; empty for a sound set-up.
-        notes: checks that were not possible, and why.
+        notes: checks that were not possible, with the reasons.
     """
 
     findings: list[Finding] = dataclasses.field(default_factory=list)
@@ -50,7 +50,7 @@ class Diagnosis:
 
 
 MAX_OFF_CENTRE = 0.12
-"""Largest distance of the principal point from the centre of the image, as a fraction of its side. Cameras have .03."""
+"""Largest distance of the principal point from the image centre, as a fraction of the side; usual cameras have 0.03."""
 
 MAX_PIXEL_ASPECT = 1.15
 """Largest ratio of the focal lengths."""
@@ -99,23 +99,23 @@ def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, heigh
 
 
 MAX_INSTANCES = 150
-"""Largest number of instances on a table."""
+"""Largest plausible number of instances on a table."""
 
 MAX_INSTANCE_SHARE = 0.6
-"""Largest share of the image that one instance covers."""
+"""Largest plausible share of the image covered by one instance."""
 
 MAX_THIN_SHARE = 0.34
-"""Largest share of the instances that vanish if their border of one pixel is removed."""
+"""Largest plausible share of thin instances, which vanish if their border of one pixel is removed."""
 
 MIN_THIN = 3
-"""Least number of such instances that counts."""
+"""Smallest number of thin instances for a finding."""
 
 MIN_PIECES, MIN_PIECE_SHARE = 3, 0.08
-"""Pieces of the only instance of a frame, each with this share of its pixels, that show a mask of the foreground."""
+"""Smallest number of pieces, and share of each, at which the only instance is taken for a foreground mask."""
 
 
 def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> None:
-    """Check whether an image [H, W] of integers numbers instances."""
+    """Check whether an image [H, W] of integers contains instance numbers."""
     values, counts = np.unique(labels[labels != 0], return_counts=True)
     advice = "Give an image in which 0 is background and each object has a number of its own; see docs/frames.md."
     if not len(values):
@@ -153,18 +153,18 @@ def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> None:
 
 
 USUAL_SIDE = (0.03, 0.6)
-"""Range of the median longest side of objects on a table, metres."""
+"""Plausible range of the median longest side of objects on a table, metres."""
 
 SCALES = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches", 1000.0: "kilometres"}
 
 
 def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float = 1.0) -> dict[str, float]:
-    """Check the unit of mesh files; return object -> longest side in metres, or nothing if the unit is likely wrong.
+    """Check the unit of mesh files; return object -> longest side in metres, empty if the unit is likely wrong.
 
     Args:
         diagnosis: receives the findings.
         meshes: object -> mesh file.
-        scale: factor that converts their unit to metres.
+        scale: factor from the unit of the meshes to metres.
     """
     sides = {}
     for name, path in meshes.items():

@@ -1,7 +1,7 @@
-"""Checks of colour: light and cast in the image alone, the order of the channels with a trained recognizer.
+"""Checks of colour: light and colour cast from the image alone, and the channel order with a trained recognizer.
 
-One frame does not show whether red and blue are exchanged: apples may be blue. A recognizer knows its objects, so its
-confidence is higher with the channels in the right order.
+A frame alone does not show whether red and blue are exchanged, since the colours of its objects are unknown. A trained
+recognizer is more confident of its objects if the channels are in the right order.
 """
 
 import dataclasses
@@ -18,26 +18,26 @@ from training.diagnosis.checks import Diagnosis
 __all__ = ["check_channel_order", "check_light"]
 
 MIN_BRIGHTNESS = 22.0
-"""Least mean value of the pixels of the instances, of 255."""
+"""Smallest plausible mean value of the pixels of the instances, from 0 to 255."""
 
 MAX_SATURATED = 0.65
-"""Largest share of the pixels of the instances with a channel at its maximum."""
+"""Largest plausible share of pixels of the instances with a channel at its maximum."""
 
 MAX_CAST = 2.2
-"""Largest ratio of the contrasts of two channels (generalized mean of order 4), which are equal in white light."""
+"""Largest plausible ratio of two channels' contrasts (generalized means of order 4), which are equal in white light."""
 
 MIN_LOGIT_GAIN = 0.2
-"""Least gain of a recognizer's mean log-odds with exchanged channels."""
+"""Smallest gain of a recognizer's mean log-odds with exchanged channels, for a finding."""
 
 MIN_CONFIDENCE_GAIN = 0.2
-"""Least gain of a recognizer's mean confidence with other light."""
+"""Smallest gain of a recognizer's mean confidence with other light, for a finding."""
 
 MAX_LOGIT = 7.0
 
 MIN_OBJECTS = 2
-"""Least number of objects for a verdict on the order of the channels."""
+"""Smallest number of objects for a finding on the channel order."""
 
-FAR = "The colours are far from those of training"
+FAR = "The colours differ strongly from the training views"
 
 LIGHTS = {
     "half as bright": (0.5, 0.5, 0.5),
@@ -47,7 +47,7 @@ LIGHTS = {
     "greener": (0.7, 1.3, 0.7),
     "less green": (1.4, 0.7, 1.4),
 }
-"""Factors of red, green and blue that are tried."""
+"""Tested changes of light -> factors of red, green and blue."""
 
 
 def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any] | None) -> None:
@@ -82,7 +82,7 @@ def _contrast(channel: NDArray[np.uint8]) -> float:
 
 
 def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer) -> None:
-    """Check the order of the channels and the light of a frame by the confidence of a recognizer."""
+    """Check the channel order and the light of a frame by the confidence of a recognizer."""
 
     def confidences(color: NDArray[np.uint8]) -> NDArray[np.float64]:
         answers = recognizer.recognize(dataclasses.replace(frame, color=color))
@@ -91,8 +91,8 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
     given, exchanged = confidences(frame.color), confidences(np.ascontiguousarray(frame.color[..., ::-1]))
     if len(given) < MIN_OBJECTS or not recognizer.classes:
         diagnosis.notes.append(
-            f"order of the colour channels: not checked, since {len(given)} objects could be described; it takes "
-            f"{MIN_OBJECTS} that the model knows"
+            f"order of the colour channels: not checked, since {len(given)} objects could be described; expected at "
+            f"least {MIN_OBJECTS} objects of the model"
         )
         return
     lights = {name: confidences(_lit(frame.color, factors)) for name, factors in LIGHTS.items()}
@@ -102,7 +102,7 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
             "bgr",
             f"With red and blue exchanged, the model is more confident of the {len(given)} objects (mean confidence "
             f"{exchanged.mean():.2f} instead of {given.mean():.2f}): the colour image is BGR, not RGB.",
-            "Store RGB; OpenCV's imread and cvtColor give BGR, imwrite expects it.",
+            "Store images as RGB; note that OpenCV's imread returns BGR and imwrite expects BGR.",
         )
     elif lights[best].mean() - given.mean() > MIN_CONFIDENCE_GAIN:
         diagnosis.add(

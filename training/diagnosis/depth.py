@@ -1,4 +1,4 @@
-"""Checks of depth: its unit, its range and its missing pixels, and the focal length by the sizes of known meshes."""
+"""Checks of the unit, range and missing pixels of depth, and of the focal length by the sizes of known meshes."""
 
 import math
 from collections.abc import Mapping
@@ -12,45 +12,45 @@ from training.diagnosis.checks import Diagnosis
 __all__ = ["check_depth", "instance_extents"]
 
 MIN_VALID_INSTANCES = 0.3
-"""Least share of the pixels of instances that have depth."""
+"""Smallest plausible share of the pixels of instances that have depth."""
 
 MIN_VALID_IMAGE = 0.15
-"""Least share of the pixels of the whole image that have depth, if there are no labels."""
+"""Smallest plausible share of the pixels of the whole image that have depth, if there are no labels."""
 
 MIN_IN_RANGE = 0.5
-"""Least share of the pixels with depth that lie within `MIN_DEPTH` and `MAX_DEPTH`."""
+"""Smallest plausible share of the pixels with depth that lie between `MIN_DEPTH` and `MAX_DEPTH`."""
 
 MIN_EXTENT, MAX_EXTENT = 0.02, 0.45
-"""Range of the median longest side of the objects of a frame, metres, if no meshes are given."""
+"""Plausible range of the median longest side of a frame's objects, metres, if no meshes are given."""
 
 EXTENT_MARGIN = 2.0
-"""Largest factor by which the median object is smaller or larger than all meshes."""
+"""Largest plausible factor by which the median object is smaller or larger than all meshes."""
 
 MAX_RATIO = 1.35
-"""Largest median ratio of an object's visible longest side to that of its mesh. Sound frames have 0.8 to 1.1, occluded
-objects less, so that a focal length that is too large does not show."""
+"""Largest plausible median ratio of an object's visible longest side to the longest side of its mesh. It is 0.8 to 1.1
+in correct frames and less for occluded objects, so a focal length that is too large cannot be detected."""
 
 MAX_FOCAL_FACTOR = 3.0
-"""Largest factor of sizes that a focal length explains; a unit of depth is wrong by a larger one."""
+"""Largest factor of sizes that is attributed to the focal length; a wrong unit of depth causes larger factors."""
 
 MIN_ROOM, MAX_ROOM = 0.12, 8.0
-"""Range of median depths that need no other unit, metres, if there are no labels to measure."""
+"""Plausible range of the median depth, metres, if there are no labels to measure."""
 
 USUAL_EXTENT, USUAL_DISTANCE = 0.15, 0.8
-"""Longest side and distance of most objects, metres; they choose among the depth scales that are possible."""
+"""Typical longest side and distance of objects, metres, for choosing among the possible depth scales."""
 
 DEPTH_SCALES = (1000.0, 10_000.0, 5000.0, 4000.0, 100.0, 1.0)
-"""Depth scales in use, the most frequent one first."""
+"""Common depth scales, the most frequent one first."""
 
 MIN_PIXELS = 50
-"""Least number of pixels with depth of an instance that is measured."""
+"""Smallest number of pixels with depth for measuring an instance."""
 
 
 def instance_extents(frame: RGBDFrame) -> dict[int, float]:
     """Return label -> longest side of the visible part of the instance, metres.
 
-    Sides run from the 2nd to the 98th percentile along the principal axes of the points whose depth is within a quarter
-    of the median. Instances with few pixels are left out.
+    A side is the distance from the 2nd to the 98th percentile along a principal axis of the points. Only points with a
+    depth within a quarter of the median are used. Instances with few pixels are left out.
     """
     extents = {}
     depths = frame.depth_m.ravel()
@@ -79,9 +79,9 @@ def check_depth(
     Args:
         diagnosis: receives the findings.
         frame: the frame.
-        mesh_sides: object -> longest side of its mesh, metres, which the objects are compared with.
-        names: label -> object, if it is known.
-        trust_camera: whether the intrinsics are right, so that extents mean something.
+        mesh_sides: object -> longest side of its mesh, metres, with which the objects are compared.
+        names: label -> object, if known.
+        trust_camera: whether the intrinsics are right, so that extents can be used.
     """
     labelled = frame.labels is not None and bool((frame.labels != 0).any())
     depth, where, least = frame.depth_m, "the image", MIN_VALID_IMAGE
@@ -122,8 +122,9 @@ def _check_focal_length(
 ) -> bool:
     """Check the sizes of objects at a plausible distance against their meshes; return whether fx, fy are too small.
 
-    Where no object has a name, as many meshes are compared in the order of their sizes, and otherwise the longest mesh
-    bounds all objects. If one instance is much larger, `_check_unit` says that it covers several objects.
+    If no object has a name and there are as many meshes as objects, they are compared in the order of their sizes.
+    Otherwise, the longest mesh is the upper bound for all objects. `_check_unit` reports a single instance that is much
+    larger, since it may cover several objects.
     """
     ratios = [extent / mesh_sides[names[label]] for label, extent in extents.items() if names.get(label) in mesh_sides]
     largest = MAX_FOCAL_FACTOR
@@ -165,7 +166,7 @@ def _check_unit(
         measured = f"The objects would measure {size} at a distance of {distance}{of_meshes}"
 
     def misfit(factor: float) -> float:
-        """Return how badly depth times a factor fits, or infinity."""
+        """Return the misfit of depth times a factor, or infinity if it is implausible."""
         fits = extent is None or low <= extent * factor <= high
         if not fits or not MIN_DEPTH <= median * factor <= MAX_DEPTH:
             return math.inf

@@ -1,8 +1,8 @@
-"""Whether edges of depth, or of labels, lie on edges of colour.
+"""Check whether edges of depth, or of labels, lie on edges of colour.
 
-The fields of oriented edges are correlated over all shifts up to `MAX_SHIFT` pixels. Orientations are doubled angles:
-an edge from dark to bright equals one from bright to dark, and random edges cancel. In registered frames the peak lies
-within three pixels of no shift and stands many standard deviations above the rest.
+The fields of oriented edges are correlated over all shifts up to `MAX_SHIFT` pixels. Orientations are doubled angles,
+so that edges from dark to bright and from bright to dark are equal, and random edges cancel out. In registered frames,
+the correlation peaks at a shift of at most three pixels, many standard deviations above the rest.
 """
 
 from typing import Any, NamedTuple
@@ -16,25 +16,25 @@ from training.diagnosis.checks import Diagnosis
 __all__ = ["check_labels_alignment", "check_registration"]
 
 MAX_SHIFT = 48
-"""Largest shift that is searched, pixels of an image of 640 columns."""
+"""Largest shift in the search, pixels of an image with 640 columns."""
 
 MAX_REGISTERED = 8.0
-"""Largest shift of a registered frame, pixels of an image of 640 columns. Some cameras shift by a few pixels."""
+"""Largest shift of a registered frame, pixels of an image with 640 columns. Some cameras shift by a few pixels."""
 
 MIN_EDGES = 150
-"""Least number of pixels on edges for a verdict."""
+"""Smallest number of pixels on edges for a finding."""
 
 MIN_EDGES_UNRELATED = 250
-"""Least number for the verdict that no shift fits: a box seen from above has one or two straight steps."""
+"""Smallest number of pixels on edges for the finding that no shift fits, since a box has only a few straight edges."""
 
 MIN_PEAK = 6.0
-"""Least height of a peak, in standard deviations of the correlation elsewhere."""
+"""Smallest height of a peak, in standard deviations of the correlation elsewhere."""
 
 MIN_NEAR = 4.0
-"""Least height without a shift, in the same unit, of a frame that may be registered."""
+"""Smallest height near zero shift, in the same unit, at which a frame may be registered."""
 
 MIN_GAIN = 1.25
-"""Least ratio of a peak to the one without a shift or a transformation."""
+"""Smallest ratio of a peak to the peak without a shift or a transformation."""
 
 WIDTH = 640
 
@@ -44,16 +44,16 @@ Field = NDArray[np.complex128]
 
 
 class Alignment(NamedTuple):
-    """The best shift of an edge field onto another one.
+    """The best shift of one edge field onto another.
 
     Attributes:
-        right: columns by which the first must be moved.
-        down: rows by which the first must be moved.
+        right: columns by which the first field must be moved.
+        down: rows by which the first field must be moved.
         peak: mean correlation at this shift; 1 is perfect.
         near: largest mean correlation at shifts up to `MAX_REGISTERED`.
         height: `peak` in standard deviations of the correlation at other shifts.
         near_height: `near` in the same unit.
-        n_edges: pixels on edges of the first field.
+        n_edges: number of pixels on edges of the first field.
     """
 
     right: int
@@ -88,13 +88,13 @@ def color_edges(color: NDArray[np.uint8]) -> Field:
 
 
 def depth_edges(depth_m: NDArray[np.floating[Any]]) -> Field:
-    """Return the oriented steps of a depth image, on the side that is nearer to the camera."""
+    """Return the oriented steps of a depth image, on the side nearer to the camera."""
     is_valid = depth_m > 0
     if not is_valid.any():
         return np.zeros(depth_m.shape, np.complex128)
     nearest = ndimage.distance_transform_edt(~is_valid, return_distances=False, return_indices=True)
     filled = depth_m[tuple(nearest)].astype(np.float64)
-    # Steps are relative, so that a wrong unit of depth changes nothing.
+    # Steps are relative, so that the unit of depth does not matter.
     filled /= np.median(filled)
     low, high = ndimage.minimum_filter(filled, 3), ndimage.maximum_filter(filled, 3)
     is_edge = is_valid & (high - low > 0.025 * np.maximum(low, 1)) & (filled <= low + 0.0125)
@@ -109,13 +109,13 @@ def label_edges(labels: NDArray[Any]) -> Field:
 
 
 def _spectrum(fixed: Field) -> Field:
-    """Return the Fourier transform of edges [H, W] with a margin of `MAX_SHIFT`, at an efficient size."""
+    """Return the Fourier transform of edges [H, W] with a margin of `MAX_SHIFT`, padded to an efficient size."""
     shape = [fft.next_fast_len(n + 2 * MAX_SHIFT) for n in fixed.shape]
     return fft.fft2(np.pad(fixed, MAX_SHIFT).astype(np.complex64), shape)
 
 
 def _align(moved: Field, spectrum: Field) -> Alignment:
-    """Return the best shift of the edges `moved` [H, W] onto those with this `_spectrum`."""
+    """Return the best shift of the edges `moved` [H, W] onto the edges with this `_spectrum`."""
     n_edges, reach = int(np.count_nonzero(moved)), MAX_SHIFT
     product = spectrum * np.conj(fft.fft2(moved.astype(np.complex64), spectrum.shape))
     correlation = fft.ifft2(product)[: 2 * reach + 1, : 2 * reach + 1].real / max(n_edges, 1)
@@ -129,13 +129,13 @@ def _align(moved: Field, spectrum: Field) -> Alignment:
 
 
 def _reduced(color: NDArray[np.uint8], other: NDArray[Any]) -> tuple[int, NDArray[np.uint8], NDArray[Any]]:
-    """Return n, and every n-th pixel of both images, which then have about `WIDTH` columns."""
+    """Return n and every n-th pixel of both images, which reduces them to about `WIDTH` columns."""
     step = max(round(color.shape[1] / WIDTH), 1)
     return step, color[::step, ::step], other[::step, ::step]
 
 
 def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
-    """Return an image enlarged about its centre, of the same size; 0 outside."""
+    """Return an image enlarged about its centre, in an array of the same size; 0 outside."""
     height, width = image.shape
     rows, columns = (np.rint((np.arange(n) - (n - 1) / 2) / factor + (n - 1) / 2).astype(int) for n in (height, width))
     inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
@@ -170,9 +170,9 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
         shift = f", and {_shift(best, step)}" if best.distance > MAX_REGISTERED else ""
         message = f"The depth image is {name} compared with the colour image{shift}: they are not registered."
     elif plain.height >= MIN_PEAK and plain.peak >= MIN_GAIN * plain.near:
-        message = f"{edges} only if depth is {_shift(plain, step)}: they are not registered."
+        message = f"{edges} only if depth is {_shift(plain, step)}: the images are not registered."
     elif plain.near_height < MIN_NEAR and plain.n_edges >= MIN_EDGES_UNRELATED:
-        message = f"{edges} at no shift: they are not registered, or belong to different frames."
+        message = f"{edges} at no shift: the images are not registered, or belong to different frames."
     else:
         return
     advice = "Use the depth image that the camera's driver aligns to the colour image (align_depth, registered depth)."

@@ -34,16 +34,16 @@ def diagnose(
     meshes: Mapping[str, Path] = MappingProxyType({}),
     mesh_scale: float = 1.0,
 ) -> Diagnosis:
-    """Diagnose the set-up that a frame was recorded with.
+    """Diagnose the set-up with which a frame was recorded.
 
-    If `labels.json` is beside the labels, the objects are compared with their own meshes.
+    If there is a `labels.json` beside the labels, each object is compared with its own mesh.
 
     Args:
         files: the files of a frame, with or without labels, or the frame.
-        depth_scale: depth units per metre, in place of the one in the intrinsics of the files.
-        recognizer: a trained recognizer, which is needed to check the order of the colour channels.
+        depth_scale: depth units per metre, replacing the depth scale in the intrinsics of the files.
+        recognizer: a trained recognizer, needed to check the order of the colour channels.
         meshes: object -> mesh file.
-        mesh_scale: factor that converts the meshes to metres.
+        mesh_scale: factor from the unit of the meshes to metres.
 
     Raises:
         InputError: a file is missing.
@@ -61,7 +61,7 @@ def diagnose(
         labels = _read(diagnosis, "labels", lambda: None if files.labels is None else read_labels(files.labels))
         camera = _read(diagnosis, "intrinsics", lambda: frame_intrinsics(files.intrinsics, files.color, depth_scale))
         if files.labels is None:
-            diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
+            diagnosis.notes.append("labels: not given, so the sizes of the objects were not checked")
         elif files.names.is_file():
             names = _read(diagnosis, "names", lambda: read_names(files.names)) or {}
     else:
@@ -81,7 +81,7 @@ def diagnose(
     pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)  # its size was checked
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, pinhole)
     is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)
-    trust_camera = camera_is_right and is_registered  # Without registration the labels are of other pixels.
+    trust_camera = camera_is_right and is_registered  # Without registration, the labels belong to other pixels.
     depth_is_right = _passes(diagnosis, check_depth, frame, sides, names, trust_camera=trust_camera)
     _check_order(diagnosis, frame, recognizer, light_is_right and trust_camera and depth_is_right)
     return diagnosis
@@ -90,7 +90,7 @@ def diagnose(
 def _aligned(
     diagnosis: Diagnosis, name: str, image: NDArray[Any] | None, color: NDArray[np.uint8] | None
 ) -> NDArray[Any] | None:
-    """Return an image that has the size of the colour image; another size is a finding."""
+    """Return an image if it has the size of the colour image; otherwise, add a finding."""
     if image is None or color is None or image.shape == color.shape[:2]:
         return image
     size, color_size = (f"{each.shape[1]} x {each.shape[0]}" for each in (image, color))
@@ -104,7 +104,7 @@ def _aligned(
 
 
 def _passes(diagnosis: Diagnosis, check: Callable[..., None], *arguments: Any, **options: Any) -> bool:
-    """Return whether a check finds nothing."""
+    """Return whether a check adds no finding."""
     n_findings = len(diagnosis.findings)
     check(diagnosis, *arguments, **options)
     return len(diagnosis.findings) == n_findings
@@ -114,7 +114,7 @@ def _check_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer 
     """Check the order of the channels, or note why it is not checked."""
     subject = "order of the colour channels (RGB or BGR): not checked"
     if recognizer is None:
-        diagnosis.notes.append(f"{subject}; one frame does not show it, a model that knows the objects does (--model)")
+        diagnosis.notes.append(f"{subject}, since this needs a model that is trained on the objects (--model)")
     elif frame.labels is None:
         diagnosis.notes.append(f"{subject}, since there are no labels")
     elif not is_sound:
@@ -124,7 +124,7 @@ def _check_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer 
 
 
 def _read(diagnosis: Diagnosis, name: str, read: Callable[[], T]) -> T | None:
-    """Read a file; one of the wrong kind is a finding."""
+    """Read a file; add a finding if it is of the wrong kind."""
     try:
         return read()
     except InputError as error:

@@ -1,10 +1,10 @@
 """Fit the packaged embedding on procedural objects: `python -m training.embedding.build --out FILE`.
 
-The packaged network was fitted with the default options and the weaker augmentations of an earlier version: with the
-present ones, a gallery separates unknown objects less well. The principal components and reference views beside it were
-computed later (benchmarks/notes/accuracy.md). On two cores that other jobs shared, it took 1,280 s: 90 s for
-the views and 1,190 s for the fit. `--meshes` adds the objects of a directory. An interrupted fit resumes from the
-directory FILE.checkpoints when the command is repeated.
+The packaged network was fitted with the default options and the weaker augmentations of an earlier version, since a
+gallery separates unknown objects less well with the present augmentations. Its principal components and reference views
+were computed later (benchmarks/notes/accuracy.md). The fit took 1,280 s on two cores shared with other jobs: 90 s for
+the views and 1,190 s for the fit itself. `--meshes` adds the objects of a directory. When the command is repeated, an
+interrupted fit resumes from the directory FILE.checkpoints.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from training.storage.workers import local_workers
 __all__ = ["build_embedding"]
 
 MESH_WEIGHT = 6
-"""Views of a mesh for each view of a procedural object: its own objects matter most to a run."""
+"""Views of a mesh for each view of a procedural object, since a run must recognize its own objects best."""
 
 
 def build_embedding(
@@ -41,7 +41,7 @@ def build_embedding(
     meshes: Annotated[Path | None, typer.Option(help="directory of other objects (GLB, OBJ, PLY)")] = None,
     workers: Annotated[int, typer.Option(min=1, help="rendering processes; they do not affect the result")] = 2,
 ) -> None:
-    """Fit an embedding and write it to a file; an error names a mesh or an output file that cannot be used."""
+    """Fit an embedding and write it to a file; the error names a mesh or an output file that cannot be used."""
     check_output_file("out", out, lambda path: bool(Embedding.load(path)))
     of_meshes = find_meshes(meshes).values() if meshes else ()
     sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in of_meshes for _ in range(MESH_WEIGHT))]

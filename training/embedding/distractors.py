@@ -1,10 +1,10 @@
-"""Distractors: objects that are none of the classes of a run, and their samples in the user's cache.
+"""Distractors: objects outside the classes of a run, and their samples in the user's cache.
 
-Distractors are procedural objects, or meshes of other objects. They teach an embedding what is unknown; a tenth of them
-is held out, so that the confidence is calibrated on unknown objects that no network was fitted on.
+Distractors are procedural objects, or meshes of other objects. An embedding is fitted on them, too, so that it rejects
+unknown objects. A tenth of them is held out, to calibrate the confidence on unknown objects that no network has seen.
 
-Their samples are kept in the user's cache: all runs use the same ones, and rendering them takes minutes. Each file
-holds the samples of one record of everything that determines them, and is named by the record's digest.
+Their samples are stored in the user's cache, since all runs use the same samples and rendering takes minutes. A file
+holds the samples for one record of everything that determines them, and its name contains the digest of the record.
 """
 
 import contextlib
@@ -36,19 +36,19 @@ __all__ = [
 ]
 
 ONE_HELD_OUT_OF = 10
-"""One of so many distractors is held out."""
+"""One in this many distractors is held out."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Distractors:
-    """Objects that are none of the classes, and how the embedding is fitted on them and the classes.
+    """Distractors, and the settings for fitting the embedding on distractors and classes.
 
     Attributes:
         procedural: number of procedural objects.
         meshes: name -> file of other objects.
         views: views of each distractor.
         epochs: passes over the samples.
-        networks: number of networks in the embedding; docs/decisions.md says why there are several.
+        networks: number of networks in the embedding; docs/decisions.md explains why there are several.
         workers: rendering processes; they do not affect the result.
 
     Raises:
@@ -69,7 +69,7 @@ class Distractors:
 
     @property
     def sources(self) -> list[ObjectSource]:
-        """The meshes and the procedural objects in a random order, always the same, so that both kinds are held out."""
+        """The meshes and the procedural objects in a fixed random order, so that both kinds are held out."""
         mixed: list[ObjectSource] = [*self.meshes.values(), *range(self.procedural)]
         return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
 
@@ -84,7 +84,7 @@ class Distractors:
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that determines the embedding, as JSON holds it."""
+        """Everything about the distractors that determines the embedding, in JSON types."""
         named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
         return named | {"meshes": sorted(self.meshes)}
 
@@ -96,11 +96,11 @@ def distractor_samples(
     config: DescriptorConfig,
     progress: Callable[[int, int], object],
 ) -> Samples:
-    """Return the samples of all distractors: render them, unless the user's cache or a directory has their samples.
+    """Return the samples of all distractors; render them unless they are in the user's cache or in `directory`.
 
     Args:
         distractors: the distractors; labels are indices into `sources`.
-        directory: directory of the training, for the samples so far: an interrupted training resumes.
+        directory: directory of the training for finished samples, so that an interrupted training resumes.
         network: colour network.
         config: descriptor. Static.
         progress: called with (distractors done, number of distractors).
@@ -122,9 +122,9 @@ def distractor_samples(
 
 
 def with_fitted_distractors(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
-    """Return samples of classes, and then those of the distractors that are not held out.
+    """Return the samples of the classes, followed by the samples of the distractors that are not held out.
 
-    The labels of the distractors follow those of the classes without gaps.
+    The labels of the distractors follow the labels of the classes without gaps.
     """
     fitted = distractors.select(np.flatnonzero(distractors.label % ONE_HELD_OUT_OF))
     label = n_classes + fitted.label - fitted.label // ONE_HELD_OUT_OF - 1
@@ -132,16 +132,16 @@ def with_fitted_distractors(samples: Samples, distractors: Samples, n_classes: i
 
 
 def held_out_clouds(distractors: Distractors, first: int) -> list[tuple[int, Cloud]]:
-    """Return label, from `first` on, and cloud, in metres, of each view of the distractors that are held out.
+    """Return the label (from `first` on) and the cloud (in metres) of each view of the held-out distractors.
 
-    They are rendered again: samples are strips in random orientations, without the points that the looks need.
+    The views are rendered again, since samples are strips in random orientations, and the looks need the points.
     """
     objects = dict(list(enumerate(distractors.sources))[::ONE_HELD_OUT_OF])
     return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views)]
 
 
 MAX_FILES = 3
-"""Number of files that are kept; the ones that were used last."""
+"""Number of files that are kept: those used most recently."""
 
 FORMAT = "thor2 samples of distractors"
 NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
@@ -150,17 +150,17 @@ log = logging.getLogger(__name__)
 
 
 def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
-    """Return the samples of a file in the user's cache, if there is one, or build them and store them in it.
+    """Return the samples from a file in the user's cache; if it does not exist, build and store them.
 
-    A cache that cannot be used is logged as a warning.
+    A warning is logged if the cache cannot be used.
 
     Args:
-        name: name of the file, which has the digest of the samples' record.
-        build: returns the samples.
+        name: name of the file, which contains the digest of the samples' record.
+        build: function that returns the samples.
 
     Raises:
-        InputError: as `build`.
-        OSError: as `build`.
+        InputError: `build` raises it.
+        OSError: `build` raises it.
     """
     cache = cache_directory("distractors")
     if cache is None:
@@ -169,7 +169,7 @@ def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
     try:
         if file.is_file():
             samples = Samples(**load_arrays(file))
-            with contextlib.suppress(OSError):  # a read-only cache is used as it is
+            with contextlib.suppress(OSError):  # the cache may be read-only
                 os.utime(file)
             return samples
     except (OSError, ValueError, TypeError) as error:
@@ -180,7 +180,7 @@ def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
 
 
 def _store(samples: Samples, file: Path) -> None:
-    """Store samples unless the file is a user's, or another process is writing."""
+    """Store samples, unless a file of the user has this name or another process is writing."""
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with locked(file.parent):
@@ -193,11 +193,11 @@ def _store(samples: Samples, file: Path) -> None:
     except InputError:
         return  # another process is writing, usually the same file
     except OSError as error:
-        log.warning("the distractors cannot be kept for the next training: %s", error)
+        log.warning("the distractors cannot be stored for the next training: %s", error)
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is one of these, also of an earlier version, and may be replaced or removed."""
+    """Return whether a file holds samples of distractors (of any version) and may be replaced or removed."""
     try:
         return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
     except (ValueError, KeyError, AttributeError):

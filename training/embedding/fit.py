@@ -1,11 +1,11 @@
 """Fit an embedding by a proxy loss: each object has a learned unit vector, to which its views should be most similar.
 
-The loss is the cross-entropy of the scaled cosines between a view and all proxies, less a margin for the view's own
-(Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al., "CosFace", CVPR
-2018). Views of a new object are compared with other views, not with proxies. The proxies of a run's classes also serve
-as a classifier.
+The loss is the cross-entropy of the scaled cosines between a view and all proxies. A margin is subtracted for the
+view's own proxy (Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al.,
+"CosFace", CVPR 2018). Views of a new object are compared with other views, not with proxies. The proxies of a run's
+classes also serve as a classifier.
 
-Reference views of an embedding are chosen from the samples that it was fitted on.
+Reference views of an embedding are chosen from the samples on which it was fitted.
 """
 
 import dataclasses
@@ -35,17 +35,17 @@ from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 __all__ = ["RUN_SIZES", "batch_descriptors", "fit_embedding", "reference_views"]
 
 RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
-"""Sizes of each network of a run; several small networks are steadier than fewer large ones."""
+"""Sizes of each network of a run; several small networks give steadier answers than fewer large networks."""
 
 BASIS_SAMPLES = 2048
-"""Samples whose features determine the principal components."""
+"""Number of samples whose features determine the principal components."""
 
 
 BATCH_SIZE = 256
-"""Samples of a step."""
+"""Number of samples per step."""
 
 RATE = 2e-3
-"""Learning rate of AdamW at the first step; it falls to 0 along a cosine."""
+"""Learning rate of AdamW at the first step; it decays to 0 along a cosine."""
 
 MARGIN = 0.12
 """Subtracted from the cosine between a view and its own proxy."""
@@ -56,7 +56,7 @@ def batch_descriptors(
 ) -> Descriptors:
     """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
     length, overflow = length.astype(jnp.float32), jnp.zeros(len(length), jnp.int32)
-    occupied = length > 0  # a strip of one point has no persistence, so its pair adds nothing to the image
+    occupied = length > 0  # the pair of a strip with one point has no persistence and adds nothing to the image
     strips = Strips(jnp.zeros_like(length), length, occupied, color.astype(jnp.float32), overflow)
     return describe_strips(strips, network, config)
 
@@ -78,7 +78,7 @@ def _projected_features(version: int, network: ColorNetwork, config: DescriptorC
 def _color_basis(
     samples: Samples, network: ColorNetwork, config: DescriptorConfig, sizes: EmbeddingSizes
 ) -> NDArray[np.float32]:
-    """Return the principal components [F, C] of the projected features, not centred: projections keep cosines."""
+    """Return the principal components [F, C] of the projected features, without centring, to preserve cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
     batches = samples.batches(rows, BATCH_SIZE, config)
     features = np.concatenate([_projected_features(sizes.version, network, config, batch) for batch in batches])
@@ -138,25 +138,25 @@ def fit_embedding(
 ) -> Embedding:
     """Fit an embedding, or resume from the last checkpoint.
 
-    On the same machine, equal arguments give equal weights, also if the fit was interrupted.
+    On the same machine, equal arguments give equal weights, even if the fit was interrupted.
 
     Args:
-        samples: of at least two objects.
+        samples: samples of at least two objects.
         network: colour network of the samples.
         config: descriptor of the samples.
         epochs: passes over the samples.
-        checkpoints: of this fit only, written after each epoch.
-        sizes: of the network.
+        checkpoints: checkpoints of this fit only, written after each epoch.
+        sizes: sizes of each network.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
-        classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
-            objects as distractors, are kept. None by default: the proxies are discarded.
-        networks: number of networks, fitted together on the same batches from different weights. Only the first one
-            embeds; all classify. Use 1 without classes.
+        classes: names of the first objects, which the embedding also recognizes. Their proxies are kept, and the
+            proxies of the other objects as distractors. By default, there are no classes and proxies are discarded.
+        networks: number of networks, fitted together on the same batches from different weights. The first network
+            computes the embedding; all networks classify. Use 1 without classes.
         seed: seed for weights, proxies, sample order and dropout.
 
     Raises:
         InputError: there are fewer samples than in a batch, the loss is not finite, or a checkpoint is unreadable.
-        OSError: a checkpoint cannot be written; the previous one stays.
+        OSError: a checkpoint cannot be written; the previous one is kept.
     """
     if len(samples) < BATCH_SIZE:
         raise InputError(f"there are {len(samples)} samples; expected at least {BATCH_SIZE}; add views")
@@ -170,12 +170,12 @@ def fit_embedding(
     n_steps = len(samples) // BATCH_SIZE
     optimizer = _adamw(n_steps * epochs)
     graphs, states = zip(*(initial_state(model, optimizer) for model in (embedding.model, *further)), strict=True)
-    # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
+    # The other networks do not read the colour statistics, which differ most between renderings and cameras.
     seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0
 
     def epoch(number: int) -> Iterator[Batch]:
-        # Order and dropout are drawn from seed and step, so that a resumed fit needs no generator state.
+        # Order and dropout depend only on seed and step, so that a resumed fit needs no generator state.
         order = np.random.default_rng([seed, number]).permutation(len(samples))
         return samples.batches(order[: n_steps * BATCH_SIZE], BATCH_SIZE, config)
 
@@ -199,10 +199,10 @@ def fit_embedding(
 
 
 BACKGROUND_VIEWS = 4096
-"""Views of the background; docs/decisions.md says why."""
+"""Number of background views; docs/decisions.md explains it."""
 
 VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192
-"""Views of each class and, at most, of all classes together."""
+"""Largest number of views per class, and of all classes together."""
 
 
 def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> References:
@@ -210,7 +210,7 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
 
     Args:
         embedding: the embedding.
-        samples: those that it was fitted on; the first labels are those of its classes.
+        samples: the samples on which it was fitted; the first labels belong to its classes.
         seed: seed for the choice of the views.
     """
     rng, n_classes = np.random.default_rng(seed), len(embedding.classes)

@@ -1,11 +1,11 @@
-"""Samples that an embedding is fitted on: the strips of clouds in random orientations.
+"""Samples for fitting an embedding: the strips of clouds in random orientations.
 
     samples = build_samples(range(400), network, config, views=16, pool=local_workers(2), directory=Path("chunks"))
 
-A sample stores only its occupied strips, about a tenth of all, and the statistics of its cloud.
+A sample stores only its occupied strips, about a tenth of all strips, and the statistics of its cloud.
 
-Views of objects are rendered from random cameras, with stronger augmentation than for classifiers: an embedding is used
-on cameras and objects that it never saw; a classifier is fitted on its own objects.
+Views of objects are rendered from random cameras. Their augmentation is stronger than for classifiers, since an
+embedding is used for new objects, while a classifier is fitted on its own objects.
 """
 
 import contextlib
@@ -58,10 +58,10 @@ COPIES = 2
 
 
 class Batch(NamedTuple):
-    """B samples as host arrays; the strips of a batch give its descriptors.
+    """B samples as host arrays; the descriptors are computed from the strips.
 
     Attributes:
-        length: [B, S, J] float16, largest less smallest y of each strip, scaled units; 0 if it is empty.
+        length: [B, S, J] float16, largest minus smallest y of each strip, scaled units; 0 for an empty strip.
         color: [B, S, J, R] float16, colour vectors of the strips.
         statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics` and `balanced_histogram`.
         label: [B] int32.
@@ -95,11 +95,11 @@ class Samples:
 
     @classmethod
     def concatenated(cls, chunks: Sequence["Samples"]) -> "Samples":
-        """Return the samples of all chunks; there is at least one."""
+        """Return the samples of all chunks, of which there must be at least one."""
         return cls(**{name: np.concatenate([chunk.arrays()[name] for chunk in chunks]) for name in chunks[0].arrays()})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays by the names of the fields."""
+        """Return field name -> array."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def __len__(self) -> int:
@@ -117,7 +117,7 @@ class Samples:
         return Samples(strips, *of_strips, self.statistics[rows], self.label[rows])
 
     def take(self, rows: NDArray[np.integer[Any]], config: DescriptorConfig) -> Batch:
-        """Return the samples with the given indices as a batch; `config` is that of the samples."""
+        """Return the samples with the given indices as a batch; `config` is the descriptor of the samples."""
         chosen, grid = self.select(rows), (len(rows), config.n_slices, config.n_strips)
         at = np.repeat(np.arange(len(rows)), chosen.strips), *np.divmod(chosen.strip, config.n_strips)
         length, color = np.zeros(grid, np.float16), np.zeros((*grid, self.color.shape[1]), np.float16)
@@ -141,8 +141,8 @@ def sample_clouds(
     """Return samples of clouds, each in `COPIES` random orientations.
 
     Args:
-        clouds: xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8. At least one.
-        labels: of the clouds.
+        clouds: at least one; xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8.
+        labels: label of each cloud.
         network: colour network.
         config: descriptor. Static.
         rng: generator of the orientations.
@@ -178,17 +178,17 @@ SEED = 0
 AUGMENTATIONS = Augmentations.of_names(KINDS)
 
 UNCHANGED = 0.2
-"""Share of views without augmentation."""
+"""Fraction of the views without augmentation."""
 
 CAMERA = Camera.from_field_of_view(540, 405, 40.0)
-"""Half the pixels of the training camera: still two for each voxel of a cloud."""
+"""Camera with half the pixels of the training camera, which is still two pixels per voxel of a cloud."""
 
 ObjectSource = int | Path
 """The seed of a procedural object, or a mesh file."""
 
 
 def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple[int, Cloud]]:
-    """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
+    """Return the object's index and the cloud of each view with at least `MIN_VIEW_POINTS` points.
 
     Args:
         objects: index -> object.
@@ -220,9 +220,9 @@ LIBRARY_CODE = (".", "descriptor", "frames")
 def samples_record(
     sources: Sequence[ObjectSource], network: ColorNetwork, config: DescriptorConfig, views: int
 ) -> dict[str, Any]:
-    """Return everything that determines the samples of `build_samples`, whose arguments these are, as JSON holds it.
+    """Return everything that determines the result of `build_samples` with these arguments, in JSON types.
 
-    It has the code, too: users of a checkout change code within a version.
+    This includes a digest of the code, since code may change within a version in a checkout.
     """
     digests = {each: load_mesh(each).digest if isinstance(each, Path) else each for each in dict.fromkeys(sources)}
     root = Path(training.__file__).parent
@@ -256,15 +256,15 @@ def build_samples(
     """Render views of objects and sample them.
 
     Args:
-        sources: objects; labels are indices into this sequence. An object that occurs n times has n times the views
-            and the label of its first occurrence.
+        sources: objects; labels are indices into this sequence. An object that occurs n times gets n times as many
+            views, all with the label of its first occurrence.
         network: colour network.
         config: descriptor. Static.
         views: number of views of each object.
-        pool: worker processes that render; does not affect the result.
+        pool: worker processes that render; they do not affect the result.
         progress: called with (objects done, number of objects) at the start and after each task of a worker.
-        directory: directory of these samples only, created if it is missing, where those of each task are stored, so
-            that an interrupted call resumes.
+        directory: directory for these samples only, created if it is missing. The samples of each task are stored
+            there, so that an interrupted call resumes.
 
     Raises:
         InputError: a mesh is unreadable or is visible in none of its views.
@@ -279,7 +279,7 @@ def build_samples(
     directory.mkdir(parents=True, exist_ok=True)
     chunks: dict[Path, Samples] = {}
     for file in tasks:
-        with contextlib.suppress(ValueError, TypeError):  # missing or damaged
+        with contextlib.suppress(ValueError, TypeError):  # the file is missing or damaged
             chunks[file] = Samples(**load_arrays(file))
     missing = {file: task for file, task in tasks.items() if file not in chunks}
     done = sum(len(tasks[file]) for file in chunks)
@@ -318,8 +318,8 @@ def sample_views(
         progress: called with (shards done, number of shards).
 
     Returns:
-        The samples, and label and cloud, in metres, of each view of the held-out set. The clouds have no rim and no
-        boundary.
+        The samples, and the label and the cloud (in metres) of each view of the held-out set. The clouds have no rim
+        and no boundary.
     """
     fitted: list[Samples] = []
     kept: list[tuple[int, Cloud]] = []
@@ -331,7 +331,7 @@ def sample_views(
             labels = [views.label] * len(clouds)
             fitted.append(sample_clouds(clouds, labels, network, config, rng, are_normal=True))
         for xyz, rgb in itertools.compress(views.clouds(), is_kept):
-            # A copy, since a slice would keep all views of the shard in memory.
+            # The slice is copied, since it would keep all views of the shard in memory.
             kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
         progress(index + 1, len(source.shards))
     return Samples.concatenated(fitted), kept

@@ -1,8 +1,8 @@
-"""Class probabilities of every classifier for every labelled instance, the file that keeps them, and their fusion.
+"""Class probabilities of every classifier for every labelled instance, the file that stores them, and their fusion.
 
-The first line of `answers.jsonl` describes the evaluation; each further line holds the answers for one frame. A line
-that an interrupted evaluation left incomplete is removed when the evaluation resumes. The digests of version 0.1.0 are
-ignored.
+The first line of `answers.jsonl` describes the evaluation; each of the other lines holds the answers for one frame. If
+an interrupted evaluation left an incomplete line, it is removed when the evaluation resumes. Digests in files of
+version 0.1.0 are ignored.
 """
 
 import dataclasses
@@ -47,8 +47,8 @@ class InstancePrediction:
 
     Attributes:
         label: label number in the label image.
-        truth: name of the object, which may be none of the classes.
-        occluded: the recognizer found the instance to be occluded.
+        truth: name of the object, which may not be one of the classes.
+        occluded: whether the recognizer judged the instance to be occluded.
         reason: why the instance could not be described; None if it was.
         probabilities: [M, C] float32, one row for each predictor of the runs; None if the instance was not described.
         position: median x, y and z of its points in the camera frame, metres; None if no pixel has depth, and in
@@ -86,8 +86,8 @@ class AnswerFile:
     """The file with the answers of an evaluation; frames are appended one at a time.
 
     Attributes:
-        frames: answers so far. Probabilities are rounded to six digits, also those of a frame just appended, so that a
-            resumed evaluation gives the same results as an uninterrupted one.
+        frames: answers so far. All probabilities are rounded to six digits, even those of a frame just appended, so
+            that a resumed evaluation gives the same results as an uninterrupted one.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
@@ -171,17 +171,17 @@ RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
-"""Columns of the embedding alone, of THOR2 with the confidence that the embedding gives (in runs with the paper's
-classifiers), of the gallery alone, and of all combined. The recognizer computes them; no rule fuses them."""
+"""Columns of the embedding alone, of THOR2 with the confidence from the embedding (in runs with the paper's
+classifiers), of the gallery alone, and of all combined. The recognizer computes them without a fusion rule."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
-"""All columns that no rule fuses."""
+"""All columns that are computed without a fusion rule."""
 
 
 def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """Return title -> names for each available baseline and gallery alone and for every combination of classifiers.
+    """Return title -> names: each available baseline and the gallery alone, and every combination of classifiers.
 
-    Titles are those of the paper: CE, TOPS, ..., THOR2 (TOPS and TOPS2).
+    The titles are as in the paper: CE, TOPS, ..., THOR2 (TOPS and TOPS2).
     """
     names = set(available)
     features = [name for name in FEATURES if name in names]
@@ -192,12 +192,12 @@ def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
 
 
 def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
-    """Return the column that the recognizer answers by.
+    """Return the column whose answers the recognizer gives.
 
     Args:
         titles: the columns, at least one.
-        answer_by: "classifiers" (the embedding with THOR2, THOR2, the embedding, or the last title: the first of them
-            that is among the titles), "gallery" or "both".
+        answer_by: "classifiers", "gallery" or "both". For "classifiers", the column is the first available one of: the
+            embedding with THOR2, THOR2, the embedding, the last title.
     """
     titles = list(titles)
     last = [title for title in titles if title not in WHOLE][-1:]
@@ -222,7 +222,7 @@ def fuse_by(
     """Return the predicted classes and their fused probabilities.
 
     Args:
-        rule: rule of the fusion.
+        rule: fusion rule.
         probabilities: [B, C] class probabilities of each classifier.
         temperatures: temperature of each classifier; needed for "calibrated".
     """

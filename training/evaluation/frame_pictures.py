@@ -1,4 +1,4 @@
-"""Pictures of an evaluation, drawn while the frames are in memory: judged frames, and crops of instances."""
+"""Pictures of an evaluation, drawn while the frames are in memory: frames with judged answers, and instance crops."""
 
 import math
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ FRAMES = 12
 
 
 class FramePictures:
-    """Pictures of some frames with the answers of the first run, and of the most confident instance of each wrong name.
+    """Pictures of some frames with the answers of the first run, and of the most confident instance of each confusion.
 
-    They are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<name>.jpg` with class indices; unknown
-    objects have the numbers after the classes.
+    The files are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<name>.jpg` with class indices; unknown
+    objects have the indices after the classes.
 
     Attributes:
         shown: numbers of the frames that are drawn.
@@ -54,11 +54,11 @@ class FramePictures:
         return self._out / "frames" / f"{number}.jpg"
 
     def confusion_path(self, truth: str, name: str) -> Path:
-        """Return the path of the picture of an object with a wrong name."""
+        """Return the path of the picture of an object that is recognized as another one."""
         return self._out / "confusions" / f"{self._names.index(truth)}-{self._names.index(name)}.jpg"
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
-        """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
+        """Draw the frame if it is shown, and its confusions that are the most confident ones so far.
 
         Raises:
             OSError: a file cannot be written.
@@ -73,7 +73,7 @@ class FramePictures:
         """Record the confidences of a frame, which may have been drawn before the evaluation was interrupted.
 
         Returns:
-            Instances with their wrong names, each the most confident one so far that has this name wrongly.
+            Instances with their wrong names; each is the most confident one so far of its confusion.
         """
         most_confident = []
         for _, instance, name, confidence in named_answers(answers.instances, self._runs):
@@ -86,7 +86,7 @@ class FramePictures:
         return most_confident
 
     def _judge(self, answers: FrameAnswers) -> list[Annotation]:
-        """Return what the first run answers, incorrect answers first; an unknown object should have no name."""
+        """Return the answers of the first run, incorrect ones first; unknown objects should be rejected."""
         names = {i.label: name for run, i, name, _ in named_answers(answers.instances, self._runs) if run == 0}
         judged = []
         for instance in answers.instances:
@@ -99,11 +99,10 @@ class FramePictures:
 
 
 CORRECT, INCORRECT = COLORS[2], UNRECOGNIZED
-"""Bluish green and vermilion of the palette of Okabe and Ito, a green and a red that people with colour blindness can
-distinguish."""
+"""Bluish green and vermilion from the palette of Okabe and Ito, which people with colour blindness can distinguish."""
 
 _LARGEST_WIDTH = 960
-"""Pixels; wider frames are drawn smaller."""
+"""Largest width of a picture, pixels; wider frames are reduced."""
 
 _CROP_SIDE = 240
 """Longest side of a crop, pixels."""
@@ -120,8 +119,8 @@ def draw_judged(color: NDArray[np.uint8], labels: NDArray[Any], judged: Sequence
     Args:
         color: [H, W, 3] uint8, sRGB.
         labels: [H, W] integers.
-        judged: instances, green if correct, red if incorrect; the first ones choose the places of their texts. Labels
-            without a pixel are skipped.
+        judged: instances, green if correct and red if incorrect; texts are placed in this order. Labels without a pixel
+            are skipped.
         path: path of the picture.
 
     Raises:

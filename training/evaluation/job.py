@@ -1,6 +1,6 @@
 """Evaluation of trained runs on a dataset: answers frame by frame, then `report.json` and `report.html`.
 
-A frame is answered with the classifiers and baselines of all runs, in this process or in workers.
+Each frame is recognized with the classifiers and baselines of all runs, in this process or in workers.
 
 REPORT/answers.jsonl               class probabilities of every classifier, written frame by frame
 REPORT/report.json, report.html    written last
@@ -35,12 +35,12 @@ from training.storage.workers import WorkerPool
 __all__ = ["Answering", "answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
 
 Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None, None]]
-"""Yields the frames of these numbers with their answers, such as `answer_frames_in_pool`."""
+"""Function that yields the frames with these numbers and their answers, such as `answer_frames_in_pool`."""
 
 ANSWERS = "answers.jsonl"
 
 NO_PIXELS = "no pixels in the label image"
-"""Why an instance that the labels name could not be described."""
+"""Reason of a labelled instance that has no pixels and therefore cannot be described."""
 
 Load = tuple[tuple[Path, ...], tuple[str, ...] | None]
 """Arguments of `load_evaluated`."""
@@ -61,19 +61,19 @@ def evaluate_dataset(
     Args:
         runs: runs, as returned by `load_runs` or `load_sequence_runs`.
         frames: the dataset.
-        dataset: "kind" (uwis, ocid, bop, frames), "path", and all other values that the frames depend on.
+        dataset: "kind" (uwis, ocid, bop, frames), "path", and all other values on which the frames depend.
         out: directory of the report: new, empty, or of the same evaluation.
         progress: called with ("evaluate", frames done, number of frames, note).
-        answering: answers frames with the same runs, for instance in worker processes; None answers them in this
+        answering: function that answers frames with the same runs, for instance in worker processes; None uses this
             process.
 
     Returns:
         The content of report.json.
 
     Raises:
-        InputError: `out` holds something else, or the answers of another evaluation or of files that have changed;
-            another process is writing to it; a frame cannot be read; or no instance is of a class of the runs. Answers
-            so far are kept.
+        InputError: `out` holds something else, or answers of another evaluation or for files that have changed; another
+            process is writing to it; a frame cannot be read; or no instance is of a class of the runs. Answers so far
+            are kept.
         OSError: a file cannot be written.
     """
     check_output_directory(out, ANSWERS)
@@ -116,12 +116,12 @@ def evaluate_dataset(
 
 
 def _file_digests(files: Sequence[Path]) -> dict[str, str]:
-    """Return the SHA-256 of each file; a missing one has none."""
+    """Return the SHA-256 of each file, without missing files."""
     return {str(path.resolve()): file_digest(path) for path in files if path.is_file()}
 
 
 def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progress: Progress) -> None:
-    """Raise InputError if frames that are already answered have another name or other files now."""
+    """Raise InputError if the names or files of frames with stored answers have changed."""
     for number, (answers, identifier) in enumerate(zip(file.frames, frames.identifiers, strict=False)):
         if answers.frame != identifier:
             raise InputError(
@@ -163,7 +163,7 @@ def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None =
         sequences: identifiers of the frames if there is a run for each sequence; None otherwise.
 
     Raises:
-        InputError: as these functions, or for several directories of sequences.
+        InputError: these functions raise it, or several directories of sequences are given.
     """
     if sequences is None:
         return load_runs(models)
@@ -177,18 +177,18 @@ def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None =
 def answer_frames_in_pool(
     load: Load, frames: LabelledFrames, pool: WorkerPool, numbers: range
 ) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
-    """Yield the frames of these numbers with the answers of `answer_frames`, which workers compute.
+    """Yield the frames with these numbers and the answers of `answer_frames`, computed by workers.
 
-    Frames before one that cannot be read are yielded before its error is raised.
+    If a frame cannot be read, the frames before it are yielded before its error is raised.
 
     Args:
-        load: arguments of `load_evaluated`, by which each worker process loads the runs.
+        load: arguments of `load_evaluated`, with which each worker process loads the runs.
         frames: the dataset.
         pool: the workers.
         numbers: numbers of the frames.
 
     Raises:
-        InputError: as `answer_frames`.
+        InputError: `answer_frames` raises it.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
     answer = functools.partial(_answer_first, load)
@@ -197,7 +197,7 @@ def answer_frames_in_pool(
 
 
 _loaded = functools.lru_cache(1)(load_evaluated)
-"""Loads the runs once in a worker process."""
+"""Cached `load_evaluated`, which loads the runs only once in each worker process."""
 
 
 def _answer_first(load: Load, frames: LabelledFrames) -> tuple[LabelledFrame, FrameAnswers]:

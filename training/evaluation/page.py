@@ -31,11 +31,11 @@ BARS = ("forest", "PointNet", "THOR", "CE", "TOPS", "TOPS2", "THOR2")
 """Columns of the bar charts."""
 
 MAX_GROUPS = 8
-"""Largest number of table rows that is also drawn as a bar chart."""
+"""Largest number of table rows for which a bar chart is drawn."""
 
 
 def _mean_std(statistics: Mapping[str, Any], factor: float = 1.0, digits: int = 3) -> str:
-    """Return the mean, and the standard deviation if there are several runs."""
+    """Return the mean as text, with the standard deviation if there are several runs."""
     if statistics["mean"] is None:
         return "–"
     values = [value for value in (statistics["mean"], statistics["std"]) if value is not None]
@@ -47,7 +47,7 @@ def _marked(title: str, main: str) -> str:
 
 
 def marked(table: Table, main: str) -> Table:
-    """Return a table whose column `main`, by which `thor2 recognize` answers, is marked."""
+    """Return a table in which the column `main`, which has the answers of `thor2 recognize`, is marked."""
     header, rows = table
     return [_marked(title, main) for title in header], rows
 
@@ -77,18 +77,18 @@ def comparison_title(table: Mapping[str, Any]) -> str:
 
 
 def comparison_text(table: Mapping[str, Any]) -> str:
-    """Return the source of a published table, its notes, and where the data differ."""
+    """Return the source of a published table, its notes, and the differences between the data."""
     return " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]])
 
 
 def comparison_table(table: Mapping[str, Any], main: str) -> Table:
-    """Return header and rows of a published table beside the measured accuracies, in percent.
+    """Return header and rows of a published table together with the measured accuracies, in percent.
 
-    Each published method has its measured column before it, where there is one; the column `main` is always shown.
+    The measured column of a published method, if there is one, stands before it. The column `main` is always shown.
 
     Args:
         table: an entry of `report["published_tables"]`.
-        main: title of the column that the recognizer answers by.
+        main: title of the column whose answers the recognizer gives.
     """
     methods = list(dict.fromkeys(method for cell in table["cells"] for method in cell["published"]))
     columns: list[tuple[str, str]] = [] if main in table["ours"].values() else [("accuracy", main)]
@@ -98,7 +98,7 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
         columns.append(("published", method))
     header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
     values = [[cell[key].get(name, NO_VALUE) for key, name in columns] for cell in table["cells"]]
-    # In percent with two decimals, as in the publications.
+    # The values are in percent with two decimals, as in the publications.
     return header, [_row(cell, each, 100.0, 2) for cell, each in zip(table["cells"], values, strict=True)]
 
 
@@ -137,14 +137,14 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
 
 
 def answer_texts(report: Mapping[str, Any]) -> list[str]:
-    """Return what `thor2 recognize` answers: accuracy, unknown objects that have a name, wrong names."""
+    """Return sentences on the answers of `thor2 recognize`: accuracy, unknown objects that are named, wrong names."""
     counts, worst = report["answers"], report["worst"]
     without = counts["known"] - counts["correct"] - counts["wrong"]
     texts = [
         f"Accuracy of the answers of thor2 recognize: {counts['correct'] / counts['known']:.3f}. "
-        f"Of {counts['known']:,} instances of known objects, {counts['correct']:,} have their name, "
-        f"{counts['wrong']:,} a wrong one and {without:,} none.",
-        f"Unknown objects: {counts['unknown_named']:,} of {counts['unknown']:,} instances have a name."
+        f"Of {counts['known']:,} instances of known objects, {counts['correct']:,} are recognized correctly, "
+        f"{counts['wrong']:,} get a wrong name and {without:,} get no name.",
+        f"Unknown objects: {counts['unknown_named']:,} of {counts['unknown']:,} instances get a name."
         if counts["unknown"]
         else "The dataset has no unknown objects, so it does not show whether they are rejected.",
     ]
@@ -183,7 +183,7 @@ def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
 
 
 def _with_fold(section: Section, every: Table, pictures: Sequence[Picture] = ()) -> Section:
-    """Return a section on what `recognize` answers by with the whole table folded, if there is more in it."""
+    """Return a section on the answers of `recognize`; a whole table with more columns is folded below it."""
     if every == section.table:
         return dataclasses.replace(section, pictures=[*section.pictures, *pictures])
     folded = Section("Every classifier and baseline", table=every, pictures=pictures)
@@ -197,15 +197,15 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
     )
     if _fused_titles(report):
         text += (
-            "CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus sign "
-            f"marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
+            "CE uses colour only, TOPS uses shape only, TOPS2 uses both. THOR2 is the fusion of TOPS and TOPS2; a plus "
+            f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
         )
     elif EMBEDDED in report["fusions"]:
-        text += f"The column {EMBEDDED} has the answers of the model, whose embedding uses shape and colour. "
+        text += f"The column {EMBEDDED} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         text += (
-            f"{ALL_CLASSIFIERS} has the names of THOR2 with the confidence that the embedding gives; here, answers "
-            "below the threshold keep their names. "
+            f"{ALL_CLASSIFIERS} shows the names from THOR2 with the confidence from the embedding; answers below the "
+            "threshold keep their names in this table. "
         )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):
         text += (
@@ -216,8 +216,8 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
         )
     if report["scratch"]:
         text += (
-            f"{', '.join(report['scratch'])}: trained from scratch, without pretrained weights; the accuracy is no "
-            "claim about the published networks. "
+            f"{', '.join(report['scratch'])}: trained from scratch, without pretrained weights; the accuracy does not "
+            "represent the published networks. "
         )
     if len(report["runs"]) > 1:
         text += f"Values are the mean and the sample standard deviation over {len(report['runs'])} models. "
@@ -239,7 +239,7 @@ def _fused_titles(report: Mapping[str, Any]) -> list[str]:
 
 
 def _fusion_sections(report: Mapping[str, Any]) -> list[Section]:
-    """Return the section on fusion rules; none if no classifiers are fused."""
+    """Return the section on fusion rules, or an empty list if no classifiers are fused."""
     cells = {rule: report["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
     titles = _fused_titles(report)
     if not titles:
@@ -255,7 +255,7 @@ def _fusion_sections(report: Mapping[str, Any]) -> list[Section]:
 
 
 def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
-    """Return the section on placements; none if every instance is a placement of its own."""
+    """Return the section on placements, or an empty list if every instance is a placement of its own."""
     placements, overall = report["placements"], report["accuracy"][report["rule"]][0]["cells"][0]
     if placements["count"] == overall["instances"]:
         return []
@@ -265,8 +265,8 @@ def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
     text = (
         f"The {overall['instances']:,} instances are {placements['count']:,} placements: an object that does not move "
         "in neighbouring frames is one placement, since its answers are not independent. Accuracy over placements is "
-        "the mean of the placements' accuracies. Steadiness is the share of instances with the most frequent answer of "
-        "their placement, among placements of at least two instances."
+        "the mean of the placements' accuracies. Steadiness is the fraction of instances that have the most frequent "
+        "answer of their placement, among placements with at least two instances."
     )
     return [_main_row(Section("Placements", text, (header, rows)), report["main"])]
 
@@ -281,7 +281,7 @@ def _main_row(section: Section, main: str) -> Section:
 
 
 def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
-    """Return the section on rejection; none without unknown objects and without a threshold."""
+    """Return the section on rejection, or an empty list without unknown objects and without a threshold."""
     shares, curve, main = report["rejection"], report["known_unknown"], report["main"]
     n_unknown = sum(report["instances"]["no_class"].values())
     if curve is None and not shares["threshold"]["runs"]:
@@ -296,11 +296,11 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
         named = _mean_std(shares["unknown_named_at_threshold"])
         table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", named])
     header = ["objects", "without rejection", f"threshold {_mean_std(shares['threshold'])}"]
-    text = f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: "
-    text += "the object is unknown. "
+    text = f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected "
+    text += "as unknown. "
     if shares["threshold"]["runs"]:
-        text += "The threshold is the one that the models store. Enrolled objects have their own ones, by their "
-        text += "numbers of views; the median is shown."
+        text += "The threshold is stored in the models. Enrolled objects have thresholds that depend on their numbers "
+        text += "of views; the median is shown."
     else:
         header, table = header[:2], [row[:2] for row in table]
         text += "These models store no threshold."
@@ -308,9 +308,9 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     if curve is not None:
         statistics = report["confidence"][main]["unknown_named"]
         draw_known_unknown(curve, (COVERAGE, statistics["mean"]), main, out / "known-unknown.png")
-        text += f" With one that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(statistics)} of the unknown "
-        text += "objects have a name."
-        caption = f"Unknown objects that {main} names, by the share of its correct answers that a threshold keeps."
+        text += f" With a threshold that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(statistics)} of the "
+        text += "unknown objects get a name."
+        caption = f"Unknown objects that {main} names, against the fraction of its correct answers above the threshold."
         pictures = [Picture("known-unknown.png", caption, "half")]
     return [Section("Unknown objects", text, (header, table), pictures)]
 
@@ -332,12 +332,12 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     ]
     temperatures = [f"{name} {_mean_std(t)}" for name, t in report["temperatures"].items() if t["runs"]]
     text = (
-        "Calibration error is the expected calibration error over 15 bins. Calibrated columns use temperatures of "
-        "classifiers, fitted on the synthetic views that each training held out"
+        "Calibration error is the expected calibration error over 15 bins. Calibrated columns use temperatures of the "
+        "classifiers, fitted on the held-out synthetic views of each training"
         + (f" ({', '.join(temperatures)})" if temperatures else "; these models have none")
         + ". AUROC is the probability that a correct answer has a higher confidence than an incorrect one, or a known "
-        "object than an unknown one; known objects are those the models were trained on. Open-set rejection: the "
-        f"threshold accepts {COVERAGE:.0%} of the known objects, and an instance below it is an unknown object. It "
+        "object than an unknown one; known objects are the classes of the models. Open-set rejection: the "
+        f"threshold accepts {COVERAGE:.0%} of the known objects, and instances below it are rejected as unknown. It "
         "is the value for the option --unknown-below of thor2 recognize. A dash means that there is no value, for "
         "instance because no answer is incorrect or the dataset has no unknown objects."
     )
@@ -349,8 +349,8 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
 
 def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
     text = (
-        "Answers of the first model. Green: correct, also an unknown object without a name. Orange: incorrect. The "
-        "true object stands in brackets; none: the instance could not be described."
+        "Answers of the first model. Green: correct, including rejected unknown objects. Orange: incorrect. The true "
+        "object is in brackets, or none if the instance could not be described."
     )
     shown = [
         Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", "half")

@@ -1,4 +1,4 @@
-"""Published accuracies (sources: `published.json`), the measured ones beside them, and how their data differ."""
+"""Published accuracies (sources: `published.json`), compared with measured accuracies, and differences of the data."""
 
 import functools
 import json
@@ -32,10 +32,10 @@ def _read() -> dict[str, Any]:
 
 
 def published_tables(kind: str) -> list[dict[str, Any]]:
-    """Return the published tables of a kind of dataset ("uwis", "ocid") as `published.json` has them; often none.
+    """Return the published tables for a kind of dataset ("uwis", "ocid") from `published.json`; empty for most kinds.
 
     The rows are the `cells`, each with attribute values (`where`) and method -> mean and standard deviation in percent
-    (`accuracy`). The field `source` has the publication itself.
+    (`accuracy`). The field `source` contains the publication itself.
     """
     content = _read()
     tables = (table for table in content["tables"] if table["kind"] == kind)
@@ -43,7 +43,7 @@ def published_tables(kind: str) -> list[dict[str, Any]]:
 
 
 def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, str]:
-    """Return the attributes of a frame with the values that the published tables name.
+    """Return the attributes of a frame with the values that the published tables use.
 
     The light of UW-IS Occluded is "bright" or "dim", and the sequence a/b/c/seq25 of OCID is "S-25".
     """
@@ -65,12 +65,12 @@ _OURS = {"THOR (MLP)": "THOR"}
 """Published methods whose name differs from the title of the measured column."""
 
 _SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
-"""What the published tables append to the methods that were trained without and with all real images, and what the
-titles of the small networks end with."""
+"""Suffixes of methods in the published tables that were trained without and with all real images, and suffix of the
+titles of small networks."""
 
 
 def _measured_column(method: str, real_views: bool, titles: Collection[str]) -> str | None:
-    """Return the title of the measured column of a published method, that of a small network if it stands for it."""
+    """Return the title of the measured column for a published method, possibly of a small network in its place."""
     other, own = (_SYNTHETIC, _REAL) if real_views else (_REAL, _SYNTHETIC)
     if method.endswith(other):
         return None
@@ -86,7 +86,7 @@ def compare_with_published(
     objects: Sequence[str],
     correct: Mapping[str, Sequence[NDArray[np.bool_]]],
 ) -> list[dict[str, Any]]:
-    """Return the published tables that the evaluation has instances for, each with the measured accuracies.
+    """Return the published tables for which the evaluation has instances, each with the measured accuracies.
 
     Args:
         kind: kind of dataset ("uwis", "ocid", ...).
@@ -94,11 +94,11 @@ def compare_with_published(
         n_frames: number of frames.
         attributes: [N] attributes of the scored instances.
         objects: [N] names of their objects.
-        correct: column title -> for each run, [N] whether the instance is recognized correctly.
+        correct: column title -> for each run, whether each instance is recognized correctly, [N].
 
     Returns:
         JSON tables with "number", "title", "source", "notes", "differences" (sentences), "ours" (published method ->
-        title of the measured column, where there is one) and "cells". A cell has "where", "instances", "published"
+        title of the measured column, if there is one) and "cells". A cell has "where", "instances", "published"
         (method -> mean and standard deviation, from 0 to 1) and "accuracy" (title -> `summarize_runs`). Rows without an
         instance are left out.
     """
@@ -139,7 +139,7 @@ def _network_differences(titles: Iterable[str], scratch: Collection[str]) -> lis
             sentences.append(f"{title} is a smaller network than the published one.")
         if title in scratch:
             sentences.append(
-                f"{title} was trained from scratch, without pretrained weights: its accuracy is no claim about the "
+                f"{title} was trained from scratch, without pretrained weights: its accuracy does not represent the "
                 "published network."
             )
     return sentences

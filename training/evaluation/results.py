@@ -1,4 +1,4 @@
-"""All values of a report, computed from the answers, as one JSON table."""
+"""Computation of all values of a report from the answers, as one JSON table."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -29,17 +29,17 @@ from training.readers.labelled import sequence_of
 __all__ = ["compute_results", "fuse_answers", "named_answers"]
 
 CURVE = tuple(k / 100 for k in range(101))
-"""Shares of the correct answers at which the known/unknown curve is computed."""
+"""Fractions of the correct answers at which the known/unknown curve is computed."""
 
 Floats = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
 
 MAX_LISTED = 20
-"""Names that an error message shows."""
+"""Largest number of names that an error message shows."""
 
 MOST_FREQUENT = 12
-"""Pairs of object and wrong name listed in a report, of known and of unknown objects."""
+"""Number of confusions (object and wrong name) that a report lists, for known and for unknown objects."""
 
 
 Fused = Mapping[str, Mapping[int, Predictions]]
@@ -75,9 +75,9 @@ def fuse_answers(
 def named_answers(
     instances: Sequence[InstancePrediction], runs: Sequence[Run]
 ) -> Iterator[tuple[int, InstancePrediction, str | None, float]]:
-    """Yield what `recognize` answers with each run: index of the run, described instance, name or None, confidence.
+    """Yield the answers of `recognize` with each run: index of the run, described instance, name or None, confidence.
 
-    The name is None if the confidence is below the run's threshold: the object is unknown.
+    The name is None if the confidence is below the run's threshold, which means that the object is unknown.
     """
     predictions = fuse_answers(instances, runs)
     for run, answers in predictions[main_fusion(predictions, runs[0].answer_by)].items():
@@ -111,7 +111,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
             "runs"
         )
     seconds = [frame.seconds for frame in frames]
-    # OCID has a table by sequence, which is the directory of the frame.
+    # One table of OCID is by sequence, which is the directory of the frame.
     attributes = [
         {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
         for instance, frame in labelled
@@ -130,7 +130,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         for rule, fused in by_rule.items()
     }
     rejection = [_rejection(by_run[run], truth, unknown_by_run[run], runs[run].thresholds) for run in by_run]
-    # Rows are true classes; the last column has the instances that are not described, by their index -1.
+    # Rows are true classes. The last column counts instances that are not described, since their index is -1.
     confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
     for predictions in by_run.values():
         np.add.at(confusion, (truth, predictions.class_index), 1)
@@ -201,7 +201,7 @@ def _accuracy(
 
 
 def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]:
-    """Return confidence metrics of each fusion, on known objects and against unknown ones."""
+    """Return confidence metrics of each fusion, for known objects and for known against unknown objects."""
     return {
         title: summarize_rows([_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run])
         for title, by_run in fused.items()
@@ -233,7 +233,7 @@ def _confidence_of_run(known: Predictions, truth: Integers, unknown: Predictions
 def _rejection(
     known: Predictions, truth: Integers, unknown: Predictions, thresholds: NDArray[np.float64]
 ) -> dict[str, float]:
-    """Return shares of the known and the unknown objects without rejection and at the run's thresholds [C]."""
+    """Return fractions of the known and the unknown objects without rejection and at the run's thresholds [C]."""
     correct = known.class_index == truth
     named = known.described & (known.confidence >= thresholds[known.class_index])
     return {
@@ -251,7 +251,7 @@ def _rejection(
 def _known_unknown(
     predictions: Sequence[tuple[Predictions, Predictions]], truth: Integers
 ) -> dict[str, list[float]] | None:
-    """Return the known/unknown curve, the mean over the runs; None without unknown objects or correct answers.
+    """Return the known/unknown curve as the mean over the runs; None without unknown objects or correct answers.
 
     Args:
         predictions: predictions for known and for unknown objects of each run.
@@ -276,7 +276,7 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
 def _answers(
     instances: Sequence[InstancePrediction], runs: Sequence[Run]
 ) -> tuple[dict[str, int], list[dict[str, Any]]]:
-    """Return the numbers of answers over all runs, and the most frequent wrong names, of unknown objects first."""
+    """Return counts of answers over all runs, and the most frequent wrong names, those of unknown objects first."""
     classes, count, wrong = runs[0].classes, Counter[str](), Counter[tuple[str, str]]()
     for _, instance, name, _ in named_answers(instances, runs):
         count["correct"] += name == instance.truth

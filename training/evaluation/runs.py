@@ -1,6 +1,6 @@
 """Trained runs that are evaluated together.
 
-These are the folds of one training, several trainings on the same classes, or one training for each sequence of a
+They are the folds of one training, several trainings on the same classes, or one training for each sequence of a
 dataset.
 """
 
@@ -45,11 +45,11 @@ class Run:
     """A trained run.
 
     Attributes:
-        name: name of its directory; of a fold, the training's directory too.
+        name: name of its directory; for a fold, with the name of the training's directory.
         digest: SHA-256 of the files of its model.
         recognizer: recognizer with the run's classifiers.
         baselines: baselines in the run directory.
-        temperatures: temperatures of the classifiers and baselines that were calibrated on a held-out set.
+        temperatures: temperatures of those classifiers and baselines that were calibrated on a held-out set.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Run:
 
     @property
     def predictors(self) -> tuple[str, ...]:
-        """Names of the classifiers and baselines; with an embedding or enrolled objects, their columns too."""
+        """Names of the classifiers and baselines, and of the columns of the embedding and the enrolled objects."""
         model = self.model
         names = (*model.run.classifiers, *self.baselines)
         if EMBEDDING in model.classifiers:
@@ -92,7 +92,7 @@ class Run:
 
     @property
     def thresholds(self) -> NDArray[np.float64]:
-        """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
+        """Confidence [C], for each class, below which an object is unknown; 0 means no rejection."""
         return self.model.thresholds()
 
     def probabilities(
@@ -129,7 +129,7 @@ class Run:
 def _digest(path: Path) -> str:
     baselines = baseline_file(path, "[!.]*")  # without the temporary file of a killed process
     weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
-    enrolled = path / EMBEDDING_FILE, path / GALLERY_DIRECTORY / INDEX_FILE  # the index has the digests of the objects
+    enrolled = path / EMBEDDING_FILE, path / GALLERY_DIRECTORY / INDEX_FILE  # the index has the objects' digests
     files = [file for file in (path / RUN_FILE, path / "network.npz", *weights, *enrolled) if file.is_file()]
     return content_digest(
         part
@@ -139,13 +139,13 @@ def _digest(path: Path) -> str:
 
 
 def load_runs(paths: Sequence[Path]) -> list[Run]:
-    """Load runs that share classes, descriptor and colour network, so that a frame is described once for all.
+    """Load runs that share classes, descriptor and colour network, so that a frame is described once for all runs.
 
     Args:
         paths: run directories, or directories with the folds of a training.
 
     Raises:
-        InputError: a run cannot be read or is given twice, or the runs differ in what they must share.
+        InputError: a run cannot be read or is given twice, or classes, descriptor or colour network differ.
     """
     directories = find_run_directories(paths)
     runs = [_load(directory) for directory in directories]
@@ -184,10 +184,10 @@ def all_predictors(runs: Sequence[Run]) -> tuple[tuple[int, str], ...]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SequenceRun(Run):
-    """Several runs, each trained on the objects of one sequence; a frame is answered by the run of its sequence.
+    """Several runs, each trained on the objects of one sequence and used for the frames of this sequence.
 
     Attributes:
-        recognizer: recognizer of any of the runs; describes the frames.
+        recognizer: recognizer of any of the runs, which describes the frames.
         of_sequence: sequence -> its run. The sequence of a frame is its identifier without the last part.
     """
 
@@ -201,7 +201,7 @@ class SequenceRun(Run):
 
     @property
     def thresholds(self) -> NDArray[np.float64]:
-        """0: the runs of the sequences have different thresholds."""
+        """Zeros, since the runs of the sequences have different thresholds."""
         return np.zeros(len(self.classes))
 
     def probabilities(
@@ -218,7 +218,7 @@ class SequenceRun(Run):
 
 
 def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceRun]:
-    """Load the runs of a directory that holds a run, or the folds of one, for each sequence of a dataset.
+    """Load the runs of a directory that holds a run, or the folds of a run, for each sequence of a dataset.
 
     The run of the sequence a/b/c is `directory`/a/b/c, `directory`/b/c or `directory`/c, whichever is found first.
 
@@ -227,7 +227,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         frames: identifiers of the dataset's frames.
 
     Returns:
-        As many runs as each sequence has folds, without temperatures.
+        One run per fold of the sequences, without temperatures.
 
     Raises:
         InputError: a sequence has no run, a run cannot be read, or runs differ in their classifiers, baselines, number
@@ -261,7 +261,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
 
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
-    """Return the titles of the image networks without pretrained weights, and of templates with such a backbone."""
+    """Return the titles of image networks without pretrained weights, including templates with such a backbone."""
     names = {name for run in runs for name, baseline in run.baselines.items() if not baseline.weights}
     return [TITLES[name] for name in (*NETWORKS, TEMPLATES) if name in names]
 

@@ -1,8 +1,8 @@
-"""Values of an evaluation: its breakdown by attributes, statistics over runs, confidence metrics, and placements.
+"""Values of an evaluation: breakdown by attributes, statistics over runs, confidence metrics, and placements.
 
-A placement is an object that does not move in neighbouring frames of a video. Such frames are nearly equal, so that
-their answers are not independent. Accuracy is therefore also averaged over placements, and the answers within a
-placement show how steady a recognizer is.
+A placement is an object that does not move in neighbouring frames of a video. Such frames are nearly equal, so their
+answers are not independent. Therefore, accuracy is also averaged over placements, and the answers within a placement
+show how steady a recognizer is.
 """
 
 import math
@@ -48,8 +48,8 @@ class Reliability(NamedTuple):
 
     Attributes:
         answers: [bins] int, number of answers in each bin.
-        accuracy: [bins], fraction of them that is correct; NaN in empty bins.
-        confidence: [bins], their mean confidence; NaN in empty bins.
+        accuracy: [bins], fraction of these answers that are correct; NaN in empty bins.
+        confidence: [bins], mean confidence of these answers; NaN in empty bins.
     """
 
     answers: NDArray[np.intp]
@@ -76,7 +76,7 @@ def reliability(confidence: Floats, correct: Flags) -> Reliability:
 def expected_calibration_error(confidence: Floats, correct: Flags) -> float:
     """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
 
-    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments are those of `reliability`.
+    See Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments are as in `reliability`.
     """
     values = reliability(confidence, correct)
     used = values.answers > 0
@@ -111,16 +111,16 @@ def accuracy_at_coverage(confidence: Floats, correct: Flags) -> tuple[float, flo
 
 
 def _threshold(confidence: Floats, kept: ArrayLike) -> NDArray[np.float64]:
-    """Return the largest thresholds that keep shares `kept` [...] of confidences; infinity keeps nothing."""
+    """Return the largest thresholds that keep fractions `kept` [...] of the confidences; infinity keeps nothing."""
     # 0.95 * 20 is slightly more than 19 in floating point.
     count = np.ceil(np.round(np.asarray(kept) * len(confidence), 9)).astype(np.intp)
     return np.append(np.sort(confidence), np.inf)[len(confidence) - count]
 
 
 def unknown_named(correct: Floats, unknown: Floats, kept: ArrayLike = COVERAGE) -> NDArray[np.float64]:
-    """Return the share of unknown objects that are named where a share `kept` of the correct answers is kept.
+    """Return the fraction of unknown objects named at the threshold that keeps a fraction `kept` of correct answers.
 
-    The threshold is the largest confidence that keeps at least this share; an answer with this confidence is kept.
+    The threshold is the largest confidence that keeps at least this fraction; answers equal to it are kept.
 
     Args:
         correct: [N], confidences of the correct answers.
@@ -128,7 +128,7 @@ def unknown_named(correct: Floats, unknown: Floats, kept: ArrayLike = COVERAGE) 
         kept: [...], from 0 to 1.
 
     Returns:
-        [...] shares; NaN if there is no correct answer or no unknown object.
+        [...] fractions; NaN if there is no correct answer or no unknown object.
     """
     if not len(correct) or not len(unknown):
         return np.full(np.shape(kept), np.nan)
@@ -145,7 +145,7 @@ _TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
 
 
 def attribute_tables(kind: str, attributes: Sequence[Mapping[str, str]]) -> list[tuple[str, ...]]:
-    """Return the attributes of each table: none for the first, then the paper's tables or each attribute by itself."""
+    """Return the attributes of each table: none for the first, then those of the paper's tables or each one alone."""
     known = sorted({name for each in attributes for name in each})
     tables = _TABLES.get(kind, tuple((name,) for name in known))
     return [(), *(table for table in tables if set(table) <= set(known))]
@@ -154,7 +154,7 @@ def attribute_tables(kind: str, attributes: Sequence[Mapping[str, str]]) -> list
 def group_by_attributes(
     attributes: Sequence[Mapping[str, str]], names: Sequence[str]
 ) -> dict[tuple[str, ...], NDArray[np.intp]]:
-    """Return the indices for each combination of the named attributes' values; entries that lack one are left out."""
+    """Return the indices for each combination of values of the attributes; entries that lack one are left out."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for index, each in enumerate(attributes):
         if all(name in each for name in names):
@@ -166,8 +166,8 @@ def group_by_attributes(
 def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
     """Return the statistics of a value over several runs as a JSON table.
 
-    They are the `mean` over the runs that have a finite value, None if none has; the sample standard deviation (n - 1)
-    `std`, None for fewer than two; and the number of these `runs`.
+    `runs` is the number of runs with a finite value, `mean` their mean (None if there are none), and `std` their sample
+    standard deviation (n - 1; None for fewer than two).
     """
     finite: NDArray[Any] = np.array([value for value in values if np.isfinite(value)])
     return {
@@ -178,7 +178,7 @@ def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
 
 
 def summarize_rows(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return `summarize_runs` of every value of the runs' rows, which have the same names; at least one row."""
+    """Return `summarize_runs` of every value in the rows, one row per run with the same names; at least one row."""
     return {name: summarize_runs([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -186,21 +186,22 @@ MAX_MOVE = 0.03
 """Largest distance between the positions of an unmoved object in two neighbouring frames, metres."""
 
 MIN_UNMOVED = 0.75
-"""Smallest share of the objects of either frame that are unmoved; with fewer, the objects were arranged anew."""
+"""Smallest fraction of unmoved objects in either frame; with fewer, the objects count as rearranged."""
 
 
 def find_placements(frames: Sequence[FrameAnswers]) -> list[NDArray[np.intp]]:
     """Return the placement of every labelled instance: one array for each frame, in the order of its instances.
 
-    An instance continues the placement of the nearest instance of the same name in the frame before if both frames
-    belong to one sequence (the identifier without its last part), they are at most `MAX_MOVE` apart, and this holds for
-    at least `MIN_UNMOVED` of the instances of either frame. Instances without a position continue nothing.
+    An instance continues the placement of the nearest instance with the same name in the previous frame under three
+    conditions: both frames belong to one sequence (the identifier without its last part), the distance is at most
+    `MAX_MOVE`, and this is true for at least `MIN_UNMOVED` of the instances of either frame. Instances without a
+    position start a new placement.
 
     Args:
         frames: frames in the order of the dataset.
 
     Returns:
-        Numbers of the placements, counted from 0 over all frames.
+        The numbers of the placements, counted from 0 over all frames.
     """
     numbers: list[NDArray[np.intp]] = []
     count = 0
@@ -220,7 +221,7 @@ def find_placements(frames: Sequence[FrameAnswers]) -> list[NDArray[np.intp]]:
 
 
 def _unmoved(before: Sequence[InstancePrediction], now: Sequence[InstancePrediction]) -> list[tuple[int, int]]:
-    """Return pairs of indices of instances with one name that are at most `MAX_MOVE` apart, the nearest ones first."""
+    """Return index pairs of instances with the same name that are at most `MAX_MOVE` apart, the nearest pairs first."""
     distances = [
         (float(np.linalg.norm(np.subtract(a.position, b.position))), i, j)
         for i, a in enumerate(before)
@@ -235,7 +236,7 @@ def _unmoved(before: Sequence[InstancePrediction], now: Sequence[InstancePredict
 
 
 def placement_accuracy(placement: NDArray[np.intp], correct: Flags) -> float:
-    """Return the mean over the placements of the share of their instances that are correct; NaN without instances.
+    """Return the mean over placements of the fraction of correct instances in each; NaN without instances.
 
     Args:
         placement: [N] int, the placement of each instance.
@@ -246,14 +247,14 @@ def placement_accuracy(placement: NDArray[np.intp], correct: Flags) -> float:
 
 
 def steadiness(placement: NDArray[np.intp], answer: NDArray[np.intp]) -> float:
-    """Return the share of instances with the most frequent answer of their placement.
+    """Return the fraction of instances that have the most frequent answer of their placement.
 
     Args:
-        placement: [N] int, the placement of each instance. Placements of one instance do not count.
-        answer: [N] int, its answer; all instances without an answer have the same number.
+        placement: [N] int, the placement of each instance. Placements with a single instance are ignored.
+        answer: [N] int, the answer for each instance; all instances without an answer have the same number.
 
     Returns:
-        The share; NaN if no placement has two instances.
+        The fraction; NaN if no placement has two instances.
     """
     numbers = np.unique(placement, return_inverse=True)[1]
     sizes = np.bincount(numbers)

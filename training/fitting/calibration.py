@@ -1,4 +1,4 @@
-"""Temperatures of classifiers (Guo et al., ICML 2017), and the confidence of a run, fitted on held-out sets."""
+"""Calibration on held-out sets: temperatures of classifiers (Guo et al., ICML 2017) and the confidence of a run."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ def _probabilities(context: FitContext, graph: Any, state: Any, batch: Batch) ->
 def sample_probabilities(
     model: MLP, samples: Samples, rows: NDArray[np.intp], context: FitContext
 ) -> NDArray[np.float32]:
-    """Return the class probabilities [len(rows), C] of samples; `context` is that of the fit."""
+    """Return the class probabilities [len(rows), C] of samples; `context` is the context of the fit."""
     graph, state = nnx.split(model)
     chunks = [np.zeros((0, len(samples.classes)), np.float32)]
     for first in range(0, len(rows), SAMPLES_PER_BATCH):
@@ -58,7 +58,7 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
     """Return the temperature between 0.01 and 100 that minimizes the negative log-likelihood of a held-out set.
 
     Args:
-        probabilities: [N, C] class probabilities of views that the classifier was not trained on, N above 0.
+        probabilities: [N, C], N > 0, class probabilities of views on which the classifier was not trained.
         truth: [N] class indices.
     """
     logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
@@ -71,32 +71,33 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
 
 
 KEPT = 0.95
-"""Share of the correct held-out answers whose confidence reaches the threshold of a run."""
+"""Fraction of the correct held-out answers whose confidence must reach the threshold of a run."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:
-    """Fit the confidence of a run; None if no held-out answer is correct, or no object is unknown.
+    """Calibrate the confidence of a run on a held-out set.
 
     The clouds are recognized in the looks of the run. Known and unknown objects have equal weights in the score,
-    whatever their numbers.
+    regardless of their numbers.
 
     Args:
-        run: run with its classifiers, which are fused as recognition does by default, and its embedding.
-        held_out: label and cloud, in metres, of each view of the held-out set; labels from the number of classes on are
-            of unknown objects.
+        run: run with its embedding and its classifiers, which are fused as in recognition by default.
+        held_out: label and cloud, in metres, of each view of the held-out set; labels from the number of classes on
+            mean unknown objects.
 
     Returns:
-        The calibration, and the accuracy on known objects.
+        The calibration, and the accuracy on known objects. The calibration is None if no held-out answer is correct or
+        no object is unknown.
     """
     model = Model.of_run(run)
-    held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
+    held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # for batches with little padding
     label = np.array([label for label, _ in held_out])
     batches = padded_batches([cloud for _, cloud in held_out])
     chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet
     correct, known = fused.argmax(axis=1) == label, label < len(run.classes)
-    accuracy = float(correct.sum() / max(known.sum(), 1))  # correct answers are to known objects
+    accuracy = float(correct.sum() / max(known.sum(), 1))  # only answers for known objects can be correct
     if known.all() or not correct.any():
         return None, accuracy
     odds = answer_features(fused, probabilities[EMBEDDING])[:, 1]
@@ -104,7 +105,7 @@ def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> t
     if not correct[known].all():
         score = logit(calibration.score(fused, probabilities[EMBEDDING]))
         bias, factor = _logistic(score[known], correct[known])
-        if factor > 0:  # otherwise the confidence would not grow with the score
+        if factor > 0:  # otherwise the confidence would not increase with the score
             calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
     confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
     return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT))), accuracy

@@ -1,8 +1,8 @@
-"""Fit one classifier (paper, section "Training"): Adam at 1e-2 and then 1e-3, categorical cross-entropy.
+"""Fit one classifier with Adam at 1e-2 and then 1e-3 and categorical cross-entropy (paper, section "Training").
 
 Two trainings with the same seed, views and options have the same folds, initial weights, sample order and dropout. On
 the same machine, with the same library versions and number of CPU devices, their weights and metrics are equal bit for
-bit, also if one of them was interrupted; only `samples_per_second` differs. On other hardware, on accelerators or with
+bit, even if one of them was interrupted; only `samples_per_second` differs. On other hardware, on accelerators or with
 another number of devices, floating-point sums are rounded differently, and the weights are close but not equal.
 
 Steps are compiled and data-parallel over all devices of all processes (`batch_mesh`). Batches are sharded over the
@@ -48,7 +48,7 @@ __all__ = [
 
 
 class FitState(NamedTuple):
-    """All that the training of a network changes. A pytree.
+    """The training state of a network: everything that a step changes. A pytree.
 
     Attributes:
         params: weights.
@@ -66,8 +66,8 @@ class FitContext:
     """Constants of a fit; static under jit.
 
     Attributes:
-        feature: which part of the descriptor the classifier reads.
-        network: colour network; gives the colour regions and their similarity.
+        feature: part of the descriptor that the classifier reads.
+        network: colour network, which defines the colour regions and their similarity.
         config: descriptor, as the samples were built with, but always in closed form, which is equal to gudhi's values.
     """
 
@@ -117,18 +117,18 @@ def network_step(
 
     Args:
         graph: the network without its arrays.
-        state: before the step.
-        optimizer: from optax.
+        state: state before the step.
+        optimizer: optax optimizer.
         label: [B] class indices.
-        outputs_of: function of the network that returns logits [B, C], and scores [B, C] of which the highest is the
-            answer.
+        outputs_of: function of the network that returns logits [B, C] and scores [B, C]; the highest score is the
+            predicted class.
 
     Returns:
         The next state, and the batch's loss and accuracy before the step.
     """
 
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
+        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalization changes its statistics
         logits, scores = outputs_of(model)
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
         return loss, ((scores.argmax(axis=-1) == label).mean(), nnx.state(model, nnx.Not(nnx.Param)))
@@ -147,11 +147,11 @@ def train_step(
     Args:
         context: static.
         graph: the classifier without its arrays, from `initial_state`. Static.
-        state: donated; not usable afterwards.
-        batch: on the devices, from `shard_batch`.
+        state: state before the step; it is donated and cannot be used afterwards.
+        batch: batch on the devices, from `shard_batch`.
         rate: learning rate.
         seed: seed for the dropout.
-        step: number of the step; dropout is drawn from it and the seed.
+        step: number of the step, which determines the dropout together with the seed.
 
     Returns:
         The next state, and the batch's loss and accuracy before the step.
@@ -208,21 +208,21 @@ def fit(
     Samples are expanded to descriptors on the devices, one batch at a time.
 
     Args:
-        samples: training samples and held-out set; with several processes, the same in each.
+        samples: training samples and held-out set; the same in all processes.
         context: feature, colour network and descriptor.
         options: epochs, learning rates, seed and batch size, a multiple of the number of devices.
-        checkpoints: of this fit only; written after each epoch.
+        checkpoints: checkpoints of this fit only, written after each epoch.
         held_out: [M], True for samples of the held-out set; by default there is none.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
-        rows: the samples that take part; by default all.
+        rows: indices of the samples to use; by default all.
 
     Returns:
-        The classifier of the best epoch, and that epoch's number: the one with the highest held-out accuracy or,
-        without a held-out set, with the lowest training loss.
+        The classifier after the best epoch, and the number of this epoch. The best epoch has the highest held-out
+        accuracy or, without a held-out set, the lowest training loss.
 
     Raises:
         InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
-        OSError: A checkpoint cannot be written. The last complete one stays.
+        OSError: A checkpoint cannot be written. The last complete one is kept.
     """
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
@@ -247,7 +247,7 @@ def fit(
             yield shard_batch(samples.take(rows[first : first + chunk]))
 
     def epoch(number: int) -> Iterator[Batch]:
-        # The order is drawn from seed and epoch, so that a resumed fit needs no generator state.
+        # The order depends only on seed and epoch, so that a resumed fit needs no generator state.
         order = np.random.default_rng((options.seed, number)).permutation(train_rows)
         return batches(order[: steps.of_epoch * batch_size])
 

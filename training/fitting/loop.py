@@ -1,4 +1,4 @@
-"""The training loop of all networks, with metrics, and checkpoints from which an interrupted fit resumes.
+"""The training loop of all networks, with metrics and with checkpoints from which an interrupted fit resumes.
 
     checkpoints = Checkpoints(directory)
     state = checkpoints.last(state) if checkpoints.last_epoch else state
@@ -7,9 +7,9 @@
         checkpoints.save(epoch, state, score)
     state = checkpoints.best(state)
 
-Two epochs are kept: the last one and the one with the best score. A checkpoint is written atomically, and an older one
-is removed only afterwards, so the last complete checkpoint survives any crash. The log of the metrics is JSON lines,
-readable while the training runs.
+Checkpoints of two epochs are kept: the last epoch and the epoch with the best score. A checkpoint is written atomically
+before an older one is removed, so the last complete checkpoint survives any crash. The metrics are logged as JSON
+lines, which can be read while the training runs.
 """
 
 import contextlib
@@ -47,17 +47,17 @@ __all__ = [
 ]
 
 MAX_SEED = 2**31 - 1
-"""Largest seed that fits into 32 signed bits, as JAX requires."""
+"""Largest seed: JAX requires that it fits into 32 signed bits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """How a classifier is fitted.
+    """Options for fitting a classifier.
 
     Attributes:
         epochs: number of epochs; the first half uses `learning_rates[0]`, the rest `learning_rates[1]`.
         learning_rates: Adam's two learning rates.
-        batch_size: samples per step; an incomplete last batch is dropped (other samples in each epoch).
+        batch_size: samples per step; an incomplete last batch is dropped, with different samples in each epoch.
         seed: seed for initial weights, sample order and dropout.
 
     Raises:
@@ -86,7 +86,7 @@ class EpochMetrics:
         loss: mean training loss of the epoch so far.
         accuracy: training accuracy of the epoch so far, with dropout.
         samples_per_second: training rate of the epoch so far, without its first step, which may compile.
-        held_out_accuracy: accuracy on the held-out set after the epoch; None before, or without a held-out set.
+        held_out_accuracy: accuracy on the held-out set after the epoch; None during the epoch or without the set.
     """
 
     epoch: int
@@ -97,7 +97,7 @@ class EpochMetrics:
 
 
 def fit_progress(progress: Progress, stage: str, epochs: int) -> Callable[[int, int, EpochMetrics], object]:
-    """Return the callback of a stage that fits networks in so many epochs: its note has the metrics."""
+    """Return the callback of a stage that fits networks in `epochs` epochs; its note contains the metrics."""
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:
         note = f"epoch {metrics.epoch}/{epochs}, loss {metrics.loss:.3f}, accuracy {metrics.accuracy:.3f}"
@@ -114,7 +114,7 @@ def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Return the metrics of all epochs, without a last line that a crash cut off; an absent file has none.
+    """Return the metrics of all epochs; a missing file has none, and a last line cut off by a crash is ignored.
 
     Raises:
         InputError: if any other line is damaged.
@@ -131,28 +131,28 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> None:
-    """Remove the lines of a classifier after `epoch`, where its training resumes and appends them again."""
+    """Remove the lines of a classifier after `epoch`, since its training resumes there and appends them again."""
     rows = read_metrics(path)
     kept = [r for r in rows if (r["fold"], r["classifier"]) != (fold, classifier) or r["epoch"] <= epoch]
     write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 CHECKPOINTS = "checkpoints"
-"""Directory inside the run directory of an unfinished training."""
+"""Directory of the checkpoints, inside the run directory of an unfinished training."""
 
 BEGUN = "begun.json"
-"""Job record of an unfinished training in this directory."""
+"""File name, in this directory, of the job record of an unfinished training."""
 
 
 class Checkpoints:
-    """Checkpoints in one directory, which all processes of a training share; the first process writes them."""
+    """Checkpoints in one directory, shared by all processes of a training; the first process writes them."""
 
     def __init__(self, directory: str | Path, log: Callable[[EpochMetrics], object] = lambda metrics: None) -> None:
         """Open or create the directory.
 
         Args:
-            directory: of this fit only.
-            log: called with the metrics of each epoch by the process that writes, before its checkpoint is written.
+            directory: directory for this fit only.
+            log: called by the first process with the metrics of each epoch, before its checkpoint is written.
 
         Raises:
             InputError: a checkpoint is damaged.
@@ -172,14 +172,14 @@ class Checkpoints:
 
     @property
     def best_epoch(self) -> int:
-        """Epoch of the checkpoint with the highest score, the latest of equal ones; 0 if there is none."""
+        """Epoch of the checkpoint with the highest score, the latest one if scores are equal; 0 if there is none."""
         return max(self._scores, key=lambda epoch: (self._scores[epoch], epoch), default=0)
 
     def save(self, epoch: int, state: Any, score: float) -> None:
-        """Write a checkpoint, and remove those that are neither the last nor the best one.
+        """Write a checkpoint, and remove all but the last one and the best one.
 
         Args:
-            epoch: number of the epoch, greater than that of the last checkpoint.
+            epoch: number of the epoch, greater than the epoch of the last checkpoint.
             state: pytree of arrays, equal in all processes.
             score: quality of the state; higher is better.
 
@@ -199,7 +199,7 @@ class Checkpoints:
         """Return the state of the last checkpoint, as NumPy arrays.
 
         Args:
-            like: state of the same structure, shapes and dtypes.
+            like: a state with the same structure, shapes and dtypes.
 
         Raises:
             InputError: if the checkpoint is damaged or has another structure.
@@ -215,7 +215,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _readable(self, path: Path) -> Iterator[None]:
-        """Raise InputError if a checkpoint cannot be read in the block."""
+        """Raise InputError if reading a checkpoint in the block fails."""
         try:
             yield
         except (ValueError, KeyError, TypeError) as error:
@@ -238,7 +238,7 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
     """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
 
     Raises:
-        InputError: A training is not finished. A path that is not a run directory is refused when it is loaded.
+        InputError: A training is not finished. Other paths that are not run directories are rejected on loading.
     """
     directories: list[Path] = []
     for path in map(Path, paths):
@@ -255,20 +255,20 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
 
 
 def wait_for_all(point: str) -> None:
-    """Wait until all processes are here, so that none reads what the first one has not written."""
+    """Wait until all processes have reached this point, so that none reads files before the first one wrote them."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(point)
 
 
 STEPS_PER_REPORT = 20
-"""Steps dispatched to the devices before their results are awaited: the host gathers batches meanwhile."""
+"""Number of steps dispatched to the devices before their results are awaited; the host gathers batches meanwhile."""
 
 State = TypeVar("State")
 Item = TypeVar("Item")
 
 
 class Steps(NamedTuple):
-    """Numbers of a fit: its epochs, the steps of an epoch, and the samples of a step."""
+    """Number of epochs of a fit, of steps per epoch, and of samples per step."""
 
     epochs: int
     of_epoch: int
@@ -287,26 +287,26 @@ def run_epochs(
     held_out_accuracy: Callable[[State], float | None] = lambda state: None,
     place: Callable[[State], State] = lambda state: state,
 ) -> State:
-    """Train for all epochs, or for those after the last checkpoint, and return the last state.
+    """Train for all epochs, or for the epochs after the last checkpoint, and return the last state.
 
-    Order and dropout should depend on seed, epoch and step only, so that a resumed fit gives the same bits.
+    Order and dropout should depend on seed, epoch and step only, so that a resumed fit gives exactly the same result.
 
     Args:
         name: name of the networks, for messages.
         state: pytree of the arrays that a step changes.
         steps: numbers of the fit.
-        batches: function of an epoch, from 1, that yields its batches.
-        step: function of the state, the number of the step, from 0, and a batch that returns the next state, and loss
+        batches: function that yields the batches of an epoch, given its number from 1.
+        step: function of the state, the number of the step from 0, and a batch. It returns the next state, and the loss
             and accuracy of the batch.
-        checkpoints: of this fit only, written after each epoch. The score of one is the held-out accuracy or, without
-            one, the negative loss.
+        checkpoints: checkpoints of this fit only, written after each epoch. Their score is the held-out accuracy or,
+            without a held-out set, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         held_out_accuracy: function of the state after an epoch; None without a held-out set.
         place: function that moves a state to the devices.
 
     Raises:
-        InputError: the loss is not finite (the last checkpoint stays), or a checkpoint is unreadable.
-        OSError: a checkpoint cannot be written; the previous one stays.
+        InputError: the loss is not finite (the last checkpoint is kept), or a checkpoint is unreadable.
+        OSError: a checkpoint cannot be written; the previous one is kept.
     """
     state = place(checkpoints.last(state) if checkpoints.last_epoch else state)
     for epoch in range(checkpoints.last_epoch + 1, steps.epochs + 1):

@@ -4,8 +4,8 @@
     batch = samples.take(np.arange(256))                                  # padded host arrays
     strips = expand(batch, region_sets(network).weights, config)          # on the device, under jit
 
-A sample stores what its descriptor is computed from: the length of each occupied strip, and how many of its points have
-each set of colour regions. This takes some hundred bytes instead of the 48 kB of TOPS2.
+A sample stores the data for computing its descriptor: the length of each occupied strip, and the number of its points
+for each set of colour regions. This takes some hundred bytes instead of 48 kB for TOPS2.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from training.views.normalized_views import ViewSource, padded_batches
 __all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand"]
 
 MIRRORS = ("", "x")
-"""Mirrors of a normalized view that change its descriptor: a mirror in y changes no strip length and no count."""
+"""Mirrors of a normalized view that change its descriptor. A mirror in y changes no strip length and no count."""
 
 PAPER_MIRRORS = ("", "x", "y", "xy")
 """The four mirrors of the paper."""
@@ -46,10 +46,10 @@ class Batch(NamedTuple):
 
     Attributes:
         strip: [B, E] uint16, slice x n_strips + strip; PADDING after the sample's last strip.
-        length: [B, E] float32, largest less smallest y of the strip, scaled units.
+        length: [B, E] float32, largest minus smallest y of the strip, scaled units.
         color_strip: [B, C] uint16, strip of a colour count; PADDING after the sample's last count.
         color_set: [B, C] uint16, set of colour regions that is counted.
-        color_count: [B, C] float32, points of the strip with that set (weights for a relaxed descriptor).
+        color_count: [B, C] float32, number of points of the strip with this set (weights for a relaxed descriptor).
         label: [B] int32.
     """
 
@@ -66,8 +66,8 @@ class Samples:
     """Training samples in compact form, as host arrays: the fields of `Batch` for one sample after the other.
 
     Attributes:
-        strip_start: [M + 1] int64, index of each sample's first entry in `strip` and `length`, and their length.
-        color_start: [M + 1] int64, the same for the colour counts.
+        strip_start: [M + 1] int64, index of each sample's first entry in `strip` and `length`; the last one is T.
+        color_start: [M + 1] int64, index of each sample's first colour count; the last one is U.
         strip: [T] uint16.
         length: [T] float32.
         color_strip: [U] uint16.
@@ -109,7 +109,7 @@ class Samples:
 def _entries(
     start: NDArray[np.int64], rows: NDArray[np.integer[Any]], most: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices [B, most] of the rows' entries, and which of them are not padding."""
+    """Return the indices [B, most] of the rows' entries, and a mask of those that are not padding."""
     index = start[rows, None] + np.arange(most)
     inside = index < start[rows + 1, None]
     return np.where(inside, index, 0), inside
@@ -124,15 +124,15 @@ def build_samples(
     orientations: int = 0,
     seed: int = 0,
 ) -> Samples:
-    """Mirror every view and keep its strips; reads one shard of views at a time.
+    """Mirror every view and compute its strips, reading one shard of views at a time.
 
     Args:
         source: normalized views.
-        network: colour network that gives the regions.
+        network: colour network that defines the regions.
         config: descriptor. Static.
         progress: called with (views done, number of views).
-        mirrors: axes of each mirror, such as "xy"; one sample each.
-        orientations: further samples of each view, in random orientations.
+        mirrors: axes of each mirror, such as "xy"; each mirror gives one sample.
+        orientations: number of additional samples of each view, in random orientations.
         seed: seed for the orientations.
 
     Raises:
@@ -144,7 +144,7 @@ def build_samples(
         if not any(shard.label == label and shard.views for shard in source.shards):
             raise InputError(f"class {name!r} has no views; render more views or leave it out")
     sets = region_sets(network)
-    # With one "region" per set, colour vectors count the sets: sparse, with integer values.
+    # With one "region" per set, colour vectors count the sets, so they are sparse with integer values.
     counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
     chunks: list[dict[str, NDArray[Any]]] = []
     all_done, total = 0, sum(shard.views for shard in source.shards)
@@ -189,12 +189,13 @@ def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> St
     """Return the strips of a batch, fields [B, S, J] and [B, S, J, R], for `describe_strips`; call it under jit.
 
     Args:
-        batch: from `Samples.take`.
+        batch: batch from `Samples.take`.
         set_weights: [K, R], region weights of each set of regions (`RegionSets.weights`).
-        config: static.
+        config: descriptor. Static.
 
     Returns:
-        `low` is 0 and `high` is the length of a strip: descriptors depend on nothing else. `overflow` is 0.
+        The strips. `low` is 0 and `high` is the length of a strip, since descriptors depend on the length only.
+        `overflow` is 0.
     """
     shape = config.n_slices, config.n_strips
     n_strips, n_regions = shape[0] * shape[1], set_weights.shape[1]

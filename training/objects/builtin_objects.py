@@ -3,8 +3,8 @@
     objects = builtin_objects()
     objects["mug_blue"].vertices        # metres, z up, standing on z = 0
 
-They are built from surfaces of rings (surfaces of revolution, or swept along a path) and boxes. Texels are coloured by
-rules in the coordinates of the surface.
+They are built from boxes and from surfaces through rings: surfaces of revolution, and rings swept along a path. Rules
+in surface coordinates determine the colour of each texel.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,14 +31,14 @@ COLOR_PAIRS = (("soup_can_red", "soup_can_green"), ("mug_blue", "mug_white"), ("
 """Pairs with the same mesh and different colours."""
 
 SHAPE_PAIRS = (("white_bowl", "white_plate"), ("white_bowl", "white_cup"), ("yellow_bottle", "yellow_box"))
-"""Pairs with different meshes and the same colours in the same shares of the surface."""
+"""Pairs with different meshes but the same colours, each on the same fraction of the surface."""
 
 Color = tuple[int, int, int]
 Array = NDArray[np.float64]
 Mark = tuple[Color, Callable[..., Any]]
-"""A colour and where it is applied: a boolean function of surface coordinates (see `_lathe`, `_sweep`, `_box`)."""
+"""A colour and the region that it covers, a boolean function of surface coordinates (`_lathe`, `_sweep`, `_box`)."""
 
-# Each colour keeps its regions of the colour network under other light; neutral greys would not, so they are tinted.
+# Each colour stays in its regions of the colour network under other light. Neutral greys would not, so they are tinted.
 RED, GREEN, BLUE, YELLOW = (196, 22, 30), (22, 135, 58), (30, 70, 182), (236, 194, 24)
 ORANGE, BROWN, TAN, IVORY = (238, 112, 20), (116, 68, 30), (206, 160, 108), (238, 240, 204)
 LIME, TEAL, STEEL, DARK = (186, 214, 52), (20, 150, 152), (152, 152, 192), (30, 32, 66)
@@ -63,8 +63,7 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
     Args:
         profile: [k, 2] radius and height, metres; runs up the outside, and for a vessel down the inside.
         base: colour.
-        marks: functions of angle (turns), radius, height, and the share [0, 1] of the surface that comes before in the
-            profile.
+        marks: functions of angle (turns), radius, height, and position along the profile as a fraction of the surface.
     """
     line = np.asarray(profile, np.float64)
     v = arc_lengths(line)
@@ -85,7 +84,7 @@ def _sweep(
         radii: [k, 2] metres, in the plane and across it.
         across: [3] unit normal of the plane.
         base: colour.
-        marks: functions of the angle (turns; 0 in the plane, 0.25 across it) and of the share [0, 1] of the length.
+        marks: functions of the angle (turns; 0 in the plane, 0.25 across it) and of the fraction [0, 1] of the length.
         sides: sides of the cross-section.
     """
     return tube_surface(path, radii, across, _texture(base, marks, *texel_centres(TEXELS)), sides)
@@ -111,13 +110,13 @@ def _arc(radius: float, start: float, stop: float, n: int) -> Array:
 
 
 def _ellipse(x: Array, y: Array, centre: tuple[float, float], radii: tuple[float, float]) -> Any:
-    """Return where coordinates lie in an ellipse."""
+    """Return which coordinates lie inside an ellipse."""
     return ((x - centre[0]) / radii[0]) ** 2 + ((y - centre[1]) / radii[1]) ** 2 < 1
 
 
 def _soup_can(label: Color) -> TexturedMesh:
     profile = [(0, 0.002), (0.031, 0.002), (0.033, 0), (0.033, 0.101), (0.031, 0.099), (0, 0.099)]
-    across = 0.104  # of half of the label, metres
+    across = 0.104  # width of half of the label, metres
     return _lathe(
         profile,
         STEEL,
@@ -160,7 +159,7 @@ def _cereal_box(ground: Color, panel: Color, bowl: Color) -> TexturedMesh:
 
 
 def _crockery(profile: ArrayLike) -> TexturedMesh:
-    """Return ivory crockery with a blue rim on an eighth of the surface, for any shape."""
+    """Return ivory crockery of any shape, with a blue rim on an eighth of the surface."""
     return _lathe(profile, IVORY, (BLUE, lambda u, r, z, s: abs(s - 0.5) < 0.0625))
 
 
@@ -181,7 +180,7 @@ def _cup() -> TexturedMesh:
 
 
 RED_SHARE = 0.22
-"""Share of red in the surface of the two yellow objects."""
+"""Red fraction of the surface of the two yellow objects."""
 
 
 def _yellow_bottle() -> TexturedMesh:
@@ -282,7 +281,7 @@ def _wooden_spoon() -> TexturedMesh:
 
 
 def builtin_objects() -> dict[str, TexturedMesh]:
-    """Return all objects by name, newly made and always the same; metres, z up, standing or lying on z = 0."""
+    """Return new, always identical meshes of all objects by name; metres, z up, standing or lying on z = 0."""
     return {
         "soup_can_red": _soup_can(RED),
         "soup_can_green": _soup_can(GREEN),

@@ -1,7 +1,7 @@
-"""Download scanned meshes of the YCB objects; nothing else in this software downloads anything.
+"""Download scanned meshes of the YCB objects. No other part of this software downloads anything.
 
-The archives are those of the YCB Object and Model Set with 16,000 faces (`google_16k`). The files of an object are
-written to `<directory>/<object>`, where `find_meshes` finds `textured.obj`.
+The archives are the `google_16k` archives of the YCB Object and Model Set, with 16,000 faces per mesh. The files of an
+object are written to `<directory>/<object>`, where `find_meshes` finds `textured.obj`.
 """
 
 import gzip
@@ -32,11 +32,11 @@ LICENCE = (
 NAME = re.compile(r"\d{3}(-[a-z])?_[a-z0-9_-]+")
 MESH_FILE = "textured.obj"
 TIMEOUT = 30.0
-"""Seconds without an answer or a byte after which the server counts as unreachable."""
+"""Seconds without any received data after which the server is considered unreachable."""
 
 CHUNK_BYTES = 2**18
 MAX_BYTES = 2**29
-"""Largest archive and largest content of an archive; those of the set have about 10 MB."""
+"""Largest size of an archive and of its content; the archives of the set have about 10 MB."""
 
 
 def fetch_ycb(
@@ -44,12 +44,12 @@ def fetch_ycb(
 ) -> dict[str, Path]:
     """Download the meshes of YCB objects: object name -> mesh file, in the order of `objects`.
 
-    Objects whose mesh is in the directory already are not downloaded again. The download of an archive that was
-    interrupted resumes. An archive that is damaged is removed.
+    Objects whose mesh is already in the directory are not downloaded again. An interrupted download resumes. A damaged
+    archive is removed.
 
     Args:
         objects: names as in the set, such as "003_cracker_box".
-        directory: the mesh of an object is `<directory>/<object>/textured.obj`; may contain other objects.
+        directory: directory of the meshes, `<directory>/<object>/textured.obj`; may contain other objects.
         url: address of the folder with the archives `<object>_google_16k.tgz`.
         progress: called with (object, downloaded kB, total kB, "").
 
@@ -84,7 +84,7 @@ def fetch_ycb(
 
 
 def _download(address: str, archive: Path, name: str, progress: Progress) -> None:
-    """Download to `archive`, from the end of what it contains on."""
+    """Download an archive; continue after the bytes that `archive` already contains."""
     have = archive.stat().st_size if archive.exists() else 0
     if have:
         with archive.open("rb") as stream:
@@ -93,7 +93,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
     try:
         with httpx.stream("GET", address, headers=headers, timeout=TIMEOUT, follow_redirects=True) as answer:
-            if answer.status_code == 416:  # nothing is missing; a damaged archive is removed by `_extract`
+            if answer.status_code == 416:  # the archive is complete; `_extract` removes a damaged one
                 return
             if answer.status_code in (403, 404):
                 raise InputError(f"objects has {name!r}, but there is no {address}; see the names at ycbbenchmarks.com")
@@ -112,7 +112,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
                     progress(name, have // 1000, max(have, total) // 1000, "kB")
     except InputError:
         raise
-    # The last two are raised for proxies of other kinds and by the resolution of names.
+    # ImportError is raised for proxies of other kinds, ValueError by name resolution.
     except (httpx.HTTPError, httpx.InvalidURL, ImportError, ValueError) as error:
         raise InputError(
             f"url: {address} cannot be read ({reason_of(error)}); expected an address such as {YCB_URL}; check the "
@@ -121,10 +121,10 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
 
 
 def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, also on an error.
+    """Move the files of the archive to `directory / name` and remove the archive, even after an error.
 
-    The files are the regular ones in `google_16k`, under their last names. The archive is read to its end, so that the
-    checksum of gzip covers all of it.
+    Only regular files in `google_16k` are moved, without their folders. The archive is read to its end, so that the
+    checksum of gzip is verified.
     """
     total = 0
     try:
@@ -140,7 +140,7 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
                     if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
                         continue
                     source = content.extractfile(member)
-                    assert source is not None  # of a regular file
+                    assert source is not None  # not None for a regular file
                     with source, (folder / path.name).open("xb") as target:
                         shutil.copyfileobj(source, target)
                 while stream.read(CHUNK_BYTES):

@@ -1,4 +1,4 @@
-"""A coloured triangle mesh, the colour at a point of its surface, and surfaces that meshes are built from (metres)."""
+"""Coloured triangle meshes: colours at surface points, and surfaces from which meshes are built (metres)."""
 
 import dataclasses
 import math
@@ -51,12 +51,12 @@ class TexturedMesh:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Centre of the axis-aligned bounding box [3], metres, at which training cameras look."""
+        """Centre of the axis-aligned bounding box [3], metres; training cameras look at it."""
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the arrays: mesh files refer to others, and meshes need not come from files."""
+        """SHA-256 of the arrays, since mesh files may refer to other files and meshes may not come from files."""
         parts: list[str | bytes] = []
         for array in (self.vertices, self.faces, self.uv, self.face_texture, self.corner_colors, *self.textures):
             parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
@@ -69,8 +69,8 @@ class TexturedMesh:
     def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Return the sRGB colours of points on the surface.
 
-        Textures are sampled at the nearest texel: a pixel of a training view spans several texels and is averaged in a
-        voxel, and bilinear weights would mix in foreign colours at the borders of a chart.
+        Textures are sampled at the nearest texel, since bilinear weights would mix in wrong colours at the borders of a
+        chart. A pixel of a training view spans several texels, and the pixels of a voxel are averaged anyway.
 
         Args:
             face: [n] integer, index into `faces`.
@@ -84,7 +84,7 @@ class TexturedMesh:
             a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
             return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
         assert self.uv is not None and self.face_texture is not None
-        # Coordinates in contiguous rows, with which NumPy calculates faster.
+        # NumPy is faster with each coordinate in a contiguous row.
         a, b, c = self.uv.take(face, axis=0).reshape(-1, 6).T.copy().reshape(3, 2, -1)
         uv = a + second.T * (b - a) + third.T * (c - a)
         if len(self.textures) == 1:
@@ -156,7 +156,7 @@ def arc_lengths(points: Array) -> Array:
 
 
 def superellipse(sides: int, exponent: float = 2.0) -> Array:
-    """Return a closed ring [sides + 1, 2] of radius 1 along the axes: a circle for 2, more like a square above."""
+    """Return a closed ring [sides + 1, 2] of radius 1 along the axes: a circle for exponent 2, squarer above."""
     theta = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([np.cos(theta), np.sin(theta)], axis=1)
     return np.sign(ring) * np.abs(ring) ** (2 / exponent)
@@ -172,7 +172,7 @@ def revolved_surface(
         texture: image; u is the angle, v the arc length of the profile.
         sides: sides of the cross-section.
         exponent: exponent of the cross-section, see `superellipse`.
-        ratio: width of the cross-section along y, as a multiple of that along x.
+        ratio: width of the cross-section along y, divided by its width along x.
     """
     line, ring = np.asarray(profile, np.float64), superellipse(sides, exponent) * [1, ratio]
     section = np.concatenate([ring, np.ones((len(ring), 1))], axis=1)
@@ -230,7 +230,7 @@ def moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", 
 
 
 def standing(*parts: TexturedMesh) -> TexturedMesh:
-    """Merge parts and put them on z = 0 over the origin."""
+    """Merge parts and place them on z = 0, centred over the origin."""
     mesh = merge_meshes(parts)
     centre = mesh.centre
     return moved(mesh, (-centre[0], -centre[1], -mesh.vertices[:, 2].min()))

@@ -14,7 +14,7 @@ from thor2_jax.frames.image_files import check_size
 from thor2_jax.printable import check_name
 from training.objects.mesh import TexturedMesh, merge_meshes
 
-if TYPE_CHECKING:  # takes .2 s to import, and is needed where meshes are read
+if TYPE_CHECKING:  # takes 0.2 s to import, so it is imported where meshes are read
     import trimesh
 
 __all__ = [
@@ -35,7 +35,7 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
-"""Range of an object's longest side, metres: rejects scans in millimetres and keeps the camera outside the object."""
+"""Range of an object's longest side, metres; rejects scans in millimetres and keeps the camera outside the object."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -46,7 +46,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
 
     Raises:
         InputError: The geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
-        ValueError: It is inconsistent.
+        ValueError: The geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
     from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
@@ -54,7 +54,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
     vertices = transform_points(vertices, transform)
     faces = np.reshape(np.asarray(geometry.faces, np.int32), (-1, 3))
-    if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored part stays the right way out
+    if np.linalg.det(transform[:3, :3]) < 0:  # keep the faces of a mirrored part oriented outwards
         faces = np.fliplr(faces).copy()
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
@@ -96,15 +96,15 @@ def _longest(mesh: TexturedMesh) -> float:
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     """Read a GLB, OBJ or PLY file with a texture, vertex colours, face colours or plain material colours.
 
-    Colours are taken as stored, as sRGB; a base colour factor multiplies its texture, or stands alone without one.
+    Stored colours are interpreted as sRGB. A base colour factor multiplies its texture, or is the colour without one.
 
     Args:
         path: the file.
-        scale: factor that converts its unit to metres; .001 for millimetres.
+        scale: factor from the unit of the file to metres; 0.001 for millimetres.
 
     Raises:
-        InputError: The file is missing, unreadable or of another format, has no faces or colours, has vertices or
-            texture coordinates that are not finite or too large, or is not of an object's size in metres; or `scale` is
+        InputError: The file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
+            texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
             not a positive number.
     """
     if not 0 < scale < np.inf:
@@ -123,12 +123,12 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
 
 
 def longest_side(path: str | Path) -> float:
-    """Return the longest side of the bounding box of a mesh in the file's unit; raises InputError as `load_mesh`."""
+    """Return the longest side of a mesh's bounding box in the file's unit; raise InputError as `load_mesh`."""
     return _longest(_parsed(Path(path)))
 
 
 def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | TexturedMesh]:
-    """Return object name -> mesh file, or, if the unit is not metres, mesh; raises InputError as `load_mesh`."""
+    """Return object name -> mesh file, or -> scaled mesh if `scale` is not 1; raise InputError as `load_mesh`."""
     return {name: path if scale == 1 else load_mesh(path, scale) for name, path in meshes.items()}
 
 
@@ -142,7 +142,7 @@ def _parsed(path: Path) -> TexturedMesh:
     missing: list[str] = []
 
     class Files(trimesh.resolvers.FilePathResolver):
-        """Remembers missing files and pipes: without its material or texture, trimesh loads a mesh as grey."""
+        """Resolver that records missing files and pipes, since trimesh loads a mesh without its texture as grey."""
 
         def get(self, name: str) -> bytes:
             try:
@@ -178,10 +178,10 @@ def _parsed(path: Path) -> TexturedMesh:
 
 
 def _mesh_in(folder: Path) -> Path | None:
-    """Return the mesh file of a directory: `textured.*` first, then the only GLB, then the only file; None without any.
+    """Return the mesh file of a directory: `textured.*`, else the only GLB, else the only mesh file; None without any.
 
     Raises:
-        InputError: There are several, and none takes precedence.
+        InputError: There are several mesh files, and none takes precedence.
     """
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
     named = [file for file in files if file.stem.lower() == "textured"]
@@ -217,7 +217,7 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         name = entry.name if entry.is_dir() else entry.stem
-        if requested is not None and name not in requested:  # it may be in any state
+        if requested is not None and name not in requested:  # scans that are not requested are not checked
             continue
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:
@@ -233,7 +233,7 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
 
 
 def _named(folder: Path, meshes: Mapping[str, Path]) -> dict[str, Path]:
-    """Return the meshes under the names that `check_name` makes of theirs."""
+    """Return the meshes under their names as normalized by `check_name`."""
     named: dict[str, Path] = {}
     for name, path in meshes.items():
         with with_context(f"mesh folder {folder}"):
@@ -247,7 +247,7 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
 
     Args:
         path: a mesh file, the folder of one object, or a folder of objects as for `find_meshes`.
-        name: the one object wanted; None takes all objects of a folder, under their own names.
+        name: name of the only object to find; None finds all objects of a folder, under their own names.
 
     Raises:
         InputError: there is no such mesh, or `name` is None for a file.

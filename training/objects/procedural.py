@@ -1,9 +1,9 @@
-"""Procedural objects: any number of different shapes, proportions and paints, to train an embedding on.
+"""Procedural objects of any number, with different shapes, proportions and paints, for training an embedding.
 
     mesh = procedural_object(12)        # the same for every call; metres, standing on z = 0
 
-Of five successive seeds, the second has the shape of the first in other paint, and the fourth the paint of the third on
-another shape, so that neither shape nor colour alone separates all objects.
+In each group of five successive seeds, the second object has the shape of the first in another paint, and the fourth
+has the paint of the third on another shape. Therefore, neither shape nor colour alone separates all objects.
 """
 
 import colorsys
@@ -40,11 +40,11 @@ Rng = np.random.Generator
 
 _SIBLINGS = 5
 _PALETTE, _TEXTURE, _SHAPE = range(3)
-"""Streams of random numbers of an object: its palette, its textures and its shape."""
+"""Random number streams of an object: for its palette, its textures and its shape."""
 
 
 def procedural_object(seed: int) -> TexturedMesh:
-    """Return the procedural object of a seed, a non-negative integer."""
+    """Return the procedural object for a seed, which is a non-negative integer."""
     shape_seed = seed - (seed % _SIBLINGS == 1)
     paint = _paint(seed - (seed % _SIBLINGS == 3))
     rng = np.random.default_rng([_SHAPE, shape_seed])
@@ -71,7 +71,7 @@ def _log_uniform(rng: Rng, low: float, high: float) -> float:
 
 
 def _paint(seed: int) -> "Paint":
-    """Return the textures of one object's parts, by number, in the colours of one palette."""
+    """Return a function from the number of a part to its texture; all parts share the colours of one palette."""
     rng = np.random.default_rng([_PALETTE, seed])
     palette, is_uniform = _palette(rng), rng.random() < 0.5
 
@@ -85,7 +85,7 @@ def _paint(seed: int) -> "Paint":
 
 
 def _palette(rng: Rng) -> list[Array]:
-    """Return one to five sRGB colours [3], 0..255; the first is the ground."""
+    """Return one to five sRGB colours [3], 0..255; the first is the background."""
     colors = [_color(rng) for _ in range(rng.integers(1, 6))]
     if len(colors) > 1 and rng.random() < 0.4:
         colors[1] = np.clip(np.array([235.0, 235.0, 230.0]) * rng.uniform(0.85, 1.05), 0, 255)
@@ -105,7 +105,7 @@ def _color(rng: Rng) -> Array:
 
 
 def _noise(rng: Rng, cells: int) -> Array:
-    """Return smooth noise [TEXELS, TEXELS], about 0 to 1, of so many cells along each axis; it repeats."""
+    """Return smooth periodic noise [TEXELS, TEXELS], about 0 to 1, with `cells` cells along each axis."""
     values = np.pad(rng.random((cells, cells)), ((0, 1), (0, 1)), mode="wrap")
     return zoom(values, TEXELS / (cells + 1), order=3)
 
@@ -125,7 +125,7 @@ def _texture(rng: Rng, palette: list[Array]) -> Image:
 
 
 def _around(u: Array, start: float) -> Array:
-    """Return the distance from `start` in the direction of u, in [0, 1): u is periodic."""
+    """Return the distance from `start` in the direction of u, in [0, 1), since u is periodic."""
     return (u - start) % 1
 
 
@@ -171,11 +171,11 @@ _PATTERNS = (_band, _sector, _panel, _ellipse, _blobs, _lettering, _stripes)
 # --------------------------------------------------------------------------------------------------------------- shapes
 
 Paint = Callable[[int], Image]
-"""The texture of a part of an object."""
+"""Function from the number of a part of an object to its texture."""
 
 
 def _closed(profile: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return a profile with a flat bottom and top."""
+    """Return a profile closed by a flat bottom and top."""
     return [(0, profile[0][1]), *profile, (0, profile[-1][1])]
 
 

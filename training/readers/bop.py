@@ -1,8 +1,8 @@
 """Datasets in the scene-wise format of BOP, the Benchmark for 6D Object Pose Estimation: YCB-Video and others.
 
 `<scene>/{rgb,depth}/<image>.png`, `<scene>/mask_visib/<image>_<instance>.png`, `scene_camera.json`, `scene_gt.json`
-and, optionally `scene_gt_info.json`; see docs/bop_datasets_format.md of github.com/thodan/bop_toolkit. The format
-numbers its objects; a YAML or JSON file names them, obj_id -> name.
+and, optionally, `scene_gt_info.json`; see docs/bop_datasets_format.md of github.com/thodan/bop_toolkit. The format
+identifies objects by numbers; a YAML or JSON file maps each obj_id to a name.
 """
 
 import contextlib
@@ -22,16 +22,16 @@ from training.readers.labelled import LabelledFrames, dataset_folder, named_path
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
 SMALLEST_VISIBLE = 0.1
-"""Least visible fraction of an instance that is scored, as in BOP's own evaluation."""
+"""Smallest visible fraction of an instance that is scored, as in BOP's own evaluation."""
 
 
 class BOP(LabelledFrames):
-    """The frames of a split (`test`), or those of the one scene that the folder is.
+    """The frames of a split (`test`), or of a single scene.
 
-    Label k + 1 is instance k of `scene_gt.json`. Masks may overlap, since BOP makes them with a tolerance in depth and
-    counts pixels without depth as visible: a pixel of several masks belongs to the smallest of them. Instances with an
-    empty mask are not scored, nor are those whose visible fraction in `scene_gt_info.json` is below `SMALLEST_VISIBLE`;
-    they keep their pixels, since they occlude others.
+    Label k + 1 is instance k of `scene_gt.json`. Masks may overlap, since BOP computes them with a tolerance in depth
+    and counts pixels without depth as visible. A pixel of several masks is assigned to the smallest mask. Instances are
+    not scored if their mask is empty or if their visible fraction in `scene_gt_info.json` is below `SMALLEST_VISIBLE`.
+    They keep their pixels, since they occlude other instances.
     """
 
     def __init__(self, path: str | Path, names: str | Path | None = None) -> None:
@@ -60,7 +60,7 @@ class BOP(LabelledFrames):
         """Read a frame, the names of its scored instances and its scene.
 
         Raises:
-            InputError: also for an image or an object that a table lacks.
+            InputError: as indexing does, or a table has no entry for the image or an object.
         """
         image = self.sources[number]
         scene = _scene(image)
@@ -138,12 +138,12 @@ def read_object_names(path: Path) -> dict[int, str]:
     """Read a YAML or JSON table obj_id -> name.
 
     Raises:
-        InputError: the table is damaged or has other entries; names the file.
+        InputError: the table is damaged or has other entries; the message names the file.
         OSError: the file cannot be opened.
     """
     names: dict[int, str] = {}
     for obj_id, name in read_table(path).items():
-        # In JSON the keys are text.
+        # JSON keys are strings.
         if not str(obj_id).isdecimal() or not isinstance(name, str) or not name:
             raise InputError(f"{path}: {obj_id!r} is {name!r}; expected an obj_id and a name")
         names[int(obj_id)] = name

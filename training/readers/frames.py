@@ -1,7 +1,7 @@
 """Frames to recognize: folders with the files of one frame each, BOP scenes and recordings.
 
-Labelled frames have color.png, depth.png, mask.png, intrinsics.json and labels.json in a folder of each frame; the
-images and the intrinsics may have the other names of `FILE_NAMES`.
+The folder of a labelled frame contains color.png, depth.png, mask.png, intrinsics.json and labels.json. The images and
+the intrinsics may also have the other names in `FILE_NAMES`.
 """
 
 import dataclasses
@@ -49,12 +49,12 @@ FILE_NAMES = {
         "K.json",
     ),
 }
-"""Names of the files of a frame; the first one that exists is read."""
+"""Possible names for each file of a frame; the first existing file is read."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameFiles:
-    """The files of a frame: the arguments of `read_frame`, and labels.json, which may name the objects beside them.
+    """The files of a frame: the arguments of `read_frame`, and beside them possibly a labels.json with object names.
 
     Attributes:
         color: colour image.
@@ -69,16 +69,16 @@ class FrameFiles:
     intrinsics: Path
 
     def read(self, depth_scale: float | None = None) -> RGBDFrame:
-        """Read the frame; arguments and exceptions as `read_frame`."""
+        """Read the frame; the arguments and errors are those of `read_frame`."""
         return read_frame(**vars(self), depth_scale=depth_scale)
 
     @property
     def names(self) -> Path:
-        """The file with the names of the objects, which need not exist."""
+        """The file with the names of the objects; it may not exist."""
         return (self.labels or self.color).with_name("labels.json")
 
     def source(self, name: str, depth_scale: float | None = None) -> "FrameSource":
-        """Return the frame of these files."""
+        """Return these files as a frame to read."""
         return FrameSource(name, functools.partial(self.read, depth_scale), self)
 
 
@@ -87,9 +87,9 @@ class FrameSource:
     """A frame that can be read.
 
     Attributes:
-        name: its folder, or scene and image.
-        read: function that returns the frame; raises InputError and OSError. Worker processes get it pickled.
-        files: its files; None for a frame of a BOP scene or a recording, and for one that is segmented.
+        name: folder of the frame, or scene and image.
+        read: function that returns the frame; raises InputError and OSError. It is pickled for worker processes.
+        files: files of the frame; None for segmented frames and for frames of a BOP scene or a recording.
     """
 
     name: str
@@ -100,7 +100,7 @@ class FrameSource:
 def frame_files(folder: Path) -> FrameFiles:
     """Return the files of the frame in a folder.
 
-    A file that is missing has its first name; a label image that is missing is None.
+    A missing file gets the first of its possible names; a missing label image is None.
     """
 
     def existing(kind: str) -> Path | None:
@@ -113,15 +113,16 @@ def frame_files(folder: Path) -> FrameFiles:
 
 
 def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list[FrameSource]:
-    """Find the frames in folders, in the order of their names, which are unique.
+    """Find the frames in folders and return them sorted by name; the names are unique.
 
     Args:
-        paths: folders of one frame, folders that hold such folders at any depth or links to them, and BOP splits or
+        paths: frame folders, folders that contain frame folders (at any depth) or links to them, and BOP splits or
             scenes.
-        depth_scale: see `read_frame`; BOP scenes have their own.
+        depth_scale: see `read_frame`; BOP scenes have their own depth scale.
 
     Raises:
-        InputError: a path is no directory or holds no frame, a frame is given twice, or `depth_scale` is out of range.
+        InputError: a path is not a directory or contains no frame, a frame is given twice, or `depth_scale` is out of
+            range.
     """
     if depth_scale is not None:
         Intrinsics(1.0, 1.0, 0.0, 0.0, depth_scale)
@@ -138,7 +139,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
-            # "**" does not follow links to folders, "*" does. A frame without colour is found too, so that it fails.
+            # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
             names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
             images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
             of_path = [
@@ -154,7 +155,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     names = [source.name for source in sources]
     if len(set(names)) == len(names):
         return sources
-    # Frames in different folders may have the same name: they are then named from the folder that holds all of them.
+    # Frames in different folders may have the same name: their names are then relative to the common parent folder.
     common = Path(os.path.commonpath([path.parent for path in folders]))
     names = [path.relative_to(common).as_posix() for path in folders]
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -164,25 +165,25 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
 
 
 MAX_LISTED = 5
-"""Frames without labels that the note lists."""
+"""Largest number of frames without labels that the note lists."""
 
 
 class FrameFolder(LabelledFrames):
-    """The frames of a folder, or any others, whose objects are named by `labels.json` beside their labels.
+    """Frames, for instance of a folder, whose objects are named in a `labels.json` beside the label image.
 
     `labels.json` contains {"labels": {"1": "mug", ...}}; other entries are ignored.
 
     Attributes:
         named: whether the frames have a labels.json.
-        note: which frames are left out, since they have no labels.json; empty if none are.
+        note: the frames that are left out because they have no labels.json; empty if there are none.
     """
 
     def __init__(self, frames: str | Path | Sequence[FrameSource], *, named: bool = True) -> None:
         """Find the frames.
 
         Args:
-            frames: a folder as `find_frames` takes it, or frames.
-            named: False takes all frames if none of them has a labels.json; their objects have no names.
+            frames: a folder as for `find_frames`, or frames.
+            named: whether a labels.json is required. If False and no frame has one, all frames are used without names.
 
         Raises:
             InputError: the path is not a directory or contains no frame, or no frame has a labels.json.
@@ -205,7 +206,7 @@ class FrameFolder(LabelledFrames):
         self.note = f"{len(left_out)} frames without labels.json: {listed}" if left_out else ""
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
-        """Read a frame, its names if they are known, and no attributes."""
+        """Read a frame and the names in its labels.json, if it has one; there are no attributes."""
         source = self.sources[number]
         files = source.files
         if files is None or not self.named:
@@ -221,7 +222,7 @@ class FrameFolder(LabelledFrames):
         return frame, truth, {}
 
     def files(self, number: int) -> list[Path]:
-        """Return the files of a frame; none are known of a recording."""
+        """Return the files of a frame; empty for a recording."""
         files = self.sources[number].files
         return [*filter(None, vars(files).values()), files.names] if files else []
 
@@ -239,7 +240,7 @@ def read_names(path: Path) -> dict[int, str]:
 
 
 def segmented_source(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> FrameSource:
-    """Return a frame that is segmented when it is read; labels that it has are replaced."""
+    """Return a frame that is segmented when it is read; existing labels are replaced."""
     return FrameSource(source.name, functools.partial(_read_segmented, source, segmenter))
 
 
@@ -252,17 +253,17 @@ def _read_bop(dataset: BOP) -> RGBDFrame:
 
 
 def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[FrameSource], list[str]]:
-    """Return the frames of a recording, without labels, and what is likely wrong with it.
+    """Return the frames of a recording, without labels, and notes about likely faults of the recording.
 
-    Frames are decoded when they are read, best in their order.
+    Frames are decoded when they are read; this is fastest in their order.
 
     Args:
         open_bag: function that returns the recording.
-        every: 2 takes every second frame, and so on.
+        every: take every `every`-th frame.
 
     Raises:
-        InputError: the recording has no complete frame, or as `Bag`. One that is damaged later on has those before.
-        OSError: it cannot be opened.
+        InputError: the recording has no complete frame, or `Bag` raises it. Frames before a later damage are returned.
+        OSError: the recording cannot be opened.
     """
     recording = _Recording(open_bag, every)
     sources: list[FrameSource] = []
@@ -277,13 +278,13 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
 
 
 def _frames(bag: Bag, every: int) -> Iterator[RecordedFrame]:
-    """Open the recording and yield every `every`-th frame; the recording is closed with the iterator."""
+    """Open the recording and yield every `every`-th frame; closing the iterator closes the recording."""
     with bag:
         yield from itertools.islice(bag.frames(), 0, None, every)
 
 
 class _Recording:
-    """Reads frames by their number; a number below the last one starts from the beginning."""
+    """Reader of frames by number; it starts again from the beginning if a number is lower than the previous one."""
 
     def __init__(self, open_bag: Callable[[], Bag], every: int) -> None:
         self._open, self._every = open_bag, every

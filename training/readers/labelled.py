@@ -27,13 +27,13 @@ def sequence_of(identifier: str) -> str:
 
 
 def named_path(path: str | Path) -> Path:
-    """Return the absolute path of a folder, of "." and "x/.." too, so that its last part is a name."""
+    """Return the absolute path of a folder, so that its last part is a name, even for "." and "x/.."."""
     path = Path(path)
     return path.resolve() if ".." in path.parts else path.absolute()
 
 
 def dataset_folder(path: str | Path) -> Path:
-    """Return the path of a dataset; raises InputError if it is no directory."""
+    """Return the path of a dataset; raise InputError if it is not a directory."""
     path = Path(path)
     if not path.is_dir():
         raise InputError(f"dataset: {path} is not a directory; expected a dataset")
@@ -41,13 +41,13 @@ def dataset_folder(path: str | Path) -> Path:
 
 
 def path_ends(sequence: str) -> list[str]:
-    """Return the names that a sequence a/b/c may be given, longest first: a/b/c, b/c, c."""
+    """Return the names by which a table may refer to a sequence a/b/c, longest first: a/b/c, b/c, c."""
     parts = sequence.split("/")
     return ["/".join(parts[start:]) for start in range(len(parts))]
 
 
 def named_labels(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    """Return label -> name; raises InputError with the path unless they are integers and texts, and a label has one."""
+    """Return label -> name; raise InputError with the path unless labels are integers with one string each."""
     names: dict[int, str] = {}
     for label, name in entries:
         if type(label) is not int or not isinstance(name, str):
@@ -66,7 +66,7 @@ class LabelledFrame:
         identifier: name of the frame, unique in its dataset.
         frame: the images.
         truth: label number -> object name of the instances that are scored; an instance may have no pixels.
-        attributes: conditions that accuracy is reported by, for instance {"occlusion": "high", "light": "1"}.
+        attributes: conditions by which accuracy is reported, for instance {"occlusion": "high", "light": "1"}.
     """
 
     identifier: str
@@ -96,7 +96,8 @@ class LabelledFrames(abc.ABC):
 
         Raises:
             IndexError: `number` is out of range.
-            InputError: a file is missing or damaged, or files do not belong together; names the frame and the file.
+            InputError: a file is missing or damaged, or files do not belong together; the message names the frame and
+                the file.
             OSError: a file cannot be opened.
         """
         identifier = self.identifiers[number]
@@ -108,11 +109,11 @@ class LabelledFrames(abc.ABC):
         """Read the images, the names and the attributes of a frame, see `LabelledFrame`; raises as indexing does."""
 
     def files(self, number: int) -> Sequence[Path]:
-        """Return the files that a frame is read from; by default none are known."""
+        """Return the files from which a frame is read; empty by default."""
         return ()
 
     def only(self, number: int) -> Self:
-        """Return a dataset of one of the frames. Processes get it, since all paths of a large dataset take seconds."""
+        """Return a dataset with one of the frames, since sending all paths of a large dataset to a process is slow."""
         one = copy.copy(self)
         one.identifiers, one.sources = [self.identifiers[number]], [self.sources[number]]
         return one

@@ -1,18 +1,18 @@
-"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: each frame has one more object.
+"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), subset YCB10: each frame of a sequence adds one object.
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
-Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects. A
-YAML or JSON file does: sequence -> names in the order in which the objects were placed, which is that of their labels:
+Two cameras record each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects.
+A YAML or JSON file does: sequence -> names in the order of placement, which is also the order of the labels:
 
     seq36: [mug, bowl, banana]                      # of both cameras
     table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
 
-The tables of OCID-VLG (Tziafas et al., 2023) name objects too: a JSON list of {"image_filename": "sequence,image",
-"answer": label, "target": name, ...}. With such a table, the frames that it lists are read, and labels that it does not
-name are not scored.
+The tables of OCID-VLG (Tziafas et al., 2023) can be used, too: a JSON list of {"image_filename": "sequence,image",
+"answer": label, "target": name, ...}. Only the frames in such a table are read, and labels without a name in it are
+not scored.
 
-The dataset has no intrinsics. They are fitted to each frame's organized point cloud, whose points lie on the rays of
-their pixels.
+The dataset has no intrinsics. They are fitted to the organized point cloud of each frame, in which each point lies on
+the ray of its pixel.
 """
 
 import itertools
@@ -31,30 +31,30 @@ from training.readers.labelled import LabelledFrames, dataset_folder, path_ends,
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
 _FIRST_OBJECT = {"table": 3, "floor": 2}
-"""Label of the object placed first. 0 is a pixel without depth, 1 the surroundings; on a table 2 is the table."""
+"""Label of the first placed object. Label 0 marks pixels without depth, 1 the surroundings, and 2 the table, if any."""
 
 _CAMERAS = {"bottom": "lower", "top": "upper"}
 
 _LARGEST_RESIDUAL = 5.0
-"""Largest root mean square residual of the fit, pixels: sensor noise makes about 1, another kind of cloud hundreds."""
+"""Largest root mean square residual of the fit, pixels: about 1 from sensor noise, hundreds for other clouds."""
 
 
 class OCID(LabelledFrames):
     """The frames of the subset, by sequence and time.
 
-    The objects that have a pixel in a frame are its truth.
+    The ground truth of a frame contains the objects with at least one pixel.
     """
 
     def __init__(self, path: str | Path, names: str | Path) -> None:
         """Find the frames and the names of their objects.
 
         Args:
-            path: folder `YCB10`, or the one that holds it.
+            path: folder `YCB10` or its parent folder.
             names: YAML or JSON file, see the module.
 
         Raises:
-            InputError: There are no frames, or `names` is damaged, lacks sequences, which the message lists, or is a
-                table of OCID-VLG that lists none of the frames.
+            InputError: There are no frames, or `names` is damaged, lacks sequences (listed in the message), or is a
+                table of OCID-VLG without any of the frames.
             OSError: `names` cannot be opened.
         """
         path = dataset_folder(path)
@@ -86,7 +86,7 @@ class OCID(LabelledFrames):
         """Read a frame, its names, and the place, the camera and the type of its sequence.
 
         Raises:
-            InputError: also for a cloud without a pinhole camera, and a label without a name.
+            InputError: as indexing does, the cloud does not fit a pinhole camera, or a label has no name.
         """
         sequence = sequence_of(self.identifiers[number])
         image, depth_file, label_file, cloud_file = self.files(number)
@@ -119,7 +119,7 @@ class OCID(LabelledFrames):
 
 
 def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[str]) -> dict[str, dict[int, str]]:
-    """Return label -> name of each sequence, whose key is the longest end of its path in the table."""
+    """Return label -> name for each sequence; the entry of a sequence is the longest end of its path in the table."""
     named: dict[str, dict[int, str]] = {}
     lacking = []
     for sequence in sequences:
@@ -137,9 +137,9 @@ def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[st
 
 
 def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int, str]], dict[str, set[str]]]:
-    """Return, of a table of OCID-VLG, sequence -> label -> name, and sequence -> stems of its images.
+    """Return sequence -> label -> name and sequence -> stems of its images from a table of OCID-VLG.
 
-    Labels number the objects of a sequence in the order of their placement, so its images share the names.
+    All images of a sequence share the names, since labels number its objects in the order of placement.
     """
     names: dict[str, dict[int, str]] = {}
     images: dict[str, set[str]] = {}
@@ -168,11 +168,11 @@ def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int,
 def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
     """Fit a pinhole camera to an organized cloud [H, W, 3] in the OpenCV camera frame; points without depth are NaN.
 
-    Least squares of x / z over the columns, x / z = (column - cx) / fx, and of y / z over the rows. The pixel is exact
-    and the ratio is not: in the dataset's clouds z is a mean over time, x and y are not.
+    Least-squares fits of x / z = (column - cx) / fx over the columns and of y / z over the rows. Only the ratios have
+    errors, not the pixels: in the dataset's clouds z is a mean over time, x and y are not.
 
     Raises:
-        InputError: the points are too few or do not lie on the rays of a pinhole camera; the message has the fit.
+        InputError: there are too few points, or they do not lie on the rays of a pinhole camera.
     """
     row, column = np.nonzero(np.isfinite(points).all(axis=-1) & (points[..., 2] > 0))
     if len(row) == 0 or np.ptp(row) == 0 or np.ptp(column) == 0:
@@ -189,7 +189,7 @@ def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
 
 
 def _line(pixel: NDArray[np.intp], ratio: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Focal length, principal point and root mean square residual, in pixels."""
+    """Return focal length, principal point and root mean square residual, in pixels."""
     centred = pixel - pixel.mean()
     slope = np.mean(centred * ratio) / np.var(pixel)
     residual = ratio - ratio.mean() - slope * centred
@@ -201,12 +201,12 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_organized_points(path: str | Path) -> NDArray[np.float64]:
-    """Read the points [HEIGHT, WIDTH, 3] of a PCD file in the file's unit (usually metres), NaN where it has none.
+    """Read the points [HEIGHT, WIDTH, 3] of a PCD file in the file's unit (usually metres); missing points are NaN.
 
     Fields other than x, y and z are ignored.
 
     Raises:
-        InputError: the file is damaged, compressed or without x, y and z; the message names it.
+        InputError: the file is damaged or compressed, or has no x, y and z; the message names the file.
         OSError: the file cannot be opened.
     """
     path = Path(path)

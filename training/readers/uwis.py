@@ -28,11 +28,11 @@ _VIDEOS = {
     ("food", "2"): ((77, 78, 212, 213), (80, 81, 215, 216), (83, 84, 218, 219)),
     ("tools", "2"): ((59, 60, 194, 195), (62, 63, 197, 198), (65, 66, 200, 201)),
 }
-"""The dataset's table: category of the objects and light -> videos without occlusion, with low and with high one."""
+"""The dataset's table: object category and light -> videos with no occlusion, low occlusion and high occlusion."""
 
 
 def video_attributes(number: int) -> dict[str, str]:
-    """Return the environment of a video and, if the dataset's table lists it, object category, occlusion and light."""
+    """Return the environment of a video and, if it is in the dataset's table, object category, occlusion and light."""
     attributes = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
     for (category, light), columns in _VIDEOS.items():
         for occlusion, numbers in zip(("none", "low", "high"), columns, strict=True):

@@ -4,8 +4,8 @@
     caster = RayCaster([mesh])                                    # once per mesh
     view = render_view(caster, poses[0])                          # view.color, view.depth, view.intrinsics
 
-The object's frame is that of the scan, with z up. The polar angle is 0 from above, pi/2 from the side, pi from below
-(paper, section "Training"). Colours are unlit: the textures of scans contain the light of the studio.
+The object's frame is the frame of the scan, with z up. The polar angle is 0 from above, pi/2 from the side, pi from
+below (paper, section "Training"). No light is added, since the textures of scans already contain the studio's light.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ class RenderedView:
         depth: [h, w] uint16, depth along the camera's z axis, millimetres, rounded; 0 where nothing is visible.
         intrinsics: intrinsics of the cropped image.
         pose: [4, 4] float64, camera to object frame.
-        corner: row and column of the cropped image's first pixel in the camera's image.
+        corner: row and column, in the camera's image, of the first pixel of the cropped image.
     """
 
     color: NDArray[np.uint8]
@@ -82,7 +82,7 @@ class RenderedView:
 
     @property
     def frame(self) -> RGBDFrame:
-        """The view as a frame in which the visible pixels are the instance 1."""
+        """The view as a frame in which the visible pixels have the label 1."""
         return RGBDFrame(self.color, self.depth, (self.depth > 0).astype(np.uint8), self.intrinsics)
 
     @property
@@ -102,14 +102,14 @@ DISTANCE = 1.5
 """Distance between the camera and the centre of the object's bounding box, metres."""
 
 FROM_ABOVE = 0.7
-"""Share of random views from above or from slightly below the middle of the object."""
+"""Fraction of random views that look from above or from slightly below the middle of the object."""
 
 MAX_VIEWS = 10**6
-"""Largest number of views of an object: 375 times the paper's."""
+"""Largest number of views of an object: 375 times as many as in the paper."""
 
 
 def _steps(name: str, step: float, turn: float) -> int:
-    count = turn / step if math.isfinite(step) and step > 1e-100 else 0.0  # of smaller ones, the quotient may overflow
+    count = turn / step if math.isfinite(step) and step > 1e-100 else 0.0  # the quotient of smaller steps may overflow
     if round(count) < 1 or abs(count - round(count)) > 1e-6:
         raise InputError(f"{name} is {step!r}; expected degrees that divide {turn:g} evenly")
     return round(count)
@@ -140,7 +140,7 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
 
 
 def random_angles(rng: np.random.Generator) -> tuple[float, float]:
-    """Return the azimuth and polar angle of a random view, in radians; most look down on the object, as on a table."""
+    """Return the azimuth and polar angle of a random view, in radians; most views look down, as at a table."""
     low, high = (-0.15, 0.97) if rng.random() < FROM_ABOVE else (-1.0, 1.0)
     return rng.uniform(0, 2 * np.pi), float(np.arccos(rng.uniform(low, high)))
 
@@ -150,8 +150,8 @@ def camera_pose(
 ) -> NDArray[np.float64]:
     """Return the pose of a camera on the view sphere that looks at `centre`.
 
-    The image's down direction is that of increasing polar angle: z is up in the image. At the poles it follows the
-    meridian of `azimuth`, so that the image rotates with the azimuth.
+    The image's down direction is the direction of increasing polar angle, so z is up in the image. At the poles, it
+    follows the meridian of `azimuth`, so that the image rotates with the azimuth.
 
     Args:
         azimuth: radians, from the x axis towards the y axis.
@@ -178,7 +178,7 @@ class Hits:
 
     Attributes:
         distance: [n] float32, in units of the direction's length; inf without a hit.
-        mesh: [n] int32, index of the mesh that is hit; -1 without a hit.
+        mesh: [n] int32, index of the hit mesh; -1 without a hit.
         color: [n, 3] uint8; 0 without a hit.
     """
 
@@ -194,7 +194,7 @@ class RayCaster:
     """
 
     def __init__(self, meshes: Sequence[TexturedMesh]) -> None:
-        """Build the index of at least one mesh, which takes about 20 ms for a mesh of 16,000 faces."""
+        """Build the ray-casting index of at least one mesh; this takes about 20 ms for a mesh of 16,000 faces."""
         # Imported here, since there is no embree for ARM on Linux, where nothing is rendered.
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -233,7 +233,7 @@ class RayCaster:
 def pixel_rays(intrinsics: Intrinsics, height: int, width: int, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rays through the pixels [height * width, 3] float64, object frame, of a camera with this pose [4, 4].
 
-    Along the optical axis their length is 1, so that hit distances are depths.
+    Their component along the optical axis is 1, so that hit distances are depths.
     """
     x, y, z = pose[:3, :3].T
     columns = ((np.arange(width) - intrinsics.cx) / intrinsics.fx)[:, None] * x
@@ -264,7 +264,7 @@ def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = T
         camera: size and intrinsics of the whole image.
 
     Returns:
-        The part of the image that the object can cover: for a mug a twentieth of the image, and as much faster.
+        The part of the image that the object can cover, which saves time: for a mug, it is a twentieth of the image.
     """
     top, bottom, left, right = _pixel_box(caster.vertices, pose, camera)
     k = camera.intrinsics

@@ -26,7 +26,7 @@ SAMPLES = (
 
 LIGHT_CHANGE = 0.2
 NOISE = 0.5
-"""Noise dominates the size of a depth image; with this factor four samples take less than 400 kB."""
+"""Factor of the depth noise. Noise dominates the file size; with this factor, four samples have less than 400 kB."""
 
 CROP_MARGIN = 24
 """Margin around the objects, pixels."""

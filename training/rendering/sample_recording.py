@@ -23,7 +23,7 @@ __all__ = ["write_sample_recording"]
 CAMERA = Camera.from_field_of_view(320, 240, 57)
 SEED, N_OBJECTS, NOISE = 8, 4, 0.03
 FRAMES, HERTZ, ARC = 16, 8, 0.1
-"""The camera moves by `ARC` radians around the table."""
+"""Number of frames, frame rate, and angle in radians by which the camera moves around the table."""
 
 START = 1_700_000_000 * 10**9
 FRAME_ID = "camera_color_optical_frame"
@@ -38,7 +38,7 @@ def write_sample_recording(path: str | Path) -> None:
         path: MCAP file (.mcap) or directory of a ROS 2 bag that does not exist; 0.45 MB.
 
     Raises:
-        InputError: as `MessageBag`.
+        InputError: as raised by `MessageBag`.
         OSError: the recording cannot be written.
     """
     topics = {COLOR: COMPRESSED_IMAGE, DEPTH: COMPRESSED_IMAGE, INFO: "sensor_msgs/msg/CameraInfo"}

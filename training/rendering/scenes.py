@@ -3,7 +3,7 @@
     scene = compose_scene(builtin_objects(), np.random.default_rng(0))
     scene.frame, scene.truth[1], scene.visible[1], scene.occlusion(1)
 
-The table is the plane z = 0. Objects rest on it without touching and occlude one another in a camera that looks down.
+The table is the plane z = 0. Objects rest on it without touching, and occlude each other in a camera that looks down.
 """
 
 import dataclasses
@@ -38,13 +38,13 @@ MIN_GAP = 0.006
 """Smallest distance between the footprints of two objects, metres."""
 
 TABLE_RADIUS = 0.18
-"""Objects lie within this distance of the table's centre, metres, if there is space."""
+"""Largest distance of objects from the table's centre, metres, if there is enough space."""
 
 MAX_SENSOR_DEPTH = 4.0
 """Largest depth that the simulated sensor measures, metres."""
 
 EDGE_STEP = 0.02
-"""Depth step between neighbouring pixels from which depth may be missing, metres."""
+"""Smallest depth step between neighbouring pixels at which depth may be missing, metres."""
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class Scene:
     Attributes:
         frame: colour, depth in millimetres, labels from 1 in no particular order; table and background are 0.
         truth: label -> object name.
-        visible: label -> visible share of the pixels that the object covers without the others, in (0, 1].
+        visible: label -> visible fraction of the pixels that the object would cover without the others, in (0, 1].
     """
 
     frame: RGBDFrame
@@ -71,7 +71,7 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class _Placed:
-    """A mesh on the table and the corners [k, 2] and outward normals [k, 2] of its convex footprint."""
+    """A mesh on the table, with the corners [k, 2] and outward normals [k, 2] of its convex footprint."""
 
     mesh: TexturedMesh
     corners: Array
@@ -98,14 +98,14 @@ SIDES: Array = np.array([
     [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
     [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
 ], np.float64)  # fmt: skip
-"""Rotations [4, 3, 3] that put each of the four sides down."""
+"""Rotations [4, 3, 3] that turn each of the four sides down."""
 
 
 def _rests(hull: Array) -> bool:
     """Return whether a body with these hull vertices [n, 3] is stable: its centre is above the contact area.
 
-    Vertices within 3 mm of the table touch it, so that a can rests on its side; the centre must be inside by 5 mm and
-    by a tenth of the height, so that a screwdriver does not stand on its handle.
+    Vertices within 3 mm of the table count as touching it, so that a can rests on its side. The centre must be inside
+    the contact area by 5 mm and by a tenth of the height, so that a screwdriver does not stand on its handle.
     """
     feet = hull[hull[:, 2] < hull[:, 2].min() + 0.003, :2]
     low, high = hull.min(axis=0), hull.max(axis=0)
@@ -117,7 +117,7 @@ def _rests(hull: Array) -> bool:
 
 
 def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
-    """Put a mesh on the origin: upright two times in three, otherwise on a stable side, with a random yaw."""
+    """Put a mesh on the origin with a random yaw: upright in two of three cases, otherwise on a stable side."""
     used = mesh.vertices[np.unique(mesh.faces)]
     hull = used[ConvexHull(used, qhull_options="QJ").vertices]
     sides = [turn for turn in SIDES if _rests(hull @ turn.T)]
@@ -135,7 +135,7 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
 
 
 def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Array | None:
-    """Return a free position [2] in line with a placed object and the camera, the taller in front, or None."""
+    """Return a free position [2] in line with a placed object and the camera, with the taller one in front, or None."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])
@@ -152,7 +152,7 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
 
 
 def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
-    """Return a free position [2] on the table; the radius grows only if there is no space."""
+    """Return a free position [2] on the table; the radius is enlarged only if there is no space."""
     reach = TABLE_RADIUS
     while True:
         angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
@@ -188,7 +188,7 @@ def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDA
     """Return depth [H, W] with the errors of a sensor, millimetres.
 
     The standard deviation of the axial noise is `noise` times 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell
-    2012). Three in ten pixels at depth steps of more than `EDGE_STEP`, and all beyond `MAX_SENSOR_DEPTH`, are missing.
+    2012). Depth is missing in 3 of 10 pixels at steps above `EDGE_STEP`, and everywhere beyond `MAX_SENSOR_DEPTH`.
     """
     sigma, near_edge = axial_deviation(depth_m), depth_edges(depth_m, EDGE_STEP)
     noisy = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
@@ -215,9 +215,10 @@ def compose_scene(
         camera: camera of the frame.
         clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
             occludes the other.
-        noise: factor of the sensor noise, at least 0; 1 is a consumer depth camera and a standard deviation of 2 in
-            colour, 0 none.
-        light: colours are multiplied by a gain within 1 +- light, and each channel by another within 1 +- light / 4.
+        noise: factor of the sensor noise, at least 0; 0 gives no noise, 1 the noise of a consumer depth camera and a
+            standard deviation of 2 in colour.
+        light: variation of the light: a gain of all colours within 1 +- light, and one per channel within
+            1 +- light / 4.
 
     Returns:
         The scene. An instance with fewer than `MIN_PIXELS` visible pixels is not labelled (its pixels are 0), so that
@@ -244,7 +245,7 @@ def compose_views(
 ) -> list[tuple[Scene, NDArray[np.float64]]]:
     """Place random objects on a table and render them from cameras around it, at equal angles.
 
-    An object has the same label in all views. The first camera is that for which the objects are in line.
+    An object has the same label in all views. The objects are placed in line as seen from the first camera.
 
     Args:
         objects: name -> mesh; metres, z up.
@@ -252,14 +253,14 @@ def compose_views(
         n_objects: number of objects in the scene, each a different one.
         n_views: number of cameras.
         camera: camera of the frames.
-        arc: angle between the first camera and the one that would follow the last, radians; by default all around.
+        arc: angle over which the cameras are spaced, with none at its end, radians; by default a full circle.
         clutter: as in `compose_scene`.
-        noise: likewise.
-        light: likewise.
-        level: whether all cameras have the height and the distance of the first, as those of a moving camera.
+        noise: as in `compose_scene`.
+        light: as in `compose_scene`.
+        level: whether all cameras have the height and the distance of the first camera, like a moving camera.
 
     Returns:
-        Scene and pose [4, 4] of each camera, from camera to world coordinates, as `compose_scene`.
+        For each camera, the scene as from `compose_scene` and the pose [4, 4], camera to world coordinates.
 
     Raises:
         InputError: there are fewer than `n_objects` objects.
@@ -275,7 +276,7 @@ def compose_views(
 def _composed(
     objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
 ) -> tuple[list[str], list[TexturedMesh], float, Array]:
-    """Return names and meshes of random objects on the table, and azimuth and pose of the camera they are in line with.
+    """Return names and meshes of random objects on the table, and the azimuth and pose of a camera in line with them.
 
     Raises:
         InputError: there are fewer than `count` objects.
@@ -304,7 +305,7 @@ def _render(
     light: float,
     rng: np.random.Generator,
 ) -> Scene:
-    """Render arranged objects; the last arguments are those of `compose_scene`."""
+    """Render arranged objects; the last arguments are as in `compose_scene`."""
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
     hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
     shape = (camera.height, camera.width)

@@ -30,25 +30,26 @@ _SOURCES = {
 }
 
 _DECIDED = (
-    "Every point of the object has an attribution: about how much the answer would lose without it. {check} Points "
-    "that are left out together can matter more, or less, than the sum of their attributions; the exact check shows "
-    "how well that holds for the strips of this object."
+    "The attribution of a point is approximately how much the answer would lose without it. {check} Points that are "
+    "left out together can matter more, or less, than the sum of their attributions; the exact check shows how large "
+    "this difference is for the strips of this object."
 )
 
 _SHAPE = (
-    "THOR2 turns each object into the same pose, cuts it into slices, and each slice into strips. It then knows how "
-    "wide every strip is (the persistence diagrams and images) and which colours it has (the colour matrices)."
+    "THOR2 rotates each object into a normalized pose and cuts it into slices and each slice into strips. It measures "
+    "the width of every strip (the persistence diagrams and images) and its colours (the colour matrices)."
 )
 
 _SLICES = (
-    "A persistence image shows the strips of a slice as spots: to the right the position of the strip (birth), upwards "
-    "how wide the object is there (persistence). A colour matrix shows the same strips from left to right, and in each "
-    "row the points of one colour region, in its mean colour; full colour means many points."
+    "A persistence image shows each strip of a slice as a spot: the horizontal axis is the position of the strip "
+    "(birth), the vertical axis is the width of the object there (persistence). A colour matrix shows the same strips "
+    "from left to right. Each row shows the points of one colour region in its mean colour; full colour means many "
+    "points."
 )
 
 
 def check_no_foreign_files(directory: Path) -> None:
-    """Raise InputError if `write_explanation` would replace files that are not those of an older explanation."""
+    """Raise InputError if `write_explanation` would replace files that are not from an older explanation."""
     names = sorted(path.name for path in directory.glob("*") if re.fullmatch(_WRITTEN, path.name))
     if names and not has_json(directory / VALUES, ("label", "explained_name", "faithfulness")):
         raise InputError(
@@ -57,16 +58,16 @@ def check_no_foreign_files(directory: Path) -> None:
 
 
 def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, directory: Path) -> None:
-    """Write an explanation to a directory, which appears only when it is complete; it replaces an older explanation.
+    """Write an explanation to a directory, all files or none; an older explanation is replaced.
 
     Args:
         explanation: the explanation.
-        frame: the frame that it was made from.
+        frame: the explained frame.
         name: name of the frame.
-        directory: directory; other files in it stay.
+        directory: output directory; other files in it are kept.
 
     Raises:
-        OSError: a file cannot be written; nothing is left behind.
+        OSError: a file cannot be written; no files are left behind.
     """
     with atomic_directory(directory) as unfinished:
         sections: dict[str, list[Picture]] = {}
@@ -86,7 +87,7 @@ def _lead(explanation: Explanation, name: str) -> str:
     sure = "" if answer.confidence is None else f" with a confidence of {100 * answer.confidence:.0f} %"
     what = f"is recognized as {answer.name}{sure}"
     if answer.name is None:
-        what = f"has no name ({answer.reason}); the most probable one is {explanation.name}"
+        what = f"gets no name ({answer.reason}); the most probable name is {explanation.name}"
     occluded = " It is partly occluded." if answer.occluded else ""
     return f"Object {answer.label} in frame {name} {what}.{occluded}"
 
@@ -105,8 +106,8 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         )
     runner_up = "" if explanation.runner_up is None else f" The next best name is {explanation.runner_up}."
     comparison = (
-        f"Without the most attributed tenth of the points the answer loses {check.most_attributed:.2f} of its "
-        f"{'log-odds' if is_odds else 'lead'}; without a random tenth, {check.random:.2f} on average."
+        f"Without the tenth of the points with the highest attributions, the answer loses {check.most_attributed:.2f} "
+        f"of its {'log-odds' if is_odds else 'lead'}; without a random tenth, {check.random:.2f} on average."
     )
     resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
     return [
@@ -124,18 +125,18 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
 def _advice(explanation: Explanation) -> str:
     answer, other = explanation.recognition, explanation.runner_up
     sentences = [
-        "Add this view to the object that it is; no training is needed: thor2 enroll NAME FRAME --instance "
+        "Add this view to the true object; no training is needed: thor2 enroll NAME FRAME --instance "
         f"{answer.label} --model RUN --extend."
     ]
     if other is not None:
         sentences.append(
-            f"If {explanation.name} and {other} look alike from this side, add views of both from this side: they show "
-            "the difference."
+            f"If {explanation.name} and {other} look alike from this side, add views of both from this side, which "
+            "show the difference."
         )
     if any(change.kind == "color" for change in explanation.changes):
         sentences.append(
-            "A shift of the colours gives another name: if the whole frame is warmer or cooler than the views of "
-            "training, adapt the model to the camera: thor2 adapt FRAME... --model RUN --out RUN2."
+            "A shift of the colours changes the answer: if the whole frame is warmer or cooler than the training "
+            "views, adapt the model to the camera: thor2 adapt FRAME... --model RUN --out RUN2."
         )
     if answer.occluded:
         sentences.append("It is partly occluded: look from another side, and fuse the frames (--track).")
@@ -165,7 +166,7 @@ def _answer_table(answer: Recognition) -> Table:
 
 
 def _percent(value: float) -> str:
-    """Return a probability; neither 0 % nor 100 % is ever certain."""
+    """Return a probability as text, never as 0 % or 100 %."""
     if value > 0.999:
         return ">99.9 %"
     return f"{100 * value:.1f} %" if value >= 0.001 else "<0.1 %"

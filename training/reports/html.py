@@ -22,8 +22,7 @@ class Picture:
     Attributes:
         path: path relative to the page.
         caption: caption and alternative text.
-        width: part of the width of a wide screen: all of it, a half, a third, or small, so that many pictures fit side
-            by side.
+        width: width on a wide screen: full, a half, a third, or small, so that many pictures fit side by side.
     """
 
     path: str
@@ -33,7 +32,7 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A section of the page: a heading, and optionally a paragraph, a table, pictures and a part that unfolds."""
+    """A section of the page: a heading, and optionally a paragraph, a table, pictures and a folded section."""
 
     heading: str
     text: str = ""
@@ -102,10 +101,10 @@ def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Se
         title: title and heading.
         lead: paragraph below the heading.
         sections: sections of the page.
-        embed: contain the pictures, which must be PNG files, so that the page can be moved without them.
+        embed: embed the pictures, which must be PNG files, so that the page does not need their files.
 
     Raises:
-        OSError: the file cannot be written, or an embedded picture not be read.
+        OSError: the file cannot be written, or a picture to embed cannot be read.
     """
     embedded_from = Path(path).parent if embed else None
     content = (f"<h2>{html.escape(each.heading)}</h2>\n{_content(each, embedded_from)}" for each in sections)

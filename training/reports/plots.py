@@ -31,7 +31,7 @@ __all__ = [
 
 
 def draw_objects(objects: Mapping[str, TexturedMesh], path: str | Path) -> None:
-    """Draw every object as a training camera sees it, all at one scale, with its name below.
+    """Draw every object as seen by a training camera, all at the same scale, with its name below.
 
     Raises:
         OSError: the file cannot be written.
@@ -132,8 +132,8 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     """Draw a confusion matrix with counts; the shade is the fraction of the row.
 
     Args:
-        counts: [C, C + 1]; rows are true classes, columns predicted classes, the last column instances without an
-            answer.
+        counts: [C, C + 1]; rows are true classes, columns are predicted classes, and the last column counts instances
+            without an answer.
         classes: class names.
         name: name of the recognizer.
         path: path of the picture.
@@ -170,11 +170,11 @@ def draw_reliability(bins: Mapping[str, Sequence[Any]], name: str, path: str | P
 def draw_known_unknown(
     curve: Mapping[str, Sequence[float]], marked: tuple[float, float], name: str, path: str | Path
 ) -> None:
-    """Draw the share of unknown objects that are named against the share of correct answers that are kept.
+    """Draw the fraction of unknown objects that are named against the fraction of correct answers that are kept.
 
     Args:
         curve: "kept" and "named".
-        marked: a point of the curve, which is emphasized.
+        marked: point of the curve to emphasize.
         name: name of the recognizer.
         path: path of the picture.
 
@@ -184,7 +184,7 @@ def draw_known_unknown(
     figure = Figure(figsize=(5.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
     axes.step(curve["kept"], curve["named"], where="pre", color=PALETTE[5])
-    axes.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="confidence tells nothing")
+    axes.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="uninformative confidence")
     kept, named = marked
     axes.plot([kept], [named], "o", color=PALETTE[6], label=f"{named:.0%} named where {kept:.0%} are kept")
     axes.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel=f"correct answers of {name} kept", ylabel="unknown objects named")

@@ -1,7 +1,7 @@
-"""Long jobs: records and locks of their output directories, arrays by which they resume, progress, and the cache.
+"""Long jobs: records and locks of their output directories, stored arrays for resuming, progress, and the cache.
 
-The user's cache directory may be deleted at any time. The environment variable THOR2_CACHE names another one, or is
-`off`.
+The user's cache directory may be deleted at any time. The environment variable THOR2_CACHE sets another directory, or
+`off` disables the cache.
 """
 
 import itertools
@@ -54,9 +54,9 @@ VARIABLE = "THOR2_CACHE"
 
 
 def cache_directory(kind: str) -> Path | None:
-    """Return the directory for files of a kind, which may be missing; None if there is no cache.
+    """Return the directory for files of a kind, which may not exist yet; None if the cache is disabled.
 
-    THOR2_CACHE holds the files of all kinds, which have different names.
+    With THOR2_CACHE, all kinds share one directory, since their file names differ.
 
     Raises:
         InputError: THOR2_CACHE names a file.
@@ -71,7 +71,7 @@ def cache_directory(kind: str) -> Path | None:
 
 
 def processor() -> str:
-    """Return a name for the kind of processor: a program compiled for another one may crash or round otherwise."""
+    """Return a name for the kind of processor; programs compiled for another kind may crash or round differently."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         features = next(line for line in lines if line.lower().startswith(("flags", "features")))
@@ -85,7 +85,7 @@ Progress = Callable[[str, int, int, str], object]
 
 
 def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:
-    """Return the callback of a stage whose note is always the same, called with (done, total)."""
+    """Return the callback of a stage with a fixed note, called with (done, total)."""
 
     def show(done: int, total: int) -> None:
         progress(stage, done, total, note)
@@ -94,20 +94,20 @@ def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, i
 
 
 def add_prefix(progress: Progress, name: str) -> Progress:
-    """Return a callback that puts a name before each stage."""
+    """Return a callback that prefixes the name of each stage."""
     return lambda stage, done, total, note: progress(f"{name}: {stage}", done, total, note)
 
 
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
-    """Return a callback that adds to each stage which one of how many it is, and the time left of all to its note.
+    """Return a callback that adds "stage k of n" to the name of each stage, and the remaining total time to its note.
 
-    The present stage keeps its own pace, and later stages take their shares at the pace of all progress seen so far.
-    What a resumed stage has done before does not count.
+    The estimate uses the pace of the current stage for this stage, and the pace of all progress so far for later ones.
+    Work that was done before a stage was resumed is not counted.
 
     Args:
-        progress: the callback that is called with both.
+        progress: the callback to call with the extended name and note.
         stages: name -> share of the time of all stages, in any unit, in the order of the stages; 0 if it is not known.
-            Stages that are not among them stay as they are.
+            Other stages are passed on unchanged.
     """
     names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
     earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))
@@ -135,19 +135,19 @@ def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
 JOB_FILE = "job.json"
 
 MAX_SHOWN = 100
-"""Characters of a value that an error message shows."""
+"""Largest number of characters of a value that an error message shows."""
 
 
 def begin_job(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
-    """Write the record of a job to a directory, or check that the directory is of this job.
+    """Write the record of a job to a directory, or check that the directory belongs to this job.
 
     Args:
         directory: output directory; it is created unless it exists.
-        job: the record, as JSON can hold it.
+        job: the record, in JSON types.
         name: path of the record in the directory.
 
     Raises:
-        InputError: the directory is of another job, or its record is damaged.
+        InputError: the directory belongs to another job, or its record is damaged.
         OSError: the record cannot be written.
     """
     check_begun(directory, job, name)
@@ -158,7 +158,7 @@ def begin_job(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> 
 
 
 def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
-    """Raise InputError if a directory has the record of another job, or a damaged one; arguments as `begin_job`."""
+    """Raise InputError if a directory has a damaged record or the record of another job; arguments as `begin_job`."""
     file = directory / name
     if file.is_file():
         try:
@@ -169,15 +169,15 @@ def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -
 
 
 def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
-    """Raise if an output directory was written by another job than the requested one.
+    """Check that an output directory was written by the requested job.
 
     Args:
         directory: output directory.
         stored: record of the job that wrote it, as read from JSON.
-        requested: record of the job to run, as JSON can hold it.
+        requested: record of the job to run, in JSON types.
 
     Raises:
-        InputError: naming the first field that differs, with both values.
+        InputError: the records differ; the message names the first different field and both values.
     """
     difference = _first_difference("", stored, json.loads(json.dumps(requested)))
     if difference:
@@ -189,7 +189,7 @@ def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mappin
 
 
 def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any, Any] | None:
-    """Return the path of the first field that differs and both values; a missing value is None."""
+    """Return the path of the first different field and both values; a missing value is None."""
     inner: list[tuple[str, Any, Any]] = []
     if isinstance(stored, Mapping) and isinstance(requested, Mapping):
         keys = dict.fromkeys([*requested, *stored])
@@ -213,11 +213,11 @@ LOCK = ".lock"
 def locked(directory: Path) -> AbstractContextManager[object]:
     """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
 
-    The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
+    The operating system releases the lock when the process ends, even if it is killed. The lock file is kept.
 
     Raises:
-        InputError: if another process holds the lock.
-        OSError: if the directory cannot be written, or its file system has no locks.
+        InputError: another process holds the lock.
+        OSError: the directory cannot be written, or its file system does not support locks.
     """
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
     try:
@@ -268,7 +268,7 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
 
 
 def load_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of a file, which may be damaged behind its header.
+    """Return the metadata of a file; only its header must be intact.
 
     Raises:
         ValueError: the file is missing, or its header is damaged.

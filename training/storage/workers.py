@@ -1,11 +1,11 @@
-"""Worker pools: ordered parallel maps over processes of this machine or tasks of a Ray cluster.
+"""Worker pools: ordered parallel maps over processes on this machine or tasks on a Ray cluster.
 
     with closing(local_workers(2)(function, items)) as results:  # or ray_workers(64, address="auto")
         for result in results:
             ...
 
-At most `workers` results wait to be read, so memory does not grow with the number of items. An item whose worker dies
-is given to another one.
+At most `workers` results wait to be read, so memory does not grow with the number of items. If a worker dies, its item
+is given to another worker.
 """
 
 import collections
@@ -35,17 +35,17 @@ Handle = TypeVar("Handle")
 
 
 ATTEMPTS = 3
-"""Number of workers that may die at the same item before that is an error."""
+"""Number of workers that may die at the same item before an error is raised."""
 
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of mallopt(3)."""
 
 
 class WorkerPool(Protocol):
-    """Map a function over items, several at a time, and yield the results in the order of the items."""
+    """Function that maps another function over items, several at a time, and yields the results in their order."""
 
     def __call__(self, function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
-        """Pickle `function` (of a module) and the items. Closing the generator ends the tasks that still run."""
+        """Apply `function`, which must be picklable like the items; closing the generator ends the running tasks."""
 
 
 def _map_ordered(
@@ -61,19 +61,19 @@ def _map_ordered(
 
 
 def keep_freed_memory() -> None:
-    """Have the C library reuse large blocks of memory in this process instead of returning them to the system.
+    """Make the C library reuse large blocks of memory in this process instead of returning them to the system.
 
-    A training otherwise gets the pages of its largest arrays anew in each step, which costs a tenth of its time.
+    Otherwise, a training requests the pages of its largest arrays again in each step, which takes a tenth of its time.
     """
     with contextlib.suppress(AttributeError):  # only glibc has these options
-        # Threads get arenas of their own, which return blocks above 64 MB all the same: there is to be one arena.
+        # There is one arena, since the arenas of other threads return blocks above 64 MB regardless of these options.
         for option, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1)):
             ctypes.CDLL(None).mallopt(option, value)
 
 
 def _initialize_worker() -> None:
-    """Exit when the parent ends: an idle worker would otherwise wait forever."""
-    # JAX would reserve most of an accelerator's memory for one worker; it reads this when it is imported.
+    """Make this worker exit when its parent ends; otherwise, an idle worker would wait forever."""
+    # Otherwise, JAX reserves most of an accelerator's memory for one worker. It reads the variable when it is imported.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -87,13 +87,13 @@ def _initialize_worker() -> None:
 
 
 class _Processes:
-    """Worker processes, each of which is replaced when it dies, and a thread for each that waits for it.
+    """Worker processes that are replaced when they die, with a waiting thread for each.
 
-    A single ProcessPoolExecutor with several processes would end all of them when one dies.
+    There is one ProcessPoolExecutor per process, since an executor with several ends all of them when one dies.
     """
 
     def __init__(self, count: int) -> None:
-        # JAX starts threads, and a forked child can deadlock on their locks.
+        # Processes are spawned, since JAX starts threads and a forked child can deadlock on their locks.
         self._context = multiprocessing.get_context("spawn")
         self._threads = ThreadPoolExecutor(count)
         self._idle: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
@@ -110,7 +110,7 @@ class _Processes:
         for _ in range(ATTEMPTS):
             process = self._idle.get()
             try:
-                with signals_blocked(signal.SIGINT):  # A process that starts here leaves Ctrl-C to this one.
+                with signals_blocked(signal.SIGINT):  # A process started here ignores Ctrl-C; this process handles it.
                     future = process.submit(function, item)
                 return future.result()
             except BrokenProcessPool as error:
@@ -124,18 +124,18 @@ class _Processes:
         ) from reason
 
     def close(self) -> None:
-        """Wait for the calls in progress, drop the others, and end the processes."""
+        """Wait for running calls, cancel the others, and end the processes."""
         self._threads.shutdown(cancel_futures=True)
         while not self._idle.empty():
             self._idle.get().shutdown()
 
 
 def local_workers(workers: int = 1) -> WorkerPool:
-    """Return a pool of processes on this machine; one worker runs in the calling process.
+    """Return a pool of processes on this machine; a single worker runs in the calling process.
 
     With several workers, the calling script needs an `if __name__ == "__main__"` guard. If a worker dies, only its item
-    is computed again. The map raises ChildProcessError if workers die repeatedly at an item, for example because memory
-    runs out.
+    is computed again. The map raises ChildProcessError if workers die repeatedly at the same item, for example because
+    memory runs out.
     """
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
@@ -156,12 +156,12 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
     """Return a pool of tasks on a Ray cluster, which repeats the tasks of a worker that dies.
 
     Args:
-        workers: number of tasks that run at a time.
-        address: address of the cluster, as for `ray.init`; None uses the cluster of this machine, or starts one for the
+        workers: number of concurrent tasks.
+        address: address of the cluster, as for `ray.init`; None uses the cluster on this machine, or starts one for the
             duration of the map.
 
     Raises:
-        InputError: if Ray is not installed.
+        InputError: Ray is not installed.
     """
     with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
@@ -169,16 +169,16 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
     def fetch(result: Any) -> Any:
         try:
             return ray.get(result)
-        except ray.exceptions.RayTaskError as error:  # Its message is a traceback of the worker.
+        except ray.exceptions.RayTaskError as error:  # The message of this error is a traceback of the worker.
             raise error.cause from None
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
         with warnings.catch_warnings():
-            # JAX warns about forks; Ray's forks execute another program at once, which is safe.
+            # JAX warns about forks, but Ray's forks are safe, since they execute another program at once.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
             cluster = ray.init(address, log_to_driver=False, logging_level="error")
         with cluster:
-            # Ray takes no other callables, such as partial functions.
+            # Ray accepts functions only, not other callables such as partial functions.
             task = function if inspect.isfunction(function) else lambda item: function(item)
             yield from _map_ordered(ray.remote(task).remote, fetch, items, workers)
 

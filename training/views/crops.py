@@ -1,4 +1,4 @@
-"""Square crops of colour and surface normals, the input of RGB-D image networks.
+"""Square crops of colour and surface normals, which are the input of RGB-D image networks.
 
     crop = rgbd_crop(frame, label)
     crop.color, crop.normals, crop.mask         # [224, 224, 3], [224, 224, 3], [224, 224]
@@ -52,12 +52,12 @@ CROP_SIZE = 224
 """Side of a crop, pixels."""
 
 _WINDOW = 5
-"""Side of the window of the median that fills depth, pixels."""
+"""Side of the median window for filling depth, pixels."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RGBDCrop:
-    """An instance, resized to fill a square; what is not the instance is 0.
+    """An instance, resized to fill a square; all other pixels are 0.
 
     Attributes:
         color: [S, S, 3] float32 sRGB in [0, 1].
@@ -73,12 +73,12 @@ class RGBDCrop:
 def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
     """Crop an instance: its bounding box, centred and padded to a square, then resized.
 
-    Missing depth is filled with `fill_depth`. Pixels that the resizing mixes have the mean of the instance's part only,
-    so that the outline has no dark rim.
+    Missing depth is filled with `fill_depth`. Resized pixels are means over pixels of the instance only, so that the
+    outline has no dark rim.
 
     Args:
         frame: frame with labels.
-        label: label number of an instance, of which some pixel has depth.
+        label: label number of an instance; at least one of its pixels must have depth.
         size: side of the crop, pixels, at least 1.
     """
     pixels = frame.instance_pixels[label]
@@ -104,11 +104,11 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
 def fill_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the depth of an instance without holes: a recursive median over windows of 5 x 5 pixels.
 
-    In each pass, holes with a known pixel in their window get the median of these pixels. Parts of the instance that no
-    pass reaches have the median of all its depths.
+    In each pass, a hole with known pixels in its window gets the median of these pixels. Parts of the instance that no
+    pass reaches get the median of all its depths.
 
     Args:
-        depth: [h, w] depth, 0 where there is none; some pixel of the mask has depth.
+        depth: [h, w] depth, 0 where it is missing; at least one pixel of the mask has depth.
         mask: [h, w] pixels of the instance; others are neither read nor filled.
 
     Returns:
@@ -132,8 +132,8 @@ def fill_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[n
 def surface_normals(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the unit normals of an organized cloud, towards the camera at the origin.
 
-    A normal is the cross product of the mean steps to the neighbours along the row and along the column, of those that
-    are in the mask. Without neighbours in one of the directions it points to the camera.
+    A normal is the cross product of the mean steps along the row and along the column to neighbours in the mask.
+    Without neighbours in one of the two directions, it points to the camera.
 
     Args:
         points: [h, w, 3] points in the OpenCV camera frame, metres.
@@ -169,7 +169,7 @@ def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _resized(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Return an image [h, w] or [h, w, C] resized to a square; smaller ones are area-filtered, as Pillow does."""
+    """Return an image [h, w] or [h, w, C] resized to a square; it is area-filtered like in Pillow if it shrinks."""
     planes = image[..., None] if image.ndim == 2 else image
     resized = [
         np.asarray(Image.fromarray(np.ascontiguousarray(plane)).resize((size, size), Image.Resampling.BILINEAR))
@@ -179,7 +179,7 @@ def _resized(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 
 
 QuantizedCrop = tuple[NDArray[np.uint8], NDArray[np.int8]]
-"""Colour and normals of a crop as `ViewCrops` holds them, [S, S, 3] each."""
+"""Colour and normals of a crop in the format of `ViewCrops`, [S, S, 3] each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,7 +203,7 @@ class ViewCrops:
         return int(self.color.shape[1])
 
     def reduced(self, size: int) -> "ViewCrops":
-        """Return the crops with sides of `size` pixels, area-filtered; the same record if they have this size."""
+        """Return the crops area-filtered to sides of `size` pixels; the same record if they already have this size."""
         if size == self.size:
             return self
 
@@ -216,12 +216,12 @@ class ViewCrops:
 
 
 def quantized(crop: RGBDCrop) -> QuantizedCrop:
-    """Return the colour and the normals of a crop as `ViewCrops` holds them."""
+    """Return the colour and the normals of a crop in the format of `ViewCrops`."""
     return np.rint(crop.color * 255).astype(np.uint8), np.rint(crop.normals * 127).astype(np.int8)
 
 
 def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
-    """Return quantized crops of `size` pixels as one record; there may be none."""
+    """Return quantized crops of `size` pixels, possibly none, as one record."""
     shape = (len(crops), size, size, 3)
     record = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
     for row, (color, normals) in enumerate(crops):
@@ -262,7 +262,7 @@ def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
     """Return size, dataset and files of the manifest in a directory of crops, see `_write_manifest`.
 
     Raises:
-        InputError: it is missing, damaged or of another format.
+        InputError: the manifest is missing, damaged or of another format.
     """
     path = directory / MANIFEST
     try:
@@ -282,12 +282,12 @@ def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
 
 
 def _crop_file(shard: str) -> str:
-    """Return the file name of the crops of a shard, given its file name."""
+    """Return the file name of a shard's crops, given the file name of the shard."""
     return Path(shard).with_suffix(".npz").name
 
 
 def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
-    """Return (number of the view, of the copy) -> crop of the views of a task in which something is visible."""
+    """Return (number of the view, number of the copy) -> crop for the views of a task that are not empty."""
     return {
         (number, copy): quantized(rgbd_crop(view.frame, 1, size))
         for number, copy, view in all_views(task)
@@ -299,7 +299,7 @@ def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]
     """Return the intact files of an interrupted rendering, file name -> checksum.
 
     Raises:
-        InputError: the crops have another size, or are of another dataset.
+        InputError: the crops have another size or belong to another dataset.
     """
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():

@@ -16,11 +16,11 @@ too few points are left out. Its directory has `manifest.json` and shards, safet
     view    [V] int32       index of the view among all views of the object
     copy    [V] int32       0 is the view as rendered, others are augmented copies
 
-The manifest has the job, everything that determines the views, and the finished shards with their checksums. It has no
-time stamps: the same job gives the same bytes.
+The manifest contains the job, that is, everything that determines the views, and the finished shards with their
+checksums. It contains no time stamps, so the same job always gives the same bytes.
 
-Worker processes render; this process normalizes and writes the shards one by one, in a fixed order. The bytes therefore
-do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
+Worker processes render the views. This process normalizes and writes the shards one by one, in a fixed order.
+Therefore, the bytes do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
 
 Image networks are trained on crops of the same views, which `render_crops` adds:
 
@@ -57,7 +57,7 @@ MANIFEST_FORMAT = 2
 
 
 def remove_views(directory: Path) -> None:
-    """Remove a dataset of views and their crops; files that `thor2 render` has not written stay."""
+    """Remove a dataset of views and their crops; files that `thor2 render` did not write are kept."""
     with contextlib.suppress(OSError, InputError):
         Manifest.parse(read_file(directory / MANIFEST), directory / MANIFEST)
         names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz))"
@@ -101,8 +101,8 @@ class Manifest:
     """The contents of a dataset.
 
     Attributes:
-        job: everything that determines the views, as JSON holds it. `objects` is a list of tables with `name` and
-            `mesh` (the mesh's checksum), `shards` the number of shards.
+        job: everything that determines the views, in JSON types. `objects` is a list of tables with `name` and `mesh`
+            (the mesh's checksum); `shards` is the number of shards.
         shards: finished shards, in the order of the job.
     """
 
@@ -116,7 +116,7 @@ class Manifest:
 
     @property
     def left_out(self) -> int:
-        """Number of clouds left out of all shards."""
+        """Number of clouds that were left out, over all shards."""
         return sum(shard.left_out for shard in self.shards)
 
     def write(self, directory: Path) -> None:
@@ -137,7 +137,7 @@ class Manifest:
 
     @classmethod
     def parse(cls, content: bytes, path: Path) -> "Manifest":
-        """Return the manifest in the bytes of a file.
+        """Parse the manifest from the bytes of a file.
 
         Raises:
             InputError: The manifest is damaged or has another format; the message names `path`.
@@ -156,12 +156,12 @@ class Manifest:
 
 @dataclasses.dataclass(frozen=True)
 class ViewDataset:
-    """A finished dataset; `len` is its number of clouds.
+    """A finished dataset; its length is the number of clouds.
 
     Attributes:
         directory: path of the dataset.
         manifest: contents of the dataset.
-        digest: SHA-256 of the manifest, which has the checksums of all shards.
+        digest: SHA-256 of the manifest, which contains the checksums of all shards.
     """
 
     directory: Path
@@ -170,7 +170,7 @@ class ViewDataset:
 
     @classmethod
     def open(cls, path: str | Path) -> "ViewDataset":
-        """Open a dataset that `render_dataset` wrote; shards are read and checked by `read`.
+        """Open a dataset written by `render_dataset`; shards are read and checked by `read`.
 
         Raises:
             InputError: The directory or its manifest is missing, the manifest is damaged or of another format or
@@ -214,7 +214,7 @@ class ViewDataset:
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """Description of the dataset for the record of a run, as JSON holds it."""
+        """Description of the dataset for the record of a run, in JSON types."""
         return {
             "digest": self.digest,
             "views": self.manifest.views,
@@ -242,7 +242,7 @@ class ViewDataset:
 
         Args:
             index: index of the shard.
-            size: side of the crops, pixels; larger stored ones are reduced.
+            size: side of the crops, pixels; larger stored crops are reduced.
 
         Raises:
             InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
@@ -270,7 +270,7 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
 
 
 def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
-    """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
+    """Normalize the clouds of a shard and write its file; `planned` is the number including left-out clouds.
 
     Raises:
         InputError: A cloud cannot be normalized or stored.
@@ -290,18 +290,18 @@ def render_dataset(
 ) -> ViewDataset:
     """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
 
-    A resumed rendering renders what is missing or damaged; the dataset ends up with the same bytes as without the
-    interruption. Memory holds one shard per worker, and one.
+    A resumed rendering renders missing and damaged shards. The final dataset has the same bytes as without the
+    interruption. At any time, memory holds one shard per worker and one more.
 
     Args:
         job: the job.
         out: directory: new, empty, or with a dataset of the same job; created with its parents.
-        pool: worker processes that render; does not affect the result.
+        pool: worker processes that render; they do not affect the result.
         progress: called with (clouds done, total clouds) at the start and after each shard.
 
     Raises:
-        InputError: Nothing is written if the job is invalid, see `RenderJob.record`, or `out` holds something else,
-            views of another job (names what differs) or is written by another process.
+        InputError: The job is invalid, see `RenderJob.record`; or `out` holds something else or views of another job
+            (the message names the difference), or another process writes to it. Nothing is written then.
         OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)

@@ -1,4 +1,4 @@
-"""Labelled real instances as views of their classes, beside rendered views or alone.
+"""Labelled real instances as views of their classes, together with rendered views or alone.
 
 instances = read_instances(FrameFolder(find_frames([Path("frames")])), config.sigma_s)
 source = WithLabelledViews(instances, config, ViewDataset.open("views"))
@@ -24,13 +24,13 @@ from training.views.normalized_views import NormalizedViews, SourceShard, ViewSo
 __all__ = ["MAX_COPIES", "LabelledInstances", "WithLabelledViews", "read_instances"]
 
 MAX_COPIES = 8
-"""Most augmented copies of an instance."""
+"""Largest number of augmented copies of an instance."""
 
 CLOUDS = 200
-"""Clouds of a class, as given and augmented, that copies are added up to if there are no rendered views."""
+"""Number of clouds of a class, including augmented copies, to reach if there are no rendered views."""
 
 FIRST_VIEW = 1_000_000
-"""Number of the first labelled view of a class; rendered views have smaller ones."""
+"""Number of the first labelled view of a class; rendered views have smaller numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +38,9 @@ class LabelledInstances:
     """The instances of labelled frames.
 
     Attributes:
-        views: object -> its usable instances, at least one each.
-        skipped: why each of the others cannot be used.
-        crops: object -> the crops of its usable instances, of one size; None if nothing reads them.
+        views: object -> its usable instances, at least one per object.
+        skipped: for each unusable instance, the reason.
+        crops: object -> the crops of its usable instances, all of one size; None if no crops are needed.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
@@ -68,13 +68,13 @@ def read_instances(
     Args:
         frames: the frames.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
-        label_name: only the object that labels.json gives this name, and the only one of frames without names.
+        label_name: read only the object with this name in labels.json, or the only instance of frames without names.
         instance: number of the object called `label_name`, in place of labels.json.
-        crop_size: side of the crops, pixels; None makes none.
+        crop_size: side of the crops, pixels; None makes no crops.
 
     Raises:
-        InputError: a folder or a frame cannot be read, or an object has no usable view. Instances whose name
-            `check_name` refuses are skipped.
+        InputError: a folder or a frame cannot be read, or an object has no usable view. Instances with a name that
+            `check_name` rejects are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
     crops: dict[str, list[QuantizedCrop]] = {}
@@ -110,10 +110,10 @@ def read_instances(
 
 
 class WithLabelledViews:
-    """A source of views joined with labelled real instances.
+    """A source of views, extended by labelled real instances.
 
-    An instance is one view, as it is and in augmented copies, as many as bring the instances of its class to about the
-    number of the rendered clouds of a class, and at most `MAX_COPIES`.
+    Each instance is one view with augmented copies. Their number is chosen so that the class gets about as many clouds
+    of instances as a class has rendered clouds, but it is at most `MAX_COPIES` per instance.
     """
 
     def __init__(
@@ -122,12 +122,12 @@ class WithLabelledViews:
         config: DescriptorConfig,
         rendered: ViewSource | None = None,
     ) -> None:
-        """Keep the instances; nothing is computed yet.
+        """Store the instances; nothing is computed yet.
 
         Args:
-            instances: the instances. Classes that `rendered` does not have are added after its classes.
+            instances: the instances. Their new classes are added after the classes of `rendered`.
             config: descriptor; only `sigma_s` is used.
-            rendered: other views; None if there are none.
+            rendered: source of rendered views, or None.
         """
         self._rendered, self._instances, self._config = rendered, instances, config
         self._views = views = dict(instances.views)
@@ -170,7 +170,7 @@ class WithLabelledViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.
 
         Raises:
-            InputError: as the source of the rendered views, or an instance is too long.
+            InputError: the source of the rendered views raises it, or an instance is too long.
         """
         if index < self._first:
             assert self._rendered is not None
@@ -186,10 +186,10 @@ class WithLabelledViews:
             return normalize_views(clouds, label, view, copy, self._config, boundary)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
-        """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
+        """Read the crops of a shard of the rendered views, or the crops of a class's instances, repeated for copies.
 
         Raises:
-            InputError: as the source of the rendered views.
+            InputError: the source of the rendered views raises it.
         """
         if index < self._first:
             assert self._rendered is not None

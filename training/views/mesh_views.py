@@ -2,8 +2,8 @@
 
     views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5)     # name -> clouds
 
-`render_dataset` writes the views of a `RenderJob` to disk, more than memory holds. Nothing here imports JAX, so that
-processes that render start quickly.
+`render_dataset` writes the views of a `RenderJob` to disk if they do not fit into memory. This module does not import
+JAX, so that rendering processes start quickly.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ __all__ = [
 SIGMA_S = DescriptorConfig().sigma_s
 
 MIN_VIEW_POINTS = 30
-"""Views with fewer points are left out: too little of the object is visible to describe it."""
+"""Smallest number of points of a view; with fewer, too little of the object is visible to describe it."""
 
 COORDINATE_STEP = 2.0**-14
 """Resolution of the coordinates, scaled units (0.024 mm)."""
@@ -71,13 +71,13 @@ CLOUDS_PER_SHARD = 256
 
 
 def cloud_of(view: RenderedView) -> "Cloud":
-    """Back-project a rendered view and downsample it to voxels of 0.01 scaled units, or coarser ones to fit a bucket.
+    """Back-project a rendered view and downsample it to voxels of 0.01 scaled units, or larger voxels to fit a bucket.
 
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8. n may be 0.
     """
-    # Metres in float32 and the rest in float64, as in the released pipeline: every fourth millimetre lies on a voxel
-    # border, and rounding decides on which side.
+    # Metres are float32 and the rest is float64, as in the released pipeline. Every fourth millimetre lies on a voxel
+    # border, so the result depends on rounding.
     pixels = np.flatnonzero(view.depth)
     depth = view.depth.take(pixels).astype(np.float32) / np.float32(1000)
     points = pixel_points(pixels, depth, view.depth.shape[1], view.intrinsics)
@@ -89,7 +89,7 @@ def cloud_of(view: RenderedView) -> "Cloud":
 def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64]) -> "Cloud":
     """Return the training cloud of one view: depth in steps of 1 mm, back-projected, voxels of 0.01 scaled units.
 
-    Each call indexes the mesh; use `render_views` for many views.
+    Each call builds the ray-casting index of the mesh; use `render_views` for many views.
 
     Args:
         mesh: metres, z up.
@@ -139,7 +139,7 @@ def _seed_of(name: str) -> int:
 
 
 def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
-    """Yield the number of each view of a task, the number of the copy and the image, ordered by view and copy."""
+    """Yield the number of the view, the number of the copy and the image of each view, ordered by view and copy."""
     caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
         yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
@@ -158,7 +158,8 @@ def _clouds(task: ViewTask) -> Iterator[tuple[int, int, "Cloud"]]:
 def render_task(task: ViewTask) -> list[tuple[int, int, "Cloud"]]:
     """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy.
 
-    Each has the index of its view among all views of the object, and the number of the copy: 0 is the view as rendered.
+    Each entry has the index of the view among all views of the object, the number of the copy (0 is the view as
+    rendered), and the cloud.
     """
     return list(_clouds(task))
 
@@ -171,7 +172,7 @@ def _read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
 def _checked_meshes(
     meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
 ) -> Iterator[tuple[str, TexturedMesh]]:
-    """Yield each object's name and mesh, one in memory at a time; finds unusable meshes before the long rendering.
+    """Yield each object's name and mesh, one at a time, so that unusable meshes are found before the long rendering.
 
     Raises:
         InputError: There are no meshes, or a mesh is unreadable or has no view of at least `MIN_VIEW_POINTS` points.
@@ -208,7 +209,7 @@ class RenderJob:
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Azimuth and polar angle [n, 2] of the views of an object; raises InputError for an invalid step."""
+        """Azimuth and polar angle [n, 2] of the views of an object; an invalid step raises InputError."""
         return view_angles(self.azimuth_step, self.polar_step)
 
     @property
@@ -218,7 +219,7 @@ class RenderJob:
 
     @functools.cached_property
     def shards(self) -> dict[str, tuple[str, range]]:
-        """File name -> object and numbers of the views of each shard."""
+        """File name of each shard -> its object and the numbers of its views."""
         size, n_views = max(1, CLOUDS_PER_SHARD // self.copies), len(self.angles)
         return {
             f"{label:04d}-{number:04d}.safetensors": (name, range(first, min(first + size, n_views)))
@@ -227,7 +228,7 @@ class RenderJob:
         }
 
     def record(self) -> dict[str, Any]:
-        """Check the job and return it as JSON holds it.
+        """Check the job and return it in JSON types.
 
         Raises:
             InputError: there are no meshes, a mesh is unreadable, too large or never visible, or a step or the seed is
@@ -240,7 +241,7 @@ class RenderJob:
             {"name": name, "mesh": _checked_size(name, mesh).digest}
             for name, mesh in _checked_meshes(self.meshes, self.angles)
         ]
-        # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
+        # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
         intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
         return {
             "descriptor_version": DESCRIPTOR_VERSION,
@@ -257,7 +258,7 @@ class RenderJob:
         }
 
     def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
-        """Yield the task of each of these shards; a mesh is read once for consecutive shards of its object."""
+        """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh."""
         angles = self.angles
         for name, group in itertools.groupby(map(self.shards.__getitem__, files), key=operator.itemgetter(0)):
             mesh = _read_mesh(self.meshes[name])
@@ -267,7 +268,7 @@ class RenderJob:
 
 
 def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
-    """Return a mesh unless its views may be too large to be stored."""
+    """Return a mesh; raise InputError if its views may be too large to be stored."""
     diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if SIGMA_S * diameter > MAX_VIEW_LENGTH:
         raise InputError(
@@ -300,7 +301,7 @@ def render_views(
 
 
 MESH_VIEWS = 60
-"""Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
+"""Number of cameras around a mesh. Each gives two views: one as rendered, and an augmented one from another camera."""
 
 
 def _evenly_spread(count: int) -> NDArray[np.float64]:
@@ -311,7 +312,7 @@ def _evenly_spread(count: int) -> NDArray[np.float64]:
 
 
 def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int = MESH_VIEWS) -> list[PreparedInstance]:
-    """Render a mesh from all sides: two views for each of `cameras`. `mesh_scale` converts a file's unit to metres.
+    """Render a mesh from all sides, two views per camera; `mesh_scale` converts the unit of a file to metres.
 
     Raises:
         InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.

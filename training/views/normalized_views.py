@@ -1,11 +1,11 @@
-"""Normalized views and where training reads them from (paper, section "View Normalization").
+"""Normalized views and their sources for training (paper, section "View Normalization").
 
-`MemoryViews` holds them in memory:
+`MemoryViews` keeps them in memory:
 
     source = MemoryViews(render_views(find_meshes("meshes")), config)
 
-`WithoutClasses` leaves classes out, to evaluate the recognition of unknown objects, or to train one run per sequence of
-a dataset, on the sequence's objects only, which is the papers' OCID protocol.
+`WithoutClasses` leaves classes out. It is used to evaluate the rejection of unknown objects, and to train one run per
+sequence of a dataset on the objects of this sequence only, which is the papers' OCID protocol.
 """
 
 import dataclasses
@@ -51,10 +51,10 @@ def padded_batches(
 
     Args:
         clouds: the clouds.
-        boundary: for each cloud [n] bool, the points on the occlusion boundary; None if there are none.
+        boundary: for each cloud, which points are on the occlusion boundary, [n] bool; None if no points are.
 
     Yields:
-        The number of given clouds in the batch, and the batch, padded by `batch_points`.
+        The number of clouds in the batch without the empty ones, and the batch, padded by `batch_points`.
 
     Raises:
         InputError: A cloud has more points than the largest bucket.
@@ -114,11 +114,11 @@ class ViewSource(Protocol):
 
     @property
     def digest(self) -> str:
-        """Digest of all views; differs if any view differs."""
+        """Digest of all views; it changes if any view changes."""
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """Description of the views for the record of a run, as JSON holds it."""
+        """Description of the views for the record of a run, in JSON types."""
 
     @property
     def shards(self) -> Sequence[Any]:
@@ -131,7 +131,7 @@ class ViewSource(Protocol):
         """Read the crops of the views of a shard, in their order, with sides of `size` pixels.
 
         Raises:
-            InputError: There are no crops, or smaller ones.
+            InputError: There are no crops, or they are smaller.
         """
 
 
@@ -157,7 +157,7 @@ def normalize_views(
         InputError: A cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
     xyz = [np.zeros((0, 3), np.float32)]
-    # Always on the CPU: an accelerator rounds differently, and rendering should not occupy its memory.
+    # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory.
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         for count, batch in padded_batches(clouds, boundary):
             normal = view_normalize(batch, config)
@@ -175,10 +175,10 @@ def normalize_views(
 
 
 class MemoryViews:
-    """Clouds in memory as a source of views, one shard per class; `read` normalizes them."""
+    """Source of views from clouds in memory, one shard per class; `read` normalizes them."""
 
     def __init__(self, views: Mapping[str, Sequence[Cloud]], config: DescriptorConfig) -> None:
-        """Keep the clouds; nothing is computed yet.
+        """Store the clouds; nothing is computed yet.
 
         Args:
             views: class name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8).
@@ -193,7 +193,7 @@ class MemoryViews:
     def digest(self) -> str:
         """SHA-256 of the class names and clouds."""
         arrays = (array for clouds in self._clouds for cloud in clouds for array in cloud)
-        shards = repr(self.shards).replace("SourceShard", "_Shard")  # their name in the digests of runs that exist
+        shards = repr(self.shards).replace("SourceShard", "_Shard")  # the old name, as in the digests of existing runs
         return content_digest(itertools.chain([f"({self.classes!r}, {shards})"], (a.tobytes() for a in arrays)))
 
     @property
@@ -239,27 +239,27 @@ class WithoutClasses:
         return {**self._source.record, "digest": self.digest, "views": views, "classes_left_out": self._names}
 
     def read(self, index: int) -> NormalizedViews:
-        """Read the views of a shard; raises what the source raises."""
+        """Read the views of a shard; raise errors as the source does."""
         return dataclasses.replace(self._source.read(self._kept[index]), label=self.shards[index].label)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
-        """Read the crops of a shard; raises what the source raises."""
+        """Read the crops of a shard; raise errors as the source does."""
         return self._source.read_crops(self._kept[index], size)
 
 
 def fold_of_views(
     label: NDArray[np.integer[Any]], view: NDArray[np.integer[Any]], classes: Sequence[str], folds: int, seed: int
 ) -> NDArray[np.intp]:
-    """Return the fold of each cloud [M], from 0: the views of every class are assigned at random and evenly.
+    """Return the fold of each cloud [M], from 0; the views of every class are distributed randomly and evenly.
 
-    All clouds of a view (mirrored and augmented copies) are in the same fold: they are nearly equal, and the held-out
-    set must not be known from training.
+    All clouds of a view (mirrored and augmented copies) are in the same fold. They are nearly equal, so otherwise the
+    held-out set would be known from training.
 
     Args:
         label: [M], index into `classes`.
         view: [M], index of the view among the views of its object.
         classes: class names.
-        folds: number of folds; with 1, everything is in fold 0.
+        folds: number of folds; with 1, all clouds are in fold 0.
         seed: seed for the assignment.
 
     Raises:

@@ -1,1 +1,1 @@
-"""Image networks that the THOR2 paper compares with, in Flax NNX, with the names of the public PyTorch files."""
+"""Image networks with which the paper compares THOR2, in Flax NNX, with the names of the public PyTorch files."""

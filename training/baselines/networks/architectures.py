@@ -1,10 +1,10 @@
-"""The image networks by name: their architecture, image size and pretrained weights.
+"""Table of the image networks: architecture, image size and pretrained weights.
 
 Weights of backbones are read from local safetensors files of PyTorch models:
 
     load_backbone(network.color, Path("weights/resnet18.safetensors"))
 
-The files are those of timm: a tensor `layer1.0.conv1.weight` is the kernel of `model.layer1[0].conv1`.
+The files have the tensor names of timm: `layer1.0.conv1.weight` is the kernel of `model.layer1[0].conv1`.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
-"""Last part of an NNX path -> of the tensor's name."""
+"""Last part of an NNX path -> last part of the tensor's name."""
 
 
 def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
@@ -51,7 +51,7 @@ def _tensor_name(path: tuple[Any, ...], prefix: str) -> str:
 
 
 def _torch_shape(shape: tuple[int, ...], kind: str) -> tuple[int, ...]:
-    """Return the shape of a PyTorch tensor: kernels have their last two axes in front, reversed."""
+    """Return the shape of a PyTorch tensor, in which the last two axes of kernels are in front, reversed."""
     return (shape[-1], shape[-2], *shape[:-2]) if kind == "kernel" else shape
 
 
@@ -74,13 +74,13 @@ def weights_file(directory: Path, name: str) -> Path:
 
 
 def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> dict[str, str]:
-    """Replace the weights of backbones by those of files in a directory, given without the suffix.
+    """Replace the weights of backbones by weights from files in a directory, given without the suffix.
 
     Returns:
         Name of each file -> its SHA-256.
 
     Raises:
-        InputError: a file does not exist, or as `load_backbone`.
+        InputError: a file does not exist, or `load_backbone` raises it.
     """
     digests = {}
     for model, name in backbones:
@@ -91,7 +91,7 @@ def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -
 
 
 def load_backbone(model: nnx.Module, path: Path) -> None:
-    """Replace the weights of a backbone by those of a file; other tensors of the file are ignored.
+    """Replace the weights of a backbone by weights from a file, ignoring other tensors in the file.
 
     The positions of a ViT are resampled to the grid of the model.
 
@@ -130,9 +130,9 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
 
 
 def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return the positions [1, 1 + G*G, D] of a ViT on another square grid, bicubic, as timm resamples them.
+    """Resample the positions [1, 1 + G*G, D] of a ViT to another square grid, with bicubic interpolation as in timm.
 
-    Positions of another length D, or of a grid that is not square, are returned as they are.
+    Positions of another length D, or of a grid that is not square, are returned unchanged.
     """
     sides = [round((n - 1) ** 0.5) for n in (positions.shape[1], shape[1])] if positions.ndim == 3 else [0, 0]
     square = positions.ndim == 3 and sides[0] ** 2 + 1 == positions.shape[1]

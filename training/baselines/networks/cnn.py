@@ -14,14 +14,14 @@ from training.baselines.networks.vit import ViT, ViTConfig
 __all__ = ["DENSENET_161", "DenseNet", "GRU", "RCFusion", "ResNet18", "ViTCNN"]
 
 MOMENTUM = 0.9
-"""Of the running statistics of all batch normalizations."""
+"""Momentum of the running statistics in all batch normalizations."""
 
 STAGES = (1, 2, 4, 8)
 """Channels of the stages, relative to the first one."""
 
 
 def batch_norm(channels: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
-    """Return a batch normalization that trains or evaluates as its model does."""
+    """Return a batch normalization layer that follows the training or evaluation mode of its model."""
     return nnx.BatchNorm(channels, momentum=MOMENTUM, epsilon=1e-5, use_running_average=None, rngs=rngs)
 
 
@@ -37,10 +37,10 @@ def stem_pool(x: jax.Array) -> jax.Array:
 
 
 class BasicBlock(nnx.Module):
-    """Two convolutions of 3 x 3 pixels and a shortcut."""
+    """Residual block: two convolutions of 3 x 3 pixels and a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, *, rngs: nnx.Rngs) -> None:
-        """Initialize the weights; with another shape of the output, the shortcut is a convolution."""
+        """Initialize the weights; the shortcut is a convolution if the output has another shape than the input."""
         self.conv1 = convolution(inputs, outputs, 3, stride, rngs)
         self.bn1 = batch_norm(outputs, rngs)
         self.conv2 = convolution(outputs, outputs, 3, 1, rngs)
@@ -101,7 +101,7 @@ class Projection(nnx.Module):
 
 
 class GRU(nnx.Module):
-    """A gated recurrent unit with the gates and biases of PyTorch's."""
+    """A gated recurrent unit with the same gates and biases as in PyTorch."""
 
     def __init__(self, inputs: int, memory: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights; `memory` is the length of the state."""
@@ -110,7 +110,7 @@ class GRU(nnx.Module):
         self.hidden = nnx.Linear(memory, 3 * memory, rngs=rngs)
 
     def __call__(self, sequence: jax.Array) -> jax.Array:
-        """Return the last state [B, memory] for a sequence [B, T, inputs] and the first state 0."""
+        """Return the last state [B, memory] for a sequence [B, T, inputs], starting from state 0."""
         state = jnp.zeros((len(sequence), self.memory), sequence.dtype)
         for step in range(sequence.shape[1]):
             reset_x, update_x, new_x = jnp.split(self.input(sequence[:, step]), 3, axis=-1)
@@ -122,7 +122,7 @@ class GRU(nnx.Module):
 
 
 class RCFusion(nnx.Module):
-    """Two ResNet-18 and a recurrent fusion of their stages."""
+    """RCFusion: two ResNet-18 networks and a recurrent fusion of their stages."""
 
     def __init__(self, n_classes: int, width: int, projection: int, memory: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights.
@@ -153,14 +153,14 @@ class RCFusion(nnx.Module):
 
 
 BOTTLENECK = 4
-"""Channels between the convolutions of a layer, relative to its output."""
+"""Number of channels between the convolutions of a layer, divided by the number of its output channels."""
 
 DENSENET_161 = {"growth": 48, "blocks": (6, 12, 36, 24)}
 """Arguments of `DenseNet`."""
 
 
 class DenseLayer(nnx.Module):
-    """A bottleneck layer, whose output is appended to its input."""
+    """A bottleneck layer that appends its output to its input."""
 
     def __init__(self, inputs: int, growth: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""
@@ -176,7 +176,7 @@ class DenseLayer(nnx.Module):
 
 
 class DenseBlock(nnx.Module):
-    """Layers denselayer1, denselayer2, ... in a row."""
+    """A sequence of layers denselayer1, denselayer2, ..."""
 
     def __init__(self, inputs: int, growth: int, layers: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""
@@ -185,14 +185,14 @@ class DenseBlock(nnx.Module):
             setattr(self, f"denselayer{number + 1}", DenseLayer(inputs + number * growth, growth, rngs=rngs))
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Return the input and the outputs of all layers, along the channels."""
+        """Return the input and the outputs of all layers, concatenated along the channels."""
         for number in range(self.n_layers):
             x = getattr(self, f"denselayer{number + 1}")(x)
         return x
 
 
 class Transition(nnx.Module):
-    """Halve the channels, the height and the width."""
+    """A transition layer, which halves the channels, the height and the width."""
 
     def __init__(self, inputs: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""

@@ -1,4 +1,4 @@
-"""Vision transformers (Dosovitskiy et al., ICLR 2021), with the module names of timm; DINOv2's have layer scales."""
+"""Vision transformers (Dosovitskiy et al., ICLR 2021) with the module names of timm; layer scales as in DINOv2."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ class ViTConfig:
         depth: number of blocks.
         heads: attention heads of a block.
         patch: side of a patch, pixels.
-        layer_scale: whether the blocks scale what they add to the tokens.
+        layer_scale: whether the blocks scale their updates of the tokens.
     """
 
     width: int
@@ -35,7 +35,7 @@ class ViTConfig:
 VIT_BASE = ViTConfig(768, 12, 12)
 VIT_TINY = ViTConfig(192, 12, 3)
 VIT_TINY_4 = dataclasses.replace(VIT_TINY, depth=4)
-"""The first four blocks of ViT-Ti: a third of the time, with the weights of the public file."""
+"""The first four blocks of ViT-Ti, which take a third of the time and use the weights of the public file."""
 VIT_DINOV2_SMALL = ViTConfig(384, 12, 6, patch=14, layer_scale=True)
 
 
@@ -70,7 +70,7 @@ class Attention(nnx.Module):
 
 
 class MLP(nnx.Module):
-    """A hidden layer with GELU."""
+    """A multilayer perceptron with one hidden layer and GELU."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""
@@ -86,7 +86,7 @@ class LayerScale(nnx.Module):
     """A factor for each channel."""
 
     def __init__(self, width: int) -> None:
-        """Initialize all factors by 1."""
+        """Initialize all factors to 1."""
         self.gamma = nnx.Param(jnp.ones(width))
 
     def __call__(self, x: jax.Array) -> jax.Array:
