@@ -1,4 +1,4 @@
-"""The command line in this process: what it is given and prints."""
+"""The command line in this process: its arguments and its output."""
 
 import json
 import sys

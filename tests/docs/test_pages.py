@@ -117,7 +117,7 @@ QUESTIONS = {
     "why unknown": "unknown-objects",
     "licence": "index",
 }
-"""What a user types -> page that is found first."""
+"""Search text of a user -> page that is found first."""
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Every Python block of the pages is executed, with the names that its page has explained before.
 
-Services, cameras and other packages are replaced by objects of the same interface: what a block calls must exist and
+Services, cameras and other packages are replaced by objects of the same interface: calls of a block must exist and
 take these arguments.
 """
 

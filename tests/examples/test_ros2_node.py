@@ -75,7 +75,7 @@ def test_a_service_that_does_not_segment(conversion: Any, monkeypatch: pytest.Mo
 
 
 class Node:
-    """Stands for rclpy's Node: what the node uses of it."""
+    """Replacement of rclpy's Node with the methods that the node uses."""
 
     def __init__(self, name: str) -> None:
         self.parameters, self.callbacks, self.published, self.warnings = {}, {}, [], []

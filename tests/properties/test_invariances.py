@@ -1,4 +1,4 @@
-"""What must not change descriptors and clouds of a frame.
+"""Changes of the input that must not change descriptors and clouds of a frame.
 
 Laws of descriptors hold over both backends, plainly, under jit and vmap, in two buckets.
 """

@@ -1,4 +1,4 @@
-"""Plots: what is drawn is what was given, on the axes that were given."""
+"""Plots: they show the given values on the given axes."""
 
 import numpy as np
 import pytest

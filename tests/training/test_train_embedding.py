@@ -1,4 +1,4 @@
-"""Trainings of an embedding alone: what a run has, interruptions, folds, and the user's cache."""
+"""Trainings of an embedding alone: files of a run, interruptions, folds, and the user's cache."""
 
 import dataclasses
 from collections.abc import Iterator

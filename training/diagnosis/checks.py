@@ -24,7 +24,7 @@ class Finding:
     Attributes:
         code: short name of the problem, for machines: "depth-unit", "intrinsics-size", ...; docs/frames.md lists them.
         message: the measurement and its meaning, for users.
-        advice: what the user can do.
+        advice: advice to the user.
     """
 
     code: str

@@ -1,4 +1,4 @@
-"""Explanations: what they compute against independent computations, and against toys whose answer is known."""
+"""Explanations, against independent computations and against toys whose answer is known."""
 
 import dataclasses
 from collections.abc import Callable

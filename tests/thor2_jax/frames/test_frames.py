@@ -83,7 +83,7 @@ BAD_FIELDS: dict[str, list[Any]] = {
     r"labels has type \w+; expected integers$": [np.ones((5, 7), kind) for kind in (np.float32, bool, object)],
     r"labels has the value -3": [np.where(np.eye(5, 7), -3, 0)],
 }
-"""What the error says, the name of the field first -> values of the field."""
+"""Error message, which begins with the name of the field -> values of the field."""
 
 
 @pytest.mark.parametrize("problem", BAD_FIELDS)

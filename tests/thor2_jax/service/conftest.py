@@ -45,7 +45,7 @@ CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) 
 """The classes of the run: the objects of the page's sample frames."""
 
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
-"""What an answer is compared with the OpenAPI document by."""
+"""Checks that compare an answer with the OpenAPI document."""
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -40,7 +40,7 @@ def epochs(folder: Path) -> set[str]:
 
 
 def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
-    """What a killed process has left is removed, and other files stay."""
+    """Leftovers of a killed process are removed, and other files stay."""
     checkpoints = Checkpoints(tmp_path / "c")
     assert checkpoints.last_epoch == checkpoints.best_epoch == 0
     for epoch, score in enumerate((-3.0, 0.9, 0.9, -0.3), 1):

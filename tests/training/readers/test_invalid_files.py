@@ -1,4 +1,4 @@
-"""What the dataset readers have in common: frames are read one at a time, and files that are invalid are named."""
+"""All dataset readers: frames are read one at a time, and errors name invalid files."""
 
 import json
 import re

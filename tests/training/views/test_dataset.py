@@ -1,4 +1,4 @@
-"""Datasets of views: what was rendered is read, interrupted rendering resumes, damaged files are refused by name."""
+"""Datasets of views: rendered views are read back, interrupted rendering resumes, damaged files are refused by name."""
 
 import contextlib
 import dataclasses
