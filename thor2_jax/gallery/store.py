@@ -329,8 +329,7 @@ def _own_objects(
 
 def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
     """Remove what an interrupted writer left, and the files of objects that an earlier change removed."""
-    for folder in (directory, directory / "objects"):
-        remove_leftovers(folder)
+    remove_leftovers(directory / "objects")  # those beside the index are removed when it is written
     if (directory / "objects").is_symlink():  # Another gallery may share the files behind it.
         return
     for path, _ in _own_objects(directory, used):
