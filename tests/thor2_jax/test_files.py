@@ -197,6 +197,6 @@ def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MAX_YAML_BYTES", 10)
     monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
     assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
-    for content, message in ((b"[1,2,3,4]" + b" " * 2, "11 bytes"), (b"{1,2,3}", "more than 5 values")):
+    for content, message in ((b"[1,2,3,4]" + b" " * 2, "11 bytes"), (b"[{1},1,1]", "more than 5 values")):
         with pytest.raises(ValueError, match=message):
             parse_yaml(content)
