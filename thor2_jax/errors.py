@@ -24,9 +24,10 @@ class InputError(ValueError):
 
 def reason_of(error: BaseException) -> str:
     """Return why an exception was raised, in one line: its message, which may be from another package, or its type."""
+    message = str(error)
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(str(error).split()) or type(error).__name__
+        message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(message.split()) or type(error).__name__
 
 
 @contextlib.contextmanager

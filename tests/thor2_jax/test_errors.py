@@ -15,4 +15,5 @@ def test_only_foreign_packages_need_an_extra() -> None:
 def test_the_reason_of_an_error_of_the_system_names_its_file() -> None:
     assert reason_of(FileNotFoundError(2, "No such file", "a.png")) == "a.png: No such file"
     assert reason_of(OSError(28, "No space left")) == "No space left"
+    assert reason_of(OSError(5, "two\nlines", "a\nb")) == "a b: two lines"
     assert reason_of(OSError("two\nlines")) == "two lines" and reason_of(ValueError()) == "ValueError"

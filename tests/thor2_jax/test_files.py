@@ -185,8 +185,8 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}"],
-    ids=["deep", "cycle", "alias", "int", "digits", "merge"],
+    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}", b"[1"],
+    ids=["deep", "cycle", "alias", "int", "digits", "merge", "open"],
 )
 def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
     with pytest.raises(ValueError):
@@ -197,6 +197,6 @@ def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MAX_YAML_BYTES", 10)
     monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
     assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
-    for content in (b"[1,2,3,4,5]", b"[1,1,1,1,]" + b" ", b"[1,1,1,1,1"):
-        with pytest.raises(ValueError):
+    for content, message in ((b"[1,2,3,4]" + b" " * 2, "11 bytes"), (b"[{1},1,1]", "more than 5 values")):
+        with pytest.raises(ValueError, match=message):
             parse_yaml(content)

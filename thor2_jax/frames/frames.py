@@ -63,7 +63,7 @@ class RGBDFrame:
         depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
             (millimetres by default) or floats in metres; 0, or for floats also NaN or infinity, means no depth.
         labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
-            segmented: `thor2_jax.segmentation.segmented` returns it with labels.
+            segmented: `thor2_jax.segmented` returns it with labels.
         intrinsics: the camera of all three images; a mapping, matrix or ROS message is converted by `Intrinsics.of`.
 
     Raises:

@@ -329,8 +329,7 @@ def _own_objects(
 
 def _remove_orphans(directory: Path, used: Collection[str | None]) -> None:
     """Remove the leftovers of an interrupted writer, and the files of objects that an earlier change removed."""
-    for folder in (directory, directory / "objects"):
-        remove_leftovers(folder)
+    remove_leftovers(directory / "objects")  # Writing the index removes the leftovers beside it.
     if (directory / "objects").is_symlink():  # Another gallery may use the linked files.
         return
     for path, _ in _own_objects(directory, used):

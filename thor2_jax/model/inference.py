@@ -29,9 +29,9 @@ __all__ = [
     "Inference",
     "answers",
     "compute_by_chunks",
-    "object_scores",
     "infer",
     "infer_clouds",
+    "object_scores",
     "padded_rows",
     "values",
 ]
@@ -150,12 +150,11 @@ def infer_clouds(
     Raises:
         InputError: a classifier that the run does not have.
     """
-    source = model.answers_by(answer_by)
-    config = model.run.config
+    source, config = model.answers_by(answer_by), model.run.config
+    names = model.chosen_classifiers(classifiers) if source != "gallery" else ()
     # If the gallery alone answers, it needs `LOOKS` looks, which `infer` would otherwise describe again.
     count = max(config.looks, LOOKS) if source == "gallery" else config.looks
     oriented = describe_looks(clouds, model.run.network, config, count)
-    names = model.chosen_classifiers(classifiers) if source != "gallery" else ()
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
 
 

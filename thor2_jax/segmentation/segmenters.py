@@ -63,8 +63,7 @@ def load_segmenter(name: str) -> Segmenter:
     try:
         segmenter = points[0].load()
     except Exception as error:
-        reason = f"{type(error).__name__}: {reason_of(error)}"
-        raise InputError(f"{subject} cannot be imported ({reason}); check its package") from None
+        raise InputError(f"{subject} cannot be imported ({_reason(error)}); check its package") from None
     if not callable(segmenter):
         raise InputError(f"{subject} is a {type(segmenter).__name__}; expected a function")
     return segmenter
@@ -90,8 +89,7 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {reason_of(error)}"
-        raise InputError(f"segmenter {name} failed on the frame ({reason}); check its package") from error
+        raise InputError(f"segmenter {name} failed on the frame ({_reason(error)}); check its package") from error
     expected = f"expected integers of shape {frame.depth.shape} (rows, columns), 0 for the background"
     if not isinstance(labels, np.ndarray):
         raise InputError(f"segmenter {name} returned a {type(labels).__name__}; {expected}, as a NumPy array")
@@ -107,3 +105,8 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
 def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame:
     """Return the frame with the labels of a segmenter; arguments and exceptions as `segment`."""
     return dataclasses.replace(frame, labels=segment(frame, segmenter))
+
+
+def _reason(error: BaseException) -> str:
+    """Return the type of an exception and its message, if it has one."""
+    return ": ".join(dict.fromkeys((type(error).__name__, reason_of(error))))

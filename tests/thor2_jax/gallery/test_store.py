@@ -19,6 +19,7 @@ import safetensors.numpy
 from refusals import assert_refused
 from written_files import files_of
 
+from thor2_jax.files import temporary_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
@@ -87,6 +88,9 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     before, stamp = files_of(directory), gallery_stamp(directory)
     update_gallery(directory, add("new", 5), FINGERPRINT)
     assert gallery_stamp(directory) != stamp
+    for folder in (directory, directory / "objects"):  # what a killed process leaves
+        with temporary_directory(folder) as temporary:
+            shutil.copytree(temporary, folder / ".thor2-killed")
     update_gallery(directory, lambda gallery: gallery.without("new"), FINGERPRINT)
     update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
     after = files_of(directory)

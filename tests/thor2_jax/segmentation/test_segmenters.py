@@ -88,8 +88,15 @@ def test_labels_that_are_not_labels(result: Any, message: str) -> None:
     )
 
 
-def test_a_segmenter_that_raises() -> None:
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (RuntimeError("no weights\nin this folder"), "RuntimeError: no weights in this folder"),
+        (NotImplementedError(), "NotImplementedError"),
+    ],
+)
+def test_a_segmenter_that_raises(error: Exception, reason: str) -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
-        raise RuntimeError("no weights\nin this folder")
+        raise error
 
-    assert_refused(r"^segmenter failing failed .*RuntimeError: no weights in this folder.*;", segment, FRAME, failing)
+    assert_refused(rf"^segmenter failing failed .*\({reason}\);", segment, FRAME, failing)
