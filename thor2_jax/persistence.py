@@ -185,7 +185,7 @@ def images(
     if len(pixels) != 2 or not all(isinstance(n, int | np.integer) and n > 0 for n in pixels):
         raise InputError(f"pixels is {pixels}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
-        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and value > 0 and np.isfinite(value)):
+        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 < np.asarray(value) < math.inf):
             raise InputError(f"{name} is {value}; expected a positive number")
     ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
     dtype = diagrams.births.dtype
