@@ -19,6 +19,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
@@ -181,10 +182,10 @@ def images(
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         if len(bounds) != 2 or not all(map(math.isfinite, bounds)) or not bounds[0] < bounds[1]:
             raise InputError(f"{name} is {bounds}; expected two finite numbers, the smaller one first")
-    if len(pixels) != 2 or not all(isinstance(n, int) and n > 0 for n in pixels):
+    if len(pixels) != 2 or not all(isinstance(n, int | np.integer) and n > 0 for n in pixels):
         raise InputError(f"pixels is {pixels}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
-        if isinstance(value, int | float) and not (value > 0 and math.isfinite(value)):
+        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 < np.asarray(value) < math.inf):
             raise InputError(f"{name} is {value}; expected a positive number")
     ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
     dtype = diagrams.births.dtype

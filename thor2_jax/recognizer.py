@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, camera_instances, estimate_transform
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import with_context
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
@@ -114,8 +114,11 @@ class Recognizer:
             chunk: see `Recognizer`.
 
         Raises:
-            InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
+            InputError: `unknown_below` is not between 0 and 1, `chunk` is not a positive integer, or `rule` or
+                `answer_by` is unknown.
         """
+        if not (isinstance(chunk, int | np.integer) and chunk > 0):
+            raise InputError(f"chunk is {chunk!r}; expected a positive integer")
         if embedding is not None:
             run = dataclasses.replace(run, embedding=embedding)
         self._model = Model.of_run(run, unknown_below, rule, answer_by)

@@ -10,7 +10,7 @@ cause a compilation:
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from typing import Any
 
 import jax
@@ -90,8 +90,9 @@ class PointClouds:
                 integer; `camera` is not finite or has another shape; `boundary` or `rim` does not fit the clouds. The
                 message gives the index of the cloud.
         """
-        if len(clouds) == 0:
-            raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
+        if not isinstance(clouds, Sized) or len(clouds) == 0:
+            actual = "empty" if isinstance(clouds, Sized) else f"a {type(clouds).__name__}"
+            raise InputError(f"clouds is {actual}; expected a list of at least one pair (xyz, rgb)")
         arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]
         n = _padded_size(sizes, capacity)
@@ -118,7 +119,7 @@ def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int]
     padded = np.zeros((len(sizes), n), bool)
     for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
         if values is not None:
-            given = np.asarray(values)
+            given = as_array(values, f"{name}[{i}]")
             if given.shape != (size,) or given.dtype != bool:
                 raise InputError(f"{name}[{i}] is {given.dtype} {list(given.shape)}; expected bool [{size}]")
             padded[i, :size] = given
@@ -170,7 +171,7 @@ def as_array(values: ArrayLike, name: str) -> NDArray[Any]:
     try:
         return np.asarray(values)
     except ValueError:
-        raise InputError(f"{name} has rows of different lengths; expected an array [n, 3]") from None
+        raise InputError(f"{name} has rows of different lengths; expected an array") from None
 
 
 def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

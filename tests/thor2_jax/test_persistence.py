@@ -175,6 +175,8 @@ def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
         {"pixels": (8, 0)},
         {"pixels": (8,)},
         {"variance": 0},
+        {"variance": np.float32(0)},
+        {"variance": np.full(2, -1.0)},
         {"exponent": -1.0},
     ],
 )
@@ -182,3 +184,8 @@ def test_bad_images(change: dict[str, Any]) -> None:
     diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
     with pytest.raises(thor2.InputError, match=f"^{next(iter(change))} is [^\n]*$"):
         persistence.images(diagrams, **({**IMAGE, "variance": 0.1} | change))
+
+
+def test_numbers_of_pixels_may_be_from_numpy() -> None:
+    diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
+    assert persistence.images(diagrams, **(IMAGE | {"pixels": (np.int64(4), 4)}), variance=0.1).shape == (4, 4)

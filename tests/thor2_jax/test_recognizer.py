@@ -81,8 +81,10 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
         else:
             assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
             assert dataclasses.replace(answer, name=named.name, reason=None) == named
-    for value in (-0.1, 1.5, float("nan")):
-        assert_refused(f"unknown_below is {value}", Recognizer, run, value)
+    for value in (-0.1, 1.5, float("nan"), "0.5"):
+        assert_refused(f"unknown_below is {value!r}", Recognizer, run, value)
+    for chunk in (0, 2.0, None):
+        assert_refused(f"chunk is {chunk}", Recognizer, run, chunk=chunk)
 
 
 def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:

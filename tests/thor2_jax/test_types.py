@@ -82,6 +82,8 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     ("arguments", "expected"),
     [
         ({"clouds": []}, ["clouds is empty"]),
+        ({"clouds": None}, ["clouds is a NoneType"]),
+        ({"clouds": iter([(POINTS, COLORS)])}, ["clouds is a list_iterator"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
@@ -105,6 +107,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"camera": "here"}, ["camera", "here"]),
         ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
+        ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
     ],

@@ -97,7 +97,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     colored = plot.attribution_colors(explanation.attributions.values).to_rgba(np.where(high > -low, high, low))
     shown[known] = colored[:, :3]
     wide = color.shape[1] > 1.5 * color.shape[0]
-    figure = Figure(figsize=(_SIZE[0], 5.4 if wide else 3.8), layout="constrained")
+    figure = Figure(figsize=(_SIZE[0], 5.4 if wide else 3.8), layout="compressed")
     first, second = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
     first.imshow(color)
     second.imshow(shown)

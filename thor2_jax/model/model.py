@@ -10,6 +10,7 @@ embedding if it was fitted on the classes. A colour transform corrects the colou
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any, TypeVar, cast, get_args
 
 import jax
@@ -138,8 +139,9 @@ class Model:
     def __post_init__(self) -> None:
         if self.rule not in FUSION_RULES:
             raise InputError(f"rule is {self.rule!r}; expected one of {', '.join(FUSION_RULES)}")
-        if self.unknown_below is not None and not 0 <= self.unknown_below <= 1:
-            raise InputError(f"unknown_below is {self.unknown_below}; expected a confidence from 0 to 1")
+        below = self.unknown_below
+        if below is not None and not (isinstance(below, Real) and 0 <= below <= 1):
+            raise InputError(f"unknown_below is {below!r}; expected a confidence from 0 to 1")
 
     @classmethod
     def of_run(

@@ -144,7 +144,9 @@ class Service:
                 compile_explanations(self.engine.model, *programs, lambda: self.state != "ready")
             except Exception:  # Requests compile the missing programs and report the error.
                 log.exception("compiling explanations failed")
-            log.info("explanations of clouds of %d points are compiled", programs[0])
+            else:
+                if self.state == "ready":
+                    log.info("explanations of clouds of %d points are compiled", programs[0])
 
         if programs not in self._compiled:
             self._compiled[programs] = self._compiler.submit(compile_all)

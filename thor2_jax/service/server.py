@@ -99,11 +99,18 @@ class _Supervisor(Multiprocess):
         """Start the workers."""
         with signals_blocked(signal.SIGINT):
             super().init_processes()
+        self._close_ends_of_workers()
 
     def keep_subprocess_alive(self) -> None:
         """Replace workers that have died."""
         with signals_blocked(signal.SIGINT):
             super().keep_subprocess_alive()
+        self._close_ends_of_workers()
+
+    def _close_ends_of_workers(self) -> None:
+        """Leave each worker's end of its pipe to the worker: a health check then ends at once if the worker dies."""
+        for process in self.processes:
+            process.child_conn.close()
 
 
 def _create_worker(settings: Settings, workers: int) -> FastAPI:

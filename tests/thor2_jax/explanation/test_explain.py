@@ -1,6 +1,7 @@
 """Explanations, against independent computations and against toys whose answer is known."""
 
 import dataclasses
+import io
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from refusals import assert_refused
 from scipy.special import logit
 from slow_tier import slow
@@ -22,6 +24,8 @@ from thor2_jax.explanation import attributions
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
+from thor2_jax.explanation.pictures import main_pictures
+from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
@@ -334,3 +338,11 @@ def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame
     assert_refused("no object", explain, Recognizer(untrained_run((), features=())), frame, 3)
     released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
     assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), frame, 3)
+
+
+def test_titles_of_the_photo_of_a_tall_object_are_inside(explanation: Explanation, frame: thor2.RGBDFrame) -> None:
+    """The titles touched the border of a picture whose sides have a ratio of 1.2."""
+    labels = np.where(np.arange(len(frame.labels))[:, None] < 58, frame.labels, 0)
+    picture = next(main_pictures(explanation, dataclasses.replace(frame, labels=labels)))
+    with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
+        assert (np.asarray(image)[:2] == 255).all()

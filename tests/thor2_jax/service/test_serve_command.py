@@ -15,6 +15,7 @@ from commands import Command
 from processes import HANG, finish_programs, start_program
 from refusals import assert_refused
 from uvicorn.supervisors import Multiprocess
+from uvicorn.supervisors.multiprocess import Process
 
 from thor2_jax.errors import InputError
 from thor2_jax.service import server
@@ -92,6 +93,7 @@ def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.Monk
     monkeypatch.setattr(Multiprocess, "init_processes", record)
     monkeypatch.setattr(Multiprocess, "keep_subprocess_alive", record)
     supervisor = object.__new__(server._Supervisor)
+    supervisor.processes = []
     supervisor.init_processes()
     supervisor.keep_subprocess_alive()
     assert all(signal.SIGINT in mask and signal.SIGTERM not in mask for mask in masks) and len(masks) == 2
@@ -102,6 +104,20 @@ def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.Monk
         "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
     )
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
+
+
+def test_health_check_ends_when_the_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A SIGKILL of a busy worker leaves the check unanswered; it would last for its whole timeout, a minute."""
+
+    def start(supervisor: Any) -> None:
+        supervisor.processes = [Process(uvicorn.Config("no application"), [])]  # not started: it holds no pipe
+
+    monkeypatch.setattr(Multiprocess, "init_processes", start)
+    monkeypatch.setattr(Multiprocess, "keep_subprocess_alive", start)
+    supervisor = object.__new__(server._Supervisor)
+    for start_workers in (supervisor.init_processes, supervisor.keep_subprocess_alive):
+        start_workers()
+        assert supervisor.processes[0].parent_conn.poll(0)  # the end of the pipe
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

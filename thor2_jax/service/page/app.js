@@ -141,7 +141,7 @@ function show(answer, bitmap, selected) {
 function unknownHint() {
   const { knows, teaches } = loaded.model;
   const how = teaches ? "Click an object to name it." : "Teach it by thor2 enroll, or here after thor2 serve --teach.";
-  return `This model knows ${knows}. ${how}`;
+  return `This model knows ${knows}${knows.endsWith(".") ? "" : "."} ${how}`;
 }
 
 function objectButton(instance, color) {

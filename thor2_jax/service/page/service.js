@@ -10,7 +10,7 @@ export class Problem extends Error {
 }
 
 export function useToken(value) {
-  token = value;
+  token = value.replace(/[^\x20-\x7e]/g, "?"); // A header that has other characters is not sent.
 }
 
 /** Escape control characters and characters that change the direction of text. */
