@@ -111,6 +111,10 @@ class LabelledFrames(abc.ABC):
         """Return the files that a frame is read from; by default none are known."""
         return ()
 
+    def names(self) -> set[str] | None:
+        """Return the names of all objects, if they can be read without the images; by default they are unknown."""
+        return None
+
     def only(self, number: int) -> Self:
         """Return a dataset of one of the frames. Processes get it, since all paths of a large dataset take seconds."""
         one = copy.copy(self)
