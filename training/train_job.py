@@ -24,6 +24,7 @@ from training.train_run import VIEWS, check_out, check_trained, finished_record,
 from training.views.crops import render_crops
 from training.views.dataset import ViewDataset, remove_views, render_dataset
 from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
+from training.views.mesh_views import RenderJob
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
@@ -146,6 +147,15 @@ def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
         )
 
 
+def _check_folds(job: TrainJob, rendering: RenderJob, labelled: LabelledInstances | None) -> None:
+    """Raise InputError if a class has fewer views than folds even if all of its views can be used."""
+    folds, n_rendered = job.protocol.folds, len(rendering.angles)
+    for name in rendering.meshes:
+        n_views = n_rendered + (len(labelled.views.get(name, ())) if labelled else 0)
+        if n_views < folds and name not in job.leave_out:
+            raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
+
+
 def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
     """Raise InputError if a finished run is of another job; without baselines, remove leftovers of a killed process.
 
@@ -244,6 +254,7 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
+        _check_folds(job, rendering, labelled)
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

@@ -269,9 +269,11 @@ def estimate_transform(
     """
     usable = [instance for instance in instances if instance.reason is None]
     if len(usable) < MIN_INSTANCES:
+        reasons = [instance.reason for instance in instances if instance.reason is not None]
+        others = f", or mend the unusable ones ({len(reasons)}); the first has {reasons[0]}" if reasons else ""
         raise InputError(
             f"frames have {len(usable)} usable instances; expected at least {MIN_INSTANCES}: give more frames of this "
-            "camera"
+            f"camera{others}"
         )
     chosen = [usable[index] for index in evenly_spread(len(usable), MAX_INSTANCES)]
     total = objective(chosen, criterion, capacity)

@@ -9,7 +9,7 @@ offers a segmenter as an entry point in the group `ENTRY_POINTS`, see docs/segme
 
 import dataclasses
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -39,8 +39,12 @@ def segmenter_names() -> list[str]:
     return [TABLE, *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - {TABLE})]
 
 
-def load_segmenter(name: str) -> Segmenter:
+def load_segmenter(name: str, others: Sequence[str] = ()) -> Segmenter:
     """Return the segmenter of this name.
+
+    Args:
+        name: name of the segmenter.
+        others: further names that the caller takes, which the error message lists.
 
     Raises:
         InputError: no segmenter has this name, or its package cannot be imported.
@@ -54,9 +58,10 @@ def load_segmenter(name: str) -> Segmenter:
             return importlib.import_module("thor2_jax.segmentation.table").segment_table
     points = list(entry_points(group=ENTRY_POINTS, name=name))
     if not points:
+        names = ", ".join([*segmenter_names(), *others])
         raise InputError(
-            f"segmenter is {name!r}; expected one of {', '.join(segmenter_names())}, or install a package that offers "
-            f"it in the entry point group {ENTRY_POINTS}"
+            f"segmenter is {name!r}; expected one of {names}, or install a package that offers it in the entry point "
+            f"group {ENTRY_POINTS}"
         )
     subject = f"segmenter is {name!r}; {points[0].value}"
     # Importing a package of others may raise any exception.

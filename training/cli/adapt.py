@@ -35,4 +35,6 @@ def adapt(
         f"{adaptation.instances} instances; mean uncertainty of their answers {adaptation.uncertainty_before:.3f} "
         f"before, {adaptation.uncertainty_after:.3f} after"
     )
+    if adaptation.uncertainty_after >= adaptation.uncertainty_before:
+        console.print(f"these frames do not show that their colours need a correction; {model} may serve as well")
     finish(f"written to {out}", "recognize a frame", "recognize", "FRAME", "--model", out)

@@ -23,6 +23,7 @@ from typing import Annotated, Any, NoReturn, TextIO
 import typer
 from rich import progress
 from rich.console import Console
+from rich.table import Column
 
 from thor2_jax import __version__
 from thor2_jax.errors import InputError, reason_of
@@ -68,10 +69,11 @@ def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
 def _bars() -> Iterator[Progress]:
     tasks: dict[str, progress.TaskID] = {}
     name = progress.TextColumn("{task.description}", markup=False)
-    note = progress.TextColumn("{task.fields[note]}", markup=False)
+    # On a narrow terminal, the note is cut, not the bar and the numbers.
+    note = progress.TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
     times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
-    columns = name, progress.BarColumn(), progress.MofNCompleteColumn(), *times, note
-    with progress.Progress(*columns, console=Console(stderr=True)) as bars:
+    columns = name, progress.BarColumn(20), progress.MofNCompleteColumn(), *times, note
+    with progress.Progress(*columns, console=Console(stderr=True), expand=True) as bars:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:

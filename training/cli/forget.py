@@ -20,4 +20,5 @@ def forget(
     recognizer = Recognizer.load(model, gallery=gallery)
     recognizer.forget(name)
     knows = f"{name} is forgotten; {model} knows {recognizer.gallery.summary}"
-    finish(knows, "teach it again", "enroll", name, "FRAME", "--model", model)
+    dashes = ["--"] if name.startswith("-") else []
+    finish(knows, "teach it again", "enroll", "--model", model, *dashes, name, "FRAME")

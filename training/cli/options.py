@@ -221,7 +221,7 @@ def find_segmenter(name: str, model: "Segmenter | None" = None) -> "Segmenter":
     from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
 
     if model is None or name != MODEL:
-        return load_segmenter(name)
+        return load_segmenter(name, () if model is None else (MODEL,))
     load_segmenter(TABLE)  # "model" starts from its segments; this raises if its package is missing
     return model
 

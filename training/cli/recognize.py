@@ -202,4 +202,4 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:
         console.print(f"{escape_characters(frame)}:")
-    console.print(table)
+    console.print(table if recognitions else "no instances: all pixels are background")

@@ -26,7 +26,7 @@ from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
-from training.evaluation.results import compute_results
+from training.evaluation.results import check_known, compute_results
 from training.evaluation.runs import Run, all_predictors, load_runs, load_sequence_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import Progress, locked
@@ -77,6 +77,9 @@ def evaluate_dataset(
         OSError: a file cannot be written.
     """
     check_output_directory(out, ANSWERS)
+    names = frames.names()
+    if names is not None:
+        check_known(names, runs[0].classes)  # not only after all frames are recognized
     if not out.exists():
         frames[0]  # raises if it cannot be read, before anything is written
     answering = answering or (lambda numbers: answer_frames(runs, (frames[number] for number in numbers)))

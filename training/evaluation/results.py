@@ -1,7 +1,7 @@
 """Computation of all values of a report from the answers, as one JSON table."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.fusion import DEFAULT_RULE
-from thor2_jax.printable import first_names
+from thor2_jax.printable import find_name, first_names
 from training.evaluation import scores
 from training.evaluation.answers import (
     RULES,
@@ -26,7 +26,7 @@ from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
-__all__ = ["compute_results", "fuse_answers", "named_answers"]
+__all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
 
 CURVE = tuple(k / 100 for k in range(101))
 """Fractions of the correct answers at which the known/unknown curve is computed."""
@@ -104,12 +104,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     is_known = [instance.truth in classes for instance, _ in labelled]
     instances = [instance for instance, _ in labelled if instance.truth in classes]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
-    if not instances:
-        raise InputError(
-            f"model: no instance of the dataset is of a class of the runs; the dataset has "
-            f"{_listed({i.truth for i in unknown})}, the runs know {_listed(classes)}; check the names, or give other "
-            "runs"
-        )
+    check_known({instance.truth for instance, _ in labelled}, classes)
     seconds = [frame.seconds for frame in frames]
     # One table of OCID is by sequence, which is the directory of the frame.
     attributes = [
@@ -183,6 +178,15 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         "confusion": confusion.tolist(),
         "answers": counts,
     }
+
+
+def check_known(names: Collection[str], classes: Sequence[str]) -> None:
+    """Raise InputError unless an object of a dataset is of a class of the runs."""
+    if not any(find_name(name, classes) for name in names):
+        raise InputError(
+            f"model: no instance of the dataset is of a class of the runs; the dataset has {_listed(names)}, the runs "
+            f"know {_listed(classes)}; check the names, give other runs, or add frames with known objects"
+        )
 
 
 def _listed(names: Iterable[str]) -> str:

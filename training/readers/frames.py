@@ -221,6 +221,11 @@ class FrameFolder(LabelledFrames):
             )
         return frame, truth, {}
 
+    def names(self) -> set[str] | None:
+        """Return the names of the objects in the labels.json of all frames."""
+        files = [source.files.names for source in self.sources if source.files]
+        return {name for path in files for name in read_names(path).values()} if self.named else None
+
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame; empty for a recording."""
         files = self.sources[number].files

@@ -112,6 +112,10 @@ class LabelledFrames(abc.ABC):
         """Return the files from which a frame is read; empty by default."""
         return ()
 
+    def names(self) -> set[str] | None:
+        """Return the names of all objects, if they can be read without the images; by default they are unknown."""
+        return None
+
     def only(self, number: int) -> Self:
         """Return a dataset with one of the frames, since sending all paths of a large dataset to a process is slow."""
         one = copy.copy(self)

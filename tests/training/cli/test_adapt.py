@@ -89,6 +89,16 @@ def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(stored.colors.mean(axis=0), expected, atol=4)
 
 
+def test_uncertainty_that_does_not_decrease_is_noted(
+    model: Path, video: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for after, is_noted in ((0.6, True), (0.4, False)):
+        adaptation = Adaptation(ColorTransform(), 12, 0.5, after)
+        monkeypatch.setattr(Recognizer, "adapt", lambda *_, adaptation=adaptation: adaptation)
+        out = printed("adapt", "--model", model, video, "--out", tmp_path / f"{after}", "--quiet")
+        assert (f"{model} may serve as well" in out) == is_noted
+
+
 def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, refused: Command) -> None:
     few, unlabelled = tmp_path / "few", tmp_path / "unlabelled"
     write_frame(few, OBJECTS)

@@ -237,6 +237,15 @@ def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert "━" in err and "render [red]" in err and "3/10" in err and "of [/x]" in err
 
 
+def test_a_narrow_terminal_cuts_the_note(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    with show_progress() as show:
+        show("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2)
+    err: Any = capsys.readouterr().err
+    assert "stage 4 of 5: fit networks" in err and "━" in err and "20/104" in err
+
+
 def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """A live display is cut at the height of the terminal."""
     bars: list[rich.progress.Progress] = []

@@ -279,7 +279,8 @@ def test_train_by_sequences(
 def test_rendered_views_are_kept_for_another_attempt(meshes: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)
-    assert "99" in refused(*command, "--folds", 99, at_once=False)
+    assert "folds is 99" in refused(*command, "--folds", 99, at_once=False)
+    assert not out.exists()  # no view was rendered
     assert "batch_size is 100000" in refused(*command, "--batch-size", 100_000, at_once=False)
     assert [p.name for p in out.iterdir()] == ["views"]
     last = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--embedding", 0)

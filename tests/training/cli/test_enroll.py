@@ -70,6 +70,13 @@ def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Co
         assert "1 frames without labels.json: 001" in printed(*command, "--model", model).replace("\n", " ")
 
 
+def test_frames_without_known_objects_are_not_recognized(model: Path, tmp_path: Path, refused: Command) -> None:
+    write_frame(tmp_path / "test" / "a", {4: "leaf"}, 7)
+    message = refused("evaluate", "frames", tmp_path / "test", "--model", model, "--out", tmp_path / "report")
+    assert "no instance of the dataset is of a class" in message and "leaf" in message
+    assert not (tmp_path / "report").exists()
+
+
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     frames = tmp_path / "test"
     write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
@@ -212,6 +219,9 @@ def test_a_gallery_outside_the_run_directory(
         assert run_thor2("enroll", name, "--model", model, *one_frame(frames / "000", label), *other) == 0
     assert run_thor2("forget", "old", "--model", model, *other) == 0
     assert "'old'" in refused("forget", "old", "--model", model, *other)
+    assert run_thor2("enroll", "--model", model, *other, *one_frame(frames / "000", 5), "--", "-old") == 0
+    forgotten = printed("forget", "--model", model, *other, "--", "-old")
+    assert forgotten.rstrip().endswith(f"thor2 enroll --model {model} -- -old FRAME")
     lines = printed("objects", "--model", model, *other)
     assert "new" in lines and "old" not in lines and "brick" not in lines
     assert files_of(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)

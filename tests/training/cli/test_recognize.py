@@ -82,6 +82,13 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
     assert f"{len(names)} instances have a name" in capfd.readouterr().err
 
 
+def test_a_frame_of_background_has_no_table(model: Path, tmp_path: Path, printed: Command) -> None:
+    folder = write_frame_files(tmp_path / "one", small_frame())
+    Image.fromarray(np.zeros_like(small_frame().labels)).save(folder / "mask.png")
+    out = printed("recognize", "--model", model, folder)
+    assert "no instances" in out and "confidence" not in out
+
+
 def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
@@ -96,7 +103,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --out frames", "expected a new or empty directory"),
         ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
         ("frames --unknown-below 1.5", "unknown_below is 1.5"),
-        ("frames --segment sam --out out", "error: segmenter is 'sam'"),
+        ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
         ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
         ("FILES --segment table --out out", "error: labels is "),
