@@ -119,7 +119,7 @@ def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int]
     padded = np.zeros((len(sizes), n), bool)
     for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
         if values is not None:
-            given = as_array(values, f"{name}[{i}]")
+            given = as_array(values, f"{name}[{i}]", "bool [n]")
             if given.shape != (size,) or given.dtype != bool:
                 raise InputError(f"{name}[{i}] is {given.dtype} {list(given.shape)}; expected bool [{size}]")
             padded[i, :size] = given
@@ -166,12 +166,12 @@ def check_batch(clouds: PointClouds) -> None:
         raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
-def as_array(values: ArrayLike, name: str) -> NDArray[Any]:
+def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
     """Return `values` as an array; rows of different lengths raise InputError."""
     try:
         return np.asarray(values)
     except ValueError:
-        raise InputError(f"{name} has rows of different lengths; expected an array") from None
+        raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
 
 
 def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -83,6 +83,7 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
             assert dataclasses.replace(answer, name=named.name, reason=None) == named
     for value in (-0.1, 1.5, float("nan"), "0.5"):
         assert_refused(f"unknown_below is {value!r}", Recognizer, run, value)
+    assert Recognizer(run, jax.numpy.float32(0.5)).thresholds().tolist() == [0.5] * len(run.classes)
     for chunk in (0, 2.0, None):
         assert_refused(f"chunk is {chunk}", Recognizer, run, chunk=chunk)
 

@@ -119,7 +119,7 @@ def slices_and_strips(
     # After rounding to 0.01, x is k / 100. The first edge j / 40 at or above x has j = ceil(2 k / 5), in integers.
     strip = (2 * _round_scaled(jnp.clip(x, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100).astype(jnp.int32) + 4) // 5
     level = _round_scaled(z, 10).astype(jnp.int32)
-    # Levels above twice the number of slices are not renumbered, since they are outside the descriptor.
+    # Levels below 0, and from twice the number of slices on, are outside the descriptor and are not renumbered.
     n_levels = 2 * config.n_slices
     ranked = (level >= 0) & (level < n_levels)
     occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & ranked, level, n_levels)].set(1, mode="drop")

@@ -10,7 +10,6 @@ embedding if it was fitted on the classes. A colour transform corrects the colou
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from typing import Any, TypeVar, cast, get_args
 
 import jax
@@ -140,7 +139,7 @@ class Model:
         if self.rule not in FUSION_RULES:
             raise InputError(f"rule is {self.rule!r}; expected one of {', '.join(FUSION_RULES)}")
         below = self.unknown_below
-        if below is not None and not (isinstance(below, Real) and 0 <= below <= 1):
+        if below is not None and (isinstance(below, str) or not 0 <= below <= 1):
             raise InputError(f"unknown_below is {below!r}; expected a confidence from 0 to 1")
 
     @classmethod
