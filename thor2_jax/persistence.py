@@ -24,7 +24,7 @@ from jax.typing import ArrayLike
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams
+from thor2_jax.types import Diagrams, is_positive_integer
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -182,7 +182,7 @@ def images(
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         if len(bounds) != 2 or not all(map(math.isfinite, bounds)) or not bounds[0] < bounds[1]:
             raise InputError(f"{name} is {bounds}; expected two finite numbers, the smaller one first")
-    if len(pixels) != 2 or not all(isinstance(n, int | np.integer) and n > 0 for n in pixels):
+    if len(pixels) != 2 or not all(map(is_positive_integer, pixels)):
         raise InputError(f"pixels is {pixels}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
         if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 < np.asarray(value) < math.inf):

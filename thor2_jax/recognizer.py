@@ -41,7 +41,7 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
 from thor2_jax.tracking.tracker import Tracker
-from thor2_jax.types import Descriptors, PointClouds
+from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 
 __all__ = ["THOR2", "DescribedFrame", "Recognizer"]
 
@@ -117,7 +117,7 @@ class Recognizer:
             InputError: `unknown_below` is not between 0 and 1, `chunk` is not a positive integer, or `rule` or
                 `answer_by` is unknown.
         """
-        if not (isinstance(chunk, int | np.integer) and chunk > 0):
+        if not is_positive_integer(chunk):
             raise InputError(f"chunk is {chunk!r}; expected a positive integer")
         if embedding is not None:
             run = dataclasses.replace(run, embedding=embedding)

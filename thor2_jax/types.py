@@ -34,6 +34,7 @@ __all__ = [
     "check_batch",
     "check_capacity",
     "check_cloud",
+    "is_positive_integer",
 ]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
@@ -153,9 +154,14 @@ def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
+def is_positive_integer(value: Any) -> bool:
+    """Return whether a value is a positive integer of Python or NumPy; True is not."""
+    return isinstance(value, int | np.integer) and value is not True and bool(value > 0)
+
+
 def check_capacity(capacity: Any) -> None:
     """Raise InputError unless a padded number of points is None or a positive integer, also of NumPy."""
-    if not (capacity is None or (isinstance(capacity, int | np.integer) and capacity is not True and capacity > 0)):
+    if not (capacity is None or is_positive_integer(capacity)):
         raise InputError(f"capacity is {capacity!r}; expected a positive integer, or None for the point buckets")
 
 

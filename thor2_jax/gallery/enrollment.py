@@ -311,7 +311,7 @@ class ObjectGallery:
 
         Raises:
             InputError: no object has this name.
-            OSError: the gallery cannot be written; it is as before.
+            OSError: the gallery cannot be written; it is unchanged.
         """
         if self.directory is not None and store.gallery_stamp(self.directory) is None:
             self.gallery.without(name)  # raises for an unknown name before a gallery is created on disk

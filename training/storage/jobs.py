@@ -236,7 +236,7 @@ def write_checked(path: Path, content: bytes) -> str:
     """Write a file and return its SHA-256.
 
     Raises:
-        OSError: the file cannot be written; an older one stays.
+        OSError: the file cannot be written; an older file is kept.
     """
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -261,7 +261,7 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
     """Write arrays and metadata to a safetensors file.
 
     Raises:
-        OSError: the file cannot be written; an older one stays.
+        OSError: the file cannot be written; an older file is kept.
     """
     with atomic_write(path) as temporary:
         temporary.write_bytes(pack_arrays(arrays, {**metadata, "sha256": _arrays_digest(arrays)}))
