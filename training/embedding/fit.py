@@ -198,7 +198,7 @@ def fit_embedding(
     return fitted if classes else fitted.without_proxies()
 
 
-BACKGROUND_VIEWS = 4096
+BACKGROUND_VIEWS = 1024
 """Number of background views; docs/decisions.md explains it."""
 
 VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192

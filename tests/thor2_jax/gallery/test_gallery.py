@@ -70,9 +70,14 @@ def test_thresholds_grow_with_the_views_of_each_object() -> None:
     balanced = dataclasses.replace(with_references, version=1)
     odds = (np.array([0.17, 0.24, 0.27, 0.29]) / 0.2) ** 3
     np.testing.assert_allclose(balanced.unknown_below[[0, 2, 4, 6]], odds / (1 + odds), atol=6e-4)
-    odds = (np.array([0.145, 0.235, 0.25, 0.305, 0.39]) / 0.2) ** 3
-    latest = dataclasses.replace(with_references, version=2)
-    np.testing.assert_allclose(latest.unknown_below[[0, 2, 4, 6, 7]], odds / (1 + odds), atol=6e-4)
+    for views, kept in (
+        (None, [0.255, 0.345, 0.375, 0.43, 0.455]),
+        (references(("mug", 3)), [0.145, 0.235, 0.25, 0.305, 0.39]),
+        (references(), [0.185, 0.27, 0.305, 0.36, 0.5]),
+    ):
+        odds = (np.array(kept) / 0.2) ** 3
+        latest = dataclasses.replace(gallery, references=views, version=2)
+        np.testing.assert_allclose(latest.unknown_below[[0, 2, 4, 6, 7]], odds / (1 + odds), atol=6e-4)
     assert Gallery("fingerprint").unknown_below.shape == (0,)
 
 

@@ -36,7 +36,7 @@ def test_references_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:
     packaged = load_default()
-    assert packaged.references is not None and packaged.references.embeddings.shape == (4096, packaged.size)
+    assert packaged.references is not None and packaged.references.embeddings.shape == (1024, packaged.size)
     assert (packaged.references.label == BACKGROUND).all() and packaged.references.classes == ()
     packaged.save(tmp_path / "embedding.safetensors")
     loaded = Embedding.load(tmp_path / "embedding.safetensors")
