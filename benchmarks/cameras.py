@@ -174,7 +174,7 @@ def _measure(
     known = [each for each in labelled if each[0].truth in classes]
     unknown = [instance for instance, _, _ in labelled if instance.truth not in classes]
     if not known:
-        raise InputError(f"frames: no instance is of a class of the runs, which know {', '.join(classes[:5])}, ...")
+        raise InputError(f"frames: no instance is of a class of the runs, which have {', '.join(classes[:5])}, ...")
     instances = [instance for instance, _, _ in known]
     described_unknown = [instance for instance in unknown if instance.probabilities is not None]
     fused, others = fuse_answers(instances, runs, rule), fuse_answers(described_unknown, runs, rule)

@@ -343,7 +343,7 @@ class Gallery:
         own = [name for name in self.answered_names if name not in toys]
         listed = first_names(own, MAX_LISTED)
         if toys:
-            others = f", and {listed}" if own else "; it knows nothing of yours"
+            others = f", and {listed}" if own else "; none of yours"
             return f"{len(toys)} toy objects of the demo{others}"
         return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
 

@@ -237,7 +237,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
 def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def check_teaches() -> None:
         if not service.settings.teach:
-            raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
+            raise RequestError(403, None, "Enrolling is disabled; start the service with `thor2 serve --teach`.")
 
     guards = [Depends(check_teaches), Depends(_check_same_site)]
     routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)

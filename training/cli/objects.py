@@ -50,4 +50,4 @@ def objects(
             sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    finish(f"{model} knows {known.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)
+    finish(f"{model} recognizes {known.summary}", "enroll an object", "enroll", "NAME", "FRAME", "--model", model)
