@@ -93,8 +93,8 @@ def run_train_job(
         Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
 
     Raises:
-        InputError: An option is invalid, or a directory holds results of another job.
-        OSError: A file cannot be written.
+        InputError: an option is invalid, or a directory holds results of another job.
+        OSError: a file cannot be written.
     """
     baselines = check_baselines(job.baselines)
     if job.weights is not None:

@@ -205,7 +205,7 @@ class ObjectGallery:
                 lost index.
 
         Raises:
-            InputError: see `refresh`.
+            InputError: as `refresh`.
             OSError: the gallery cannot be written; it is unchanged.
         """
         self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)

@@ -221,7 +221,7 @@ class Gallery:
             replace: discard the views of an existing object, and hide a trained class with this name.
 
         Raises:
-            InputError: see `check_name`; or the name exists and neither `extend` nor `replace` is given, or both are.
+            InputError: the name exists and neither `extend` nor `replace` is given, or both are; also as `check_name`.
         """
         name = self.name_to_enroll(name, extend=extend, replace=replace)
         if name in self.objects and extend:

@@ -124,7 +124,7 @@ def train_baselines(
         InputError: `path` is not a run directory; the run was trained on other views; a baseline cannot be trained on
             them; `weights` lacks a file or has a file of another architecture; or a network of the run was trained
             without these weights.
-        OSError: A file cannot be written.
+        OSError: a file cannot be written.
     """
     for directory in find_run_directories([Path(path)]):
         run = load_run(directory)

@@ -221,8 +221,8 @@ def fit(
         accuracy or, without a held-out set, the lowest training loss.
 
     Raises:
-        InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
-        OSError: A checkpoint cannot be written. The last complete one is kept.
+        InputError: there are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
+        OSError: a checkpoint cannot be written. The last complete one is kept.
     """
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]

@@ -54,9 +54,9 @@ def fetch_ycb(
         progress: called with (object, downloaded kB, total kB, "").
 
     Raises:
-        InputError: A name or the address is invalid, the server has no such object or cannot be reached, an archive or
+        InputError: a name or the address is invalid, the server has no such object or cannot be reached, an archive or
             mesh is damaged, or another process writes to the directory.
-        OSError: The directory cannot be written.
+        OSError: the directory cannot be written.
     """
     wrong = [name for name in objects if not NAME.fullmatch(name)]
     if wrong or not objects:

@@ -109,7 +109,7 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     """Merge meshes in the same frame into one.
 
     Raises:
-        InputError: Some meshes have textures and others corner colours.
+        InputError: some meshes have textures and others corner colours.
     """
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     vertices = np.concatenate([part.vertices for part in parts])

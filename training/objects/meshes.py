@@ -45,8 +45,8 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
-        InputError: The geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
-        ValueError: The geometry is inconsistent.
+        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
+        ValueError: the geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
     from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
@@ -103,7 +103,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
         scale: factor from the unit of the file to metres; 0.001 for millimetres.
 
     Raises:
-        InputError: The file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
+        InputError: the file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
             texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
             not a positive number.
     """
@@ -181,7 +181,7 @@ def _mesh_in(folder: Path) -> Path | None:
     """Return the mesh file of a directory: `textured.*`, else the only GLB, else the only mesh file; None without any.
 
     Raises:
-        InputError: There are several mesh files, and none takes precedence.
+        InputError: there are several mesh files, and none takes precedence.
     """
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
     named = [file for file in files if file.stem.lower() == "textured"]
@@ -206,9 +206,9 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
             `read_names`. By default every scan is an object under its own name.
 
     Raises:
-        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` is damaged or
+        InputError: the directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` is damaged or
             has an unknown scan, or `check_name` refuses the name of an object.
-        OSError: The file `names` cannot be opened.
+        OSError: the file `names` cannot be opened.
     """
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
@@ -273,8 +273,8 @@ def read_names(path: str | Path) -> dict[str, str]:
     """Read a table of object name -> scan from a file, JSON if its name ends with .json and YAML otherwise.
 
     Raises:
-        InputError: The file is missing, damaged, empty, or not a flat table of strings.
-        OSError: The file cannot be opened.
+        InputError: the file is missing, damaged, empty, or not a flat table of strings.
+        OSError: the file cannot be opened.
     """
     with with_context(f"names file {path}"):
         table = read_table(Path(path))

@@ -267,7 +267,7 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
         every: take every `every`-th frame.
 
     Raises:
-        InputError: the recording has no complete frame, or `Bag` raises it. Frames before a later damage are returned.
+        InputError: the recording has no complete frame; also as `Bag`. Frames before a later damage are returned.
         OSError: the recording cannot be opened.
     """
     recording = _Recording(open_bag, every)

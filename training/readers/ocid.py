@@ -53,7 +53,7 @@ class OCID(LabelledFrames):
             names: YAML or JSON file, see the module.
 
         Raises:
-            InputError: There are no frames, or `names` is damaged, lacks sequences (listed in the message), or is a
+            InputError: there are no frames, or `names` is damaged, lacks sequences (listed in the message), or is a
                 table of OCID-VLG without any of the frames.
             OSError: `names` cannot be opened.
         """
@@ -86,7 +86,7 @@ class OCID(LabelledFrames):
         """Read a frame, its names, and the place, the camera and the type of its sequence.
 
         Raises:
-            InputError: as indexing does, the cloud does not fit a pinhole camera, or a label has no name.
+            InputError: the cloud does not fit a pinhole camera, or a label has no name; also as indexing.
         """
         sequence = sequence_of(self.identifiers[number])
         image, depth_file, label_file, cloud_file = self.files(number)

@@ -57,7 +57,7 @@ def padded_batches(
         The number of clouds in the batch without the empty ones, and the batch, padded by `batch_points`.
 
     Raises:
-        InputError: A cloud has more points than the largest bucket.
+        InputError: a cloud has more points than the largest bucket.
     """
     empty: Cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     for start in range(0, len(clouds), CLOUDS_PER_BATCH):
@@ -131,7 +131,7 @@ class ViewSource(Protocol):
         """Read the crops of the views of a shard, in their order, with sides of `size` pixels.
 
         Raises:
-            InputError: There are no crops, or they are smaller.
+            InputError: there are no crops, or they are smaller.
         """
 
 
@@ -154,7 +154,7 @@ def normalize_views(
         boundary: points on the occlusion boundary, see `padded_batches`.
 
     Raises:
-        InputError: A cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
+        InputError: a cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
     xyz = [np.zeros((0, 3), np.float32)]
     # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory.
@@ -205,7 +205,7 @@ class MemoryViews:
         """Normalize the views of a class.
 
         Raises:
-            InputError: A cloud has more points than the largest bucket, or is too long.
+            InputError: a cloud has more points than the largest bucket, or is too long.
         """
         clouds = self._clouds[index]
         return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)
@@ -287,7 +287,7 @@ def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
         Sequence -> views of its objects.
 
     Raises:
-        InputError: The table is unreadable or empty, a sequence is not a relative path, or the source has no views of
+        InputError: the table is unreadable or empty, a sequence is not a relative path, or the source has no views of
             an object.
     """
     sources: dict[str, ViewSource] = {}

@@ -80,7 +80,7 @@ def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -
         Name of each file -> its SHA-256.
 
     Raises:
-        InputError: a file does not exist, or `load_backbone` raises it.
+        InputError: a file does not exist; also as `load_backbone`.
     """
     digests = {}
     for model, name in backbones:
