@@ -73,7 +73,7 @@ class TrainJob:
 
     @property
     def stages(self) -> dict[str, float]:
-        """The stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
+        """The stages of the training of a run, see `Protocol.stages`; baselines are not included."""
         if self.meshes is None:
             return self.protocol.stages
         return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if self.crop_size is not None else {}) | self.protocol.stages
@@ -204,7 +204,7 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         return None
     if job.sequences is not None:
         raise InputError(
-            f"sequences is {job.sequences}; expected none with frames: the frames of each have other objects"
+            f"sequences is {job.sequences}; expected none with frames, since the runs are trained on different objects"
         )
     if "thor" in baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")

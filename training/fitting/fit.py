@@ -68,7 +68,7 @@ class FitContext:
     Attributes:
         feature: part of the descriptor that the classifier reads.
         network: colour network, which defines the colour regions and their similarity.
-        config: descriptor, as the samples were built with, but always in closed form, which is equal to gudhi's values.
+        config: descriptor of the samples, always in closed form, whose values equal those of gudhi.
     """
 
     feature: Feature

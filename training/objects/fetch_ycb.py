@@ -26,7 +26,7 @@ YCB_URL = "http://ycb-benchmarks.s3-website-us-east-1.amazonaws.com/data/google"
 LICENCE = (
     "The scans are those of the YCB Object and Model Set (Calli et al., IEEE Robotics and Automation Magazine 22(3), "
     "2015), licence CC BY 4.0, https://creativecommons.org/licenses/by/4.0/: whoever shares them, or pictures of them, "
-    "names this source."
+    "must name this source."
 )
 
 NAME = re.compile(r"\d{3}(-[a-z])?_[a-z0-9_-]+")

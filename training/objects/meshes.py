@@ -28,7 +28,7 @@ __all__ = [
     "scaled_meshes",
 ]
 
-# Otherwise what trimesh logs about a damaged file, also with a traceback, is printed on standard error.
+# Without a handler, Python prints trimesh's log of a damaged file on standard error, also with a traceback.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
@@ -206,8 +206,8 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
             `read_names`. By default every scan is an object under its own name.
 
     Raises:
-        InputError: the directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` is damaged or
-            has an unknown scan, or `check_name` refuses the name of an object.
+        InputError: the directory is missing or has no mesh, a scan exists twice or is ambiguous, or `names` is damaged
+            or has an unknown scan; also as `check_name`.
         OSError: the file `names` cannot be opened.
     """
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
@@ -250,7 +250,7 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
         name: name of the only object to find; None finds all objects of a folder, under their own names.
 
     Raises:
-        InputError: there is no such mesh, or `name` is None for a file.
+        InputError: there is no such mesh, or `name` is None for a file; also as `find_meshes`.
     """
     if not path.is_dir():
         if name is None:

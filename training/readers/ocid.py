@@ -2,7 +2,7 @@
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
 Two cameras record each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects.
-A YAML or JSON file does: sequence -> names in the order of placement, which is also the order of the labels:
+A YAML or JSON file gives the names: sequence -> names in the order of placement, which is the order of the labels:
 
     seq36: [mug, bowl, banana]                      # of both cameras
     table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
@@ -250,7 +250,7 @@ def _binary(data: bytes, record: np.dtype[Any], n: int, axes: list[int], path: P
     if len(data) < n * record.itemsize:
         raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
     records = np.frombuffer(data, record, count=n)
-    with np.errstate(invalid="ignore"):  # of signalling NaN
+    with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
         return np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
 
 

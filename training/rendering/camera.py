@@ -259,7 +259,7 @@ def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = T
     """Render colours and depth from a pose.
 
     Args:
-        caster: index of the object.
+        caster: ray-casting index of the object.
         pose: [4, 4] camera to object frame, as from `camera_pose`.
         camera: size and intrinsics of the whole image.
 

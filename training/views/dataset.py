@@ -7,8 +7,9 @@
         views = dataset.read(index)                # views.xyz, views.rgb, views.counts, views.label
 
 A dataset contains normalized point clouds, not images: for each object, one cloud per camera angle as rendered (`copy`
-0) and, if the job has augmentations, further clouds of augmented copies of the same view (`copy` 1, 2, ...). Views with
-too few points are left out. Its directory has `manifest.json` and shards, safetensors files with views of one object:
+0) and, if the job has augmentations, its augmented copies (`copy` 1, 2, ...), which are seen from random cameras. Views
+with too few points are left out. Its directory has `manifest.json` and shards, safetensors files with views of one
+object:
 
     xyz     [n, 3] uint16   points of all views, one view after the other, in `COORDINATE_STEP` scaled units
     rgb     [n, 3] uint8    sRGB

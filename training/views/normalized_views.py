@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 CLOUDS_PER_BATCH = 64
-"""Batch size of everything that is computed of the clouds of a training."""
+"""Batch size of all computations on the clouds of a training."""
 
 
 def padded_batches(
@@ -106,7 +106,7 @@ class SourceShard(NamedTuple):
 
 
 class ViewSource(Protocol):
-    """Normalized views in shards of one object each: a `ViewDataset` on disk, or `MemoryViews`."""
+    """Normalized views in shards of one object each, such as a `ViewDataset` on disk or `MemoryViews`."""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -252,8 +252,8 @@ def fold_of_views(
 ) -> NDArray[np.intp]:
     """Return the fold of each cloud [M], from 0; the views of every class are distributed randomly and evenly.
 
-    All clouds of a view (mirrored and augmented copies) are in the same fold. They are nearly equal, so otherwise the
-    held-out set would be known from training.
+    All clouds of a view (mirrored and augmented copies) are in the same fold, since nearly equal clouds in the training
+    set would raise the held-out accuracy.
 
     Args:
         label: [M], index into `classes`.
