@@ -59,7 +59,7 @@ class ServiceModel:
         config: configuration of the descriptor.
         color_network: fingerprint of the colour network.
         teaches: whether objects can be enrolled and forgotten.
-        segmenter: segmenter of frames without labels; None if the service rejects such frames.
+        segmenter: segmenter of frames without labels; None if the service refuses such frames.
     """
 
     classes: tuple[str, ...]

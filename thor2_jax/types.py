@@ -149,7 +149,7 @@ def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
 
 
 def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert to float32. Values that are too large become infinite without a warning; the caller rejects them."""
+    """Convert to float32. Values that are too large become infinite without a warning; the caller refuses them."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 

@@ -40,13 +40,13 @@ class TrainJob:
     Attributes:
         out: run directory; with `sequences`, the directory that contains the run directories.
         protocol: the settings of the runs and of their views.
-        meshes: directory of meshes, or name -> mesh in metres (then `names` and `mesh_scale` are not used). Their views
+        meshes: folder of meshes, or name -> mesh in metres (then `names` and `mesh_scale` are not used). Their views
             are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`; their instances are used as views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         baselines: any of `BASELINES`.
-        weights: directory of pretrained weights for the image networks; None trains them from scratch.
+        weights: folder of pretrained weights for the image networks; None trains them from scratch.
         leave_out: objects to leave out of the training.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
         workers: rendering processes.

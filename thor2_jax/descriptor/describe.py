@@ -264,7 +264,7 @@ def describe_stream(
         Descriptors of up to `batch` clouds, as NumPy arrays.
 
     Raises:
-        InputError: `batch` is not positive, or `PointClouds.pack` rejects a cloud; the message gives the index of the
+        InputError: `batch` is not positive, or `PointClouds.pack` refuses a cloud; the message gives the index of the
             cloud in its batch.
     """
     if batch < 1:

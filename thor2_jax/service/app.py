@@ -107,7 +107,7 @@ def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
 
 @contextlib.contextmanager
 def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
-    """Reject new requests as soon as the signal arrives; the server closes its connections later."""
+    """Refuse new requests as soon as the signal arrives; the server closes its connections later."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

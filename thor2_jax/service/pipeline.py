@@ -165,7 +165,7 @@ class Service:
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
     def stop_accepting(self) -> None:
-        """Reject new requests; requests in progress are still answered."""
+        """Refuse new requests; requests in progress are still answered."""
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
 
@@ -299,7 +299,7 @@ class Service:
 
         Args:
             change: function that changes a copy of the gallery.
-            refused: status if the gallery rejects the change.
+            refused: status if the gallery refuses the change.
             field: field of the request that the error then names.
             request: the request.
 

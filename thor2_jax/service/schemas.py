@@ -241,7 +241,7 @@ class ModelAnswer(BaseModel):
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
     color_network: str = Field(description="Fingerprint of the colour network.")
     teaches: bool = Field(description="Whether objects can be enrolled and forgotten.")
-    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are rejected.")
+    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are refused.")
 
 
 class ObjectAnswer(BaseModel):

@@ -36,7 +36,7 @@ class Settings:
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: whether callers may enroll and forget objects.
         adapt: whether the camera's colour transform is estimated from the latest frames and applied.
-        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None rejects
+        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
             them. Default: the result of `default_segmenter`.
         allow_host: names that the header Host may have, besides loopback names and the address of the connection.
         warm_why: whether explanations are compiled in the background after the start, or from the first request on.

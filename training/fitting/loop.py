@@ -238,7 +238,7 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
     """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
 
     Raises:
-        InputError: a training is not finished. Other paths that are not run directories are rejected on loading.
+        InputError: a training is not finished. Other paths that are not run directories are refused on loading.
     """
     directories: list[Path] = []
     for path in map(Path, paths):

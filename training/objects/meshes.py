@@ -35,7 +35,7 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
-"""Range of an object's longest side, metres; rejects scans in millimetres and keeps the camera outside the object."""
+"""Range of an object's longest side, metres; refuses scans in millimetres and keeps the camera outside the object."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -178,7 +178,7 @@ def _parsed(path: Path) -> TexturedMesh:
 
 
 def _mesh_in(folder: Path) -> Path | None:
-    """Return the mesh file of a directory: `textured.*`, else the only GLB, else the only mesh file; None without any.
+    """Return the mesh file of a folder: `textured.*`, else the only GLB, else the only mesh file; None without any.
 
     Raises:
         InputError: there are several mesh files, and none takes precedence.
@@ -200,13 +200,13 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     """Find mesh files: object name -> file, sorted by name.
 
     Args:
-        folder: directory with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subdirectories with one mesh file each, or
+        folder: folder with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subfolders with one mesh file each, or
             both.
-        names: object name -> scan (a subdirectory's name or a file's stem), or a file with this table, see
+        names: object name -> scan (a subfolder's name or a file's stem), or a file with this table, see
             `read_names`. By default every scan is an object under its own name.
 
     Raises:
-        InputError: the directory is missing or has no mesh, a scan exists twice or is ambiguous, or `names` is damaged
+        InputError: the folder is missing or has no mesh, a scan exists twice or is ambiguous, or `names` is damaged
             or has an unknown scan; also as `check_name`.
         OSError: the file `names` cannot be opened.
     """

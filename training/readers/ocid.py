@@ -172,7 +172,8 @@ def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
     errors, not the pixels: in the dataset's clouds z is a mean over time, x and y are not.
 
     Raises:
-        InputError: there are too few points, or they do not lie on the rays of a pinhole camera.
+        InputError: there are too few points, or they do not lie on the rays of a pinhole camera; the message has the
+            fit.
     """
     row, column = np.nonzero(np.isfinite(points).all(axis=-1) & (points[..., 2] > 0))
     if len(row) == 0 or np.ptp(row) == 0 or np.ptp(column) == 0:

@@ -74,7 +74,7 @@ def read_instances(
 
     Raises:
         InputError: a folder or a frame cannot be read, or an object has no usable view. Instances with a name that
-            `check_name` rejects are skipped.
+            `check_name` refuses are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
     crops: dict[str, list[QuantizedCrop]] = {}
