@@ -81,7 +81,7 @@ class KnownObject:
         trained: whether the classifiers have an output for it.
         views: number of enrolled views.
         source: source of the views: "frames", "mesh" or "mesh and frames"; None without views.
-        date: date of the last enrolment, ISO 8601; None without views.
+        date: date of the last enrollment, ISO 8601; None without views.
     """
 
     name: str
@@ -93,7 +93,7 @@ class KnownObject:
 
 @dataclasses.dataclass(frozen=True)
 class EnrolledObject(KnownObject):
-    """An object after its enrolment.
+    """An object after its enrollment.
 
     Attributes:
         generation: generation of the gallery, for `undo`.

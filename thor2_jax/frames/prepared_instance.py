@@ -278,7 +278,7 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
-    """Prepare one instance of a frame for enrolment or explanation.
+    """Prepare one instance of a frame for enrollment or explanation.
 
     Args:
         frame: the frame.

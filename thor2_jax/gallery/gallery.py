@@ -138,7 +138,7 @@ class GalleryObject:
         embeddings: [E, D] float16 of unit length: several looks at each view, and its augmented copies.
         clouds: the views as they were enrolled.
         source: source of the views: "mesh", "frames" or "mesh and frames".
-        date: date of the last enrolment, ISO 8601.
+        date: date of the last enrollment, ISO 8601.
         file: name of its file in the gallery on disk; None until it is written.
     """
 
@@ -171,7 +171,7 @@ class Gallery:
 
     Attributes:
         embedding: fingerprint of the embedding of the views.
-        objects: name -> its views, in the order of enrolment.
+        objects: name -> its views, in the order of enrollment.
         trained: class names of the run, in the order of the classifiers' outputs.
         hidden: trained classes that were forgotten or replaced; the classifiers' outputs for them are ignored.
         references: reference views of the embedding; None if it has none.

@@ -111,7 +111,7 @@ def _warm_up(name: str) -> None:
 
 
 def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance for enrolment or explanation.
+    """Decode a frame and compute the cloud of one instance for enrollment or explanation.
 
     Raises:
         RequestError: 422 if there is no such instance or it has too few points; also as `prepare_frame`.

@@ -88,7 +88,7 @@ class InstanceAnswer(BaseModel):
     top: dict[str, list[Candidate]] = Field(
         description="Five most probable classes of each classifier, and of the gallery."
     )
-    occluded: bool = Field(description="Partly hidden by another instance or cut off by the image border.")
+    occluded: bool = Field(description="Partly occluded by another instance or cut off by the image border.")
     overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
     points_used: int = Field(description="Number of points of the described cloud.")
     kept_by_fallback: bool = Field(description="Outlier removal was relaxed because it would have removed most points.")
@@ -251,7 +251,7 @@ class ObjectAnswer(BaseModel):
     trained: bool = Field(description="Whether the classifiers have an output for it.")
     views: int = Field(description="Number of enrolled views.")
     source: str | None = Field(description="Source of the views: frames, mesh, or mesh and frames; null without views.")
-    date: str | None = Field(description="Date of the last enrolment, ISO 8601; null without views.")
+    date: str | None = Field(description="Date of the last enrollment, ISO 8601; null without views.")
 
 
 class ObjectsAnswer(BaseModel):
@@ -268,7 +268,7 @@ class ChangeAnswer(BaseModel):
 
 
 class EnrolmentAnswer(ObjectAnswer, ChangeAnswer):
-    """The object after its enrolment."""
+    """The object after its enrollment."""
 
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, gallery, total.")
 

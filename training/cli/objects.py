@@ -25,7 +25,7 @@ def objects(
         ),
     ] = False,
 ) -> None:
-    """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
+    """List the trained classes and the enrolled objects: number of views, source and date of enrollment."""
     from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, load_gallery
     from thor2_jax.model.run_record import read_description
 
