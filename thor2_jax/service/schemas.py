@@ -194,7 +194,7 @@ class WhyAnswer(BaseModel):
         description="Loss of the margin without the tenth of the points that supports the name most."
     )
     mean_loss_without_random_tenth: float = Field(description="Mean loss without a random tenth of the points.")
-    changes: list[str] = Field(description="Smallest changes of colour and extents to another name, in words.")
+    changes: list[str] = Field(description="Smallest changes of colour and side lengths to another name, in words.")
     pictures: list[WhyPicture]
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, explain, total.")
 
@@ -319,7 +319,7 @@ _FRAME: dict[str, Any] = {
         "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
     },
 }
-_INSTANCE = {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."}
+_INSTANCE = {"type": "integer", "minimum": 0, "description": "Label number of the object."}
 
 FRAME_FORM = _form(_FRAME, "labels")
 """OpenAPI schema of the body of /v1/recognize. `decoding` parses it, since FastAPI writes large files to disk."""
