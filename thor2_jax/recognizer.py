@@ -105,7 +105,7 @@ class Recognizer:
 
         Args:
             run: the trained run.
-            unknown_below: least confidence, from 0 to 1, of an answer with a name; by default see `Model.thresholds`.
+            unknown_below: lowest confidence, from 0 to 1, of an answer with a name; by default see `Model.thresholds`.
             rule: fusion rule, see `fusion`; the paper's is "max".
             embedding: embedding of the gallery; by default that of the run, or the packaged one. An embedding that was
                 fitted on the run's classes is also a classifier.
@@ -189,7 +189,7 @@ class Recognizer:
         return self._model.color_transform
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
-        """Return the least confidence [n] of an answer with each name of `classes`; see `Model.thresholds`."""
+        """Return the lowest confidence [n] of an answer with each name of `classes`; see `Model.thresholds`."""
         return self.model.thresholds(answer_by)
 
     def enroll(

@@ -128,7 +128,7 @@ def slices_and_strips(
 
 
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
-    """Return the least and the greatest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
+    """Return the smallest and the largest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
 
     Points whose segment number is `n_segments` or more are dropped. Tied points share the gradient of an extreme.
     """

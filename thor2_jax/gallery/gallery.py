@@ -277,7 +277,7 @@ class Gallery:
 
     @functools.cached_property
     def unknown_below(self) -> NDArray[np.float64]:
-        """Default thresholds [n_objects]: the least confidence of an answer with the name of each object.
+        """Default thresholds [n_objects]: the lowest confidence of an answer with the name of each object.
 
         They follow from scores that are interpolated in `KEPT`, linearly in the logarithm of the number of views.
         """

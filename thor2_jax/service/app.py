@@ -38,7 +38,7 @@ from thor2_jax.service.signals import handlers_replaced
 __all__ = ["create_app"]
 
 WHY_SECONDS = 90.0
-"""Least deadline of an explanation, since explanations wait for one another."""
+"""Shortest deadline of an explanation, since explanations wait for one another."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)

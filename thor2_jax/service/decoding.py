@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 MAX_BODY = 16 * 2**20
-"""Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
+"""Largest size of a request body, and of the arrays it decompresses to, in bytes."""
 
 MAX_UPLOAD_PIXELS = 1920 * 1080
-"""Maximum number of pixels of an image."""
+"""Largest number of pixels of an image."""
 
 MAX_INSTANCES = 256
-"""Maximum number of instances in a frame."""
+"""Largest number of instances in a frame."""
 
 MAX_INTRINSICS_BYTES = 4096
-"""Maximum size of the intrinsics file."""
+"""Largest size of the intrinsics file."""
 
 CloudArrays = list[tuple[NDArray[np.float32], NDArray[np.uint8]]]
 """Points [n, 3] in metres and sRGB colours [n, 3] of each cloud."""

@@ -33,10 +33,10 @@ from thor2_jax.service.signals import signals_blocked
 __all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
 MAX_LABEL_RUNS = 50_000
-"""Maximum number of runs in the label map of an explained frame."""
+"""Largest number of runs in the label map of an explained frame."""
 
 MIN_SECONDS = 1.0
-"""Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
+"""Shortest time that a process has for a request, so that only exceptionally slow requests are interrupted."""
 
 
 @contextlib.contextmanager

@@ -51,16 +51,16 @@ NPZ = "application/octet-stream"
 FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels), clouds, device, total."
 
 MAX_POINTS = POINT_BUCKETS[-1]
-"""Maximum number of points of a cloud."""
+"""Largest number of points of a cloud."""
 
 MAX_CLOUD_COORDINATE = 100.0
 """Largest absolute value of a coordinate of a cloud, in metres."""
 
 MAX_CLOUDS = 32
-"""Maximum number of clouds in a request."""
+"""Largest number of clouds in a request."""
 
 MAX_EXPLAINED = 32
-"""Maximum number of instances of a frame that are explained."""
+"""Largest number of instances of a frame that are explained."""
 
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
