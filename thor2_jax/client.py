@@ -204,11 +204,11 @@ class Client(_Connection):
         return self._send("POST", "/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
 
     def model(self) -> ServiceModel:
-        """Return the model of the service. Raises as `describe`."""
+        """Return the model of the service; raise errors as `describe`."""
         return self._send("GET", "/v1/model", _model)
 
     def objects(self) -> list[KnownObject]:
-        """Return the objects that the service can recognize. Raises as `describe`."""
+        """Return the objects that the service can recognize; raise errors as `describe`."""
         return self._send("GET", "/v1/objects", _objects)
 
     def enroll(

@@ -138,7 +138,7 @@ class Recognizer:
         reembed: bool = False,
         chunk: int = CHUNK,
     ) -> "Recognizer":
-        """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
+        """Read a run directory; raise errors as `run_directory.load_run`, `load_gallery` and `Recognizer`.
 
         Args:
             run_dir: the run directory.

@@ -114,7 +114,7 @@ def persistence_images(
 
     Args:
         diagrams: fields [..., J].
-        config: static.
+        config: settings of the descriptor. Static.
         variance: [], variance of the Gaussian; by default `config.image_variance`.
         persistence_weight: [], exponent n; by default `config.persistence_weight`.
 

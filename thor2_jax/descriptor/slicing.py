@@ -109,7 +109,7 @@ def slices_and_strips(
         x: [N] float32, scaled units, first octant.
         z: [N] float32, likewise.
         mask: [N] bool.
-        config: static.
+        config: settings of the descriptor. Static.
 
     Returns:
         Two [N] int32 arrays. Numbers may lie outside the descriptor; the numbers of padding are meaningless.
@@ -153,7 +153,7 @@ def strips_of_cloud(
         mask: [N] bool.
         region_set: [N] int32, row of `sets.weights` for each point, as `color_sets` returns it.
         sets: the region sets of the colour network.
-        config: static.
+        config: settings of the descriptor. Static.
     """
     n_segments = config.n_slices * config.n_strips
     x, y, z = points

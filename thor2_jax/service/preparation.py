@@ -138,7 +138,7 @@ def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
 
 
 def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
-    """Decode the clouds of a request body. Raises RequestError."""
+    """Decode the clouds of a request body; raise RequestError if they are invalid."""
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
         clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)

@@ -145,7 +145,7 @@ def train_step(
     """Make one step of Adam.
 
     Args:
-        context: static.
+        context: constants of the fit. Static.
         graph: the classifier without its arrays, from `initial_state`. Static.
         state: state before the step; it is donated and cannot be used afterwards.
         batch: batch on the devices, from `shard_batch`.

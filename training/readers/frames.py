@@ -237,7 +237,7 @@ def _listed(labels: Iterable[int]) -> str:
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Read `labels.json`: label -> name of the object; raises InputError and OSError."""
+    """Read `labels.json`: label -> name of the object; raise InputError or OSError if it is unusable."""
     content = read_file(path)
     with decoding(f"{path} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
         entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
