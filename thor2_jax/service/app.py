@@ -167,7 +167,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})
     async def why(request: Request) -> schemas.WhyAnswer:
-        """Explain the answer for one instance: the contributions of points, and the smallest changes to another answer.
+        """Explain the answer for one instance: the attributions of points, and the smallest changes to another answer.
 
         The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
@@ -274,7 +274,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
-        """Forget an object: remove its views, and never answer with its trained class again."""
+        """Forget an object: remove its views; a trained class is no longer predicted."""
         async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # The request has no body.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
