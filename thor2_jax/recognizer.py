@@ -224,7 +224,7 @@ class Recognizer:
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
 
     def forget(self, name: str) -> None:
-        """Forget an object: remove its views, and never answer its trained class again.
+        """Forget an object: remove its views; a trained class is no longer predicted.
 
         Every answer is then as if the object had not been enrolled.
 

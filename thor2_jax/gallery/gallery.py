@@ -231,7 +231,7 @@ class Gallery:
         return dataclasses.replace(self, objects=objects, hidden=hidden)
 
     def without(self, name: str) -> "Gallery":
-        """Return the gallery without an object, and with a trained class of this name hidden.
+        """Return the gallery without an object, and with a trained class of this name hidden (no longer predicted).
 
         Raises:
             InputError: no object and no class has the name.
