@@ -177,7 +177,7 @@ class FitTask:
         source: views of the run.
         run: the run. Its fold is held out, unless it is the only fold.
         directory: directory of the run.
-        weights: directory of pretrained weights; None trains networks from scratch.
+        weights: folder of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 

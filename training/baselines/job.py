@@ -117,7 +117,7 @@ def train_baselines(
         source: the views on which the run was trained; the held-out views of its fold are held out here, too.
         names: names from BASELINES, in the same order.
         progress: called with (stage, done, total, note).
-        weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
+        weights: folder of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
     Raises:

@@ -69,7 +69,7 @@ def weights_file(directory: Path, name: str) -> Path:
     """
     path = directory / f"{name}.safetensors"
     if not path.is_file():
-        raise InputError(f"weights: {path} does not exist; expected it in the directory, see docs/baselines.md")
+        raise InputError(f"weights: {path} does not exist; expected it in the folder, see docs/baselines.md")
     return path
 
 
