@@ -111,7 +111,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
         f"Orange pixels support {explanation.name}, blue pixels oppose it, and grey pixels have little influence. If "
         "the outline decides, few pixels are coloured: the width of a strip depends only on its outermost points."
     )
-    return ExplanationPicture("photo", "decided", "What decided, on the photo", caption, figure)
+    return ExplanationPicture("photo", "decided", "What decided, on the colour image", caption, figure)
 
 
 def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
