@@ -13,7 +13,7 @@ RUN pip install --no-cache-dir -c constraints.txt '.[serve,segment]' \
 USER thor2
 WORKDIR /
 EXPOSE 8080
-# /readyz returns 503 until the programs are compiled (about twenty seconds).
+# /readyz returns 503 until the programs are compiled (up to a minute).
 HEALTHCHECK --interval=10s --timeout=3s --start-period=120s \
     CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8080/readyz', timeout=2)"]
 ENTRYPOINT ["thor2", "serve", "--model", "/run-folder", "--host", "0.0.0.0", "--port", "8080"]

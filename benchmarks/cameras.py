@@ -6,11 +6,11 @@ file has the mean and the standard deviation over the runs of
 
 accuracy              mean over placements, for all frames and by group (directory) of frames
 accuracy_of_instances
-steadiness            share of neighbouring frames with the most frequent answer of their placement
+steadiness            fraction of instances with the most frequent answer of their placement
 calibration_error     expected calibration error on known objects
 auroc                 known against unknown objects, by the confidence
-unknown_named         share of unknown objects that are named at a threshold that keeps 95 % of the correct answers
-kept_at_threshold, unknown_named_at_threshold    the two shares at the threshold stored in the run
+unknown_named         fraction of unknown objects that are named at a threshold that keeps 95 % of the correct answers
+kept_at_threshold, unknown_named_at_threshold    the two fractions at the threshold stored in the run
 
 on the original frames, for each camera, and for all cameras together. Labelled objects that are not classes of the runs
 are unknown objects; names that match --ignore are left out. Placements are found in the original frames and counted
@@ -174,7 +174,7 @@ def _measure(
     known = [each for each in labelled if each[0].truth in classes]
     unknown = [instance for instance, _, _ in labelled if instance.truth not in classes]
     if not known:
-        raise InputError(f"frames: no instance is of a class of the runs, which know {', '.join(classes[:5])}, ...")
+        raise InputError(f"frames: no instance is of a class of the runs, which have {', '.join(classes[:5])}, ...")
     instances = [instance for instance, _, _ in known]
     described_unknown = [instance for instance in unknown if instance.probabilities is not None]
     fused, others = fuse_answers(instances, runs, rule), fuse_answers(described_unknown, runs, rule)
@@ -215,7 +215,7 @@ def _measure(
 def at_threshold(
     threshold: float, confidence: NDArray[np.floating], correct: NDArray[np.bool_], of_unknown: NDArray[np.floating]
 ) -> dict[str, float]:
-    """Return the shares of correct answers and of unknown objects above a threshold; NaN without a threshold."""
+    """Return the fractions of correct answers and of unknown objects above a threshold; NaN without a threshold."""
     kept, named = (
         float((values >= threshold).mean()) if threshold and len(values) else np.nan
         for values in (confidence[correct], of_unknown)

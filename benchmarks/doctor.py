@@ -1,4 +1,4 @@
-"""Benchmark of `thor2 doctor`: share of damaged set-ups with a right diagnosis, and of sound frames without findings.
+"""Benchmark of `thor2 doctor`: fraction of damaged set-ups diagnosed correctly, and of sound frames without findings.
 
     python -m benchmarks.doctor --data ../shared/data --model run --out benchmarks/results/doctor.json
 

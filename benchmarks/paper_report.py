@@ -129,7 +129,7 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 
 def draw_claims(report: Mapping[str, Any], path: Path) -> None:
-    """Draw the differences of the default rule with their intervals, coloured by verdict (PNG); raises OSError."""
+    """Draw the differences of the default rule with intervals, coloured by verdict (PNG); raise OSError on failure."""
     datasets = report["datasets"]
     n_rows = max(len(results["claims"][DEFAULT_RULE]) for results in datasets.values())
     figure = Figure(figsize=(6.5 * len(datasets), 0.42 * n_rows + 1.5), layout="constrained")

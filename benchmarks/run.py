@@ -115,7 +115,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
 
 
 def align_share(clouds: list[Any], rounds: int = 20) -> float:
-    """Return the share of the alignment in the time of the pipeline (closed form), as the median over rounds."""
+    """Return the fraction of the alignment in the time of the pipeline (closed form), as the median over rounds."""
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     shares = []
     for _ in range(rounds):

@@ -186,7 +186,7 @@ def arguments() -> tuple[argparse.ArgumentParser, argparse.Namespace]:
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--azimuth-step", type=float, default=40.0, help="degrees between training views")
     parser.add_argument("--polar-step", type=float, default=45.0, help="degrees between training views")
-    parser.add_argument("--meshes", type=Path, help="directory of meshes, instead of the built-in objects")
+    parser.add_argument("--meshes", type=Path, help="folder of meshes, instead of the built-in objects")
     parser.add_argument("--names", type=Path, help="table: object name -> mesh (default: all meshes)")
     parser.add_argument(
         "--evaluate-uwis", type=Path, nargs="+", default=[], help="datasets in the layout of UW-IS Occluded"

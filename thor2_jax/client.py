@@ -59,7 +59,7 @@ class ServiceModel:
         config: configuration of the descriptor.
         color_network: fingerprint of the colour network.
         teaches: whether objects can be enrolled and forgotten.
-        segmenter: segmenter of frames without labels; None if the service rejects such frames.
+        segmenter: segmenter of frames without labels; None if the service refuses such frames.
     """
 
     classes: tuple[str, ...]
@@ -81,7 +81,7 @@ class KnownObject:
         trained: whether the classifiers have an output for it.
         views: number of enrolled views.
         source: source of the views: "frames", "mesh" or "mesh and frames"; None without views.
-        date: date of the last enrolment, ISO 8601; None without views.
+        date: date of the last enrollment, ISO 8601; None without views.
     """
 
     name: str
@@ -93,7 +93,7 @@ class KnownObject:
 
 @dataclasses.dataclass(frozen=True)
 class EnrolledObject(KnownObject):
-    """An object after its enrolment.
+    """An object after its enrollment.
 
     Attributes:
         generation: generation of the gallery, for `undo`.
@@ -204,11 +204,11 @@ class Client(_Connection):
         return self._send("POST", "/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
 
     def model(self) -> ServiceModel:
-        """Return the model of the service. Raises as `describe`."""
+        """Return the model of the service; raise errors as `describe`."""
         return self._send("GET", "/v1/model", _model)
 
     def objects(self) -> list[KnownObject]:
-        """Return the objects that the service can recognize. Raises as `describe`."""
+        """Return the objects that the service can recognize; raise errors as `describe`."""
         return self._send("GET", "/v1/objects", _objects)
 
     def enroll(

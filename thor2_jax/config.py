@@ -17,7 +17,7 @@ from thor2_jax.errors import InputError
 __all__ = ["DESCRIPTOR_VERSION", "LOOK_COUNTS", "DescriptorConfig", "Relaxation"]
 
 DESCRIPTOR_VERSION = 1
-"""Version of the descriptor's values, stored in every run directory; a run of another version is rejected."""
+"""Version of the descriptor's values, stored in every run directory; a run of another version is refused."""
 
 LOOK_COUNTS = (1, 2, 4)
 """Allowed numbers of looks at a cloud; the paper uses 1."""

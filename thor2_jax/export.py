@@ -47,7 +47,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         "embedding"; its probabilities sum to the probability that the object is one of the classes.
 
     Raises:
-        InputError: A size is not a bucket, or a platform is unknown.
+        InputError: a size is not a bucket, or a platform is unknown.
     """
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
         if value not in buckets:

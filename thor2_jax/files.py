@@ -73,7 +73,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         resumable: names that this command writes before the marker.
 
     Raises:
-        InputError: if the directory contains anything else, or cannot be written.
+        InputError: the directory contains anything else, or cannot be written.
     """
     directory = Path(directory)
     with _refusal_named(f"out: {directory} is not a directory"):
@@ -265,7 +265,7 @@ def parse_json(content: bytes) -> Any:
     """Return the value in a JSON file.
 
     Raises:
-        ValueError: if the file is damaged.
+        ValueError: the file is damaged.
     """
     try:
         return json.loads(content)
@@ -277,7 +277,7 @@ def parse_yaml(content: bytes) -> Any:
     """Return the value in a YAML file, built from plain types.
 
     Raises:
-        ValueError: if the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
+        ValueError: the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
     """
     import yaml
 
@@ -319,8 +319,8 @@ def read_table(path: Path, kinds: tuple[type, ...] = (dict,)) -> Any:
         kinds: types of a table; with `list`, a list counts as one.
 
     Raises:
-        InputError: if the file is damaged or contains something else; the message names the file.
-        OSError: if the file cannot be opened.
+        InputError: the file is damaged or contains something else; the message names the file.
+        OSError: the file cannot be opened.
     """
     content = read_file(path)
     try:

@@ -340,7 +340,7 @@ def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray
         prefix: prefix of the names.
 
     Raises:
-        ValueError: if an array is missing or has another shape.
+        ValueError: an array is missing or has another shape.
     """
     model = nnx.eval_shape(create)
     state, variables = _variables(model)

@@ -166,8 +166,8 @@ def images(
 
     Args:
         diagrams: births, deaths and mask [..., N], from `sublevel_diagrams` or any other source.
-        birth_range: least and greatest birth of the image. Static, as are the next two.
-        persistence_range: least and greatest persistence of the image.
+        birth_range: smallest and largest birth of the image. Static, as are the next two.
+        persistence_range: smallest and largest persistence of the image.
         pixels: number of pixels P along births, and Q along persistence.
         variance: [], variance of the Gaussian, positive (persim calls it `sigma`).
         exponent: [], exponent n of the weight, positive.

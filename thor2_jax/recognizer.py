@@ -105,7 +105,7 @@ class Recognizer:
 
         Args:
             run: the trained run.
-            unknown_below: least confidence, from 0 to 1, of an answer with a name; by default see `Model.thresholds`.
+            unknown_below: lowest confidence, from 0 to 1, of an answer with a name; by default see `Model.thresholds`.
             rule: fusion rule, see `fusion`; the paper's is "max".
             embedding: embedding of the gallery; by default that of the run, or the packaged one. An embedding that was
                 fitted on the run's classes is also a classifier.
@@ -138,7 +138,7 @@ class Recognizer:
         reembed: bool = False,
         chunk: int = CHUNK,
     ) -> "Recognizer":
-        """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
+        """Read a run directory; raise errors as `run_directory.load_run`, `load_gallery` and `Recognizer`.
 
         Args:
             run_dir: the run directory.
@@ -189,7 +189,7 @@ class Recognizer:
         return self._model.color_transform
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
-        """Return the least confidence [n] of an answer with each name of `classes`; see `Model.thresholds`."""
+        """Return the lowest confidence [n] of an answer with each name of `classes`; see `Model.thresholds`."""
         return self.model.thresholds(answer_by)
 
     def enroll(
@@ -224,7 +224,7 @@ class Recognizer:
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
 
     def forget(self, name: str) -> None:
-        """Forget an object: remove its views, and never answer its trained class again.
+        """Forget an object: remove its views; a trained class is no longer predicted.
 
         Every answer is then as if the object had not been enrolled.
 

@@ -45,7 +45,7 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
             y: ignored.
 
         Raises:
-            InputError: as in `transform`.
+            InputError: as `transform`.
         """
         self._check_parameters()
         self._clouds(X)

@@ -149,7 +149,7 @@ def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
 
 
 def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert to float32. Values that are too large become infinite without a warning; the caller rejects them."""
+    """Convert to float32. Values that are too large become infinite without a warning; the caller refuses them."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
@@ -215,8 +215,8 @@ class Strips:
     """The extremes and the colour vector of every strip of aligned clouds, from which descriptors are computed.
 
     Attributes:
-        low: [..., S, J] float32, least y of the points of the strip, scaled units; 0 if it is empty.
-        high: [..., S, J] float32, greatest y of the points of the strip, scaled units; 0 if it is empty.
+        low: [..., S, J] float32, smallest y of the points of the strip, scaled units; 0 if it is empty.
+        high: [..., S, J] float32, largest y of the points of the strip, scaled units; 0 if it is empty.
         occupied: [..., S, J] bool, True if the strip has a point.
         color: [..., S, J, R] float32, colour vectors Phi^j of the strips, the rows of the colour matrix C^i.
         overflow: [...] int32, number of points outside the grid of slices and strips.

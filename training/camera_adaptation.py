@@ -33,7 +33,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
         report: see `Recognizer.adapt`.
 
     Raises:
-        InputError: the run or a frame cannot be read, `out` is not empty, or `Recognizer.adapt` raises it. Nothing is
+        InputError: the run or a frame cannot be read, or `out` is not empty; also as `Recognizer.adapt`. Nothing is
             written.
         OSError: a file cannot be read or written. Nothing is written.
     """

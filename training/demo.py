@@ -198,7 +198,7 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
     )
     accuracy = (
         "Fraction of the instances that are recognized correctly. CE uses colour only, TOPS shape only, TOPS2 "
-        "both; THOR2 is the fusion of TOPS and TOPS2. Occlusion is low if 5 to 30 % of an object are hidden, "
+        "both; THOR2 is the fusion of TOPS and TOPS2. Occlusion is low if 5 to 30 % of an object are occluded, "
         "and high if more are."
     )
     descriptor = (

@@ -58,7 +58,7 @@ class FrameAnswer:
         return [] if self.frame is None else detections_of(self.frame, self.recognitions)
 
     def as_json(self) -> dict[str, Any]:
-        """Return {"frame", "instances"} or {"frame", "error"}; for recordings with "depth_gap" and detections."""
+        """Return {"frame", "instances"} or {"frame", "error"}; recordings add "depth_gap", boxes and positions."""
         line: dict[str, Any] = {"frame": self.name}
         if self.recorded is not None:
             line["depth_gap"] = self.recorded.gap / 1e9

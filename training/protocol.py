@@ -154,7 +154,7 @@ class Protocol:
         `epochs` also sets the epochs of the embedding. With `orientation_copies=0`, each view is also used mirrored.
 
         Raises:
-            InputError: A value of the fit is invalid.
+            InputError: a value of the fit is invalid.
         """
         given = {name: value for name, value in values.items() if value is not None}
         if given.get("orientation_copies") == 0 and self.orientation_copies:

@@ -40,13 +40,13 @@ class TrainJob:
     Attributes:
         out: run directory; with `sequences`, the directory that contains the run directories.
         protocol: the settings of the runs and of their views.
-        meshes: directory of meshes, or name -> mesh in metres (then `names` and `mesh_scale` are not used). Their views
+        meshes: folder of meshes, or name -> mesh in metres (then `names` and `mesh_scale` are not used). Their views
             are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`; their instances are used as views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         baselines: any of `BASELINES`.
-        weights: directory of pretrained weights for the image networks; None trains them from scratch.
+        weights: folder of pretrained weights for the image networks; None trains them from scratch.
         leave_out: objects to leave out of the training.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
         workers: rendering processes.
@@ -73,7 +73,7 @@ class TrainJob:
 
     @property
     def stages(self) -> dict[str, float]:
-        """The stages of the training of a run, see `Protocol.stages`; those of baselines are none of them."""
+        """The stages of the training of a run, see `Protocol.stages`; baselines are not included."""
         if self.meshes is None:
             return self.protocol.stages
         return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if self.crop_size is not None else {}) | self.protocol.stages
@@ -93,8 +93,8 @@ def run_train_job(
         Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
 
     Raises:
-        InputError: An option is invalid, or a directory holds results of another job.
-        OSError: A file cannot be written.
+        InputError: an option is invalid, or a directory holds results of another job.
+        OSError: a file cannot be written.
     """
     baselines = check_baselines(job.baselines)
     if job.weights is not None:
@@ -204,7 +204,7 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         return None
     if job.sequences is not None:
         raise InputError(
-            f"sequences is {job.sequences}; expected none with frames: the frames of each have other objects"
+            f"sequences is {job.sequences}; expected none with frames, since the runs are trained on different objects"
         )
     if "thor" in baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")

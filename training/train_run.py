@@ -88,7 +88,7 @@ def check_trained(digest: str, out: Path, settings: Protocol) -> None:
     """Check that a finished run was trained with these settings on views with this digest.
 
     Raises:
-        InputError: The run cannot be read, or was trained with another value; the message names it.
+        InputError: the run cannot be read, or was trained with another value; the message names it.
     """
     requested, record = settings.record(digest), finished_record(out)
     stored = {"orientation_copies": 0, **record, "dataset": record["dataset"]["digest"]}
@@ -100,7 +100,7 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     """Return the record of a finished run, or of its first fold.
 
     Raises:
-        InputError: The run cannot be read.
+        InputError: the run cannot be read.
     """
     return load_run(find_run_directories([out])[0]).record
 
@@ -129,7 +129,7 @@ def train_run(
         InputError: `out` holds something else, is in use by another process or was begun with other settings or views;
             a class has no views, or fewer views than folds; or the batch size is not a multiple of the number of
             devices. Nothing is written then. If a loss is not finite, the checkpoints written so far are kept.
-        OSError: A file cannot be written; the last complete checkpoints are kept.
+        OSError: a file cannot be written; the last complete checkpoints are kept.
     """
     out = Path(out).absolute()
     check_out(out)

@@ -142,7 +142,7 @@ def _text(text: str) -> str:
 
 
 def openapi() -> dict[str, Any]:
-    """Return the OpenAPI description of a service that teaches."""
+    """Return the OpenAPI description of a service with `--teach`."""
     from thor2_jax.service.app import create_app
     from thor2_jax.service.settings import Settings
 

@@ -34,7 +34,7 @@ def detect(client: Client, frame: RGBDFrame) -> list[Detection]:
 
     Raises:
         InputError: the service is too old to segment frames.
-        ServiceError: the service rejects the frame.
+        ServiceError: the service refuses the frame.
         OSError: the service cannot be reached.
     """
     millimetres = np.clip(np.round(frame.depth_m * MILLIMETRES), 0, 2**16 - 1).astype(np.uint16)

@@ -165,7 +165,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
     Args:
         aligned: clouds in scaled units, as `align` returns them.
         network: the colour network; only its regions are used.
-        config: static.
+        config: settings of the descriptor. Static.
     """
     check_batch(aligned)
     return strips_by_sets(aligned, region_sets(network), config)
@@ -215,7 +215,7 @@ def describe(
     Args:
         clouds: [B, N] clouds in metres.
         network: the colour network; it gives the colour regions and their similarity.
-        config: static.
+        config: settings of the descriptor. Static.
         parameters: replace the corresponding values of `network` and `config`.
 
     Returns:
@@ -256,7 +256,7 @@ def describe_stream(
     Args:
         clouds: pairs (xyz, rgb) as `PointClouds.pack` takes them, read lazily.
         network: the colour network.
-        config: static.
+        config: settings of the descriptor. Static.
         capacity: padded number of points; by default the bucket of each batch's largest cloud.
         batch: number of clouds described together; each value compiles once.
 
@@ -264,7 +264,7 @@ def describe_stream(
         Descriptors of up to `batch` clouds, as NumPy arrays.
 
     Raises:
-        InputError: `batch` is not positive, or `PointClouds.pack` rejects a cloud; the message gives the index of the
+        InputError: `batch` is not positive, or `PointClouds.pack` refuses a cloud; the message gives the index of the
             cloud in its batch.
     """
     if batch < 1:
@@ -328,7 +328,7 @@ def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: Descrip
     Args:
         clouds: as `shard_clouds` returns them.
         network: the colour network.
-        config: static.
+        config: settings of the descriptor. Static.
 
     Returns:
         Descriptors sharded like the clouds; a process reads its own descriptors through `addressable_shards`.

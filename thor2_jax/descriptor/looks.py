@@ -181,7 +181,7 @@ def describe_aligned_looks(
         aligned: [B * K, N] clouds, from `aligned_looks`.
         strips: strips of the clouds.
         network: colour network.
-        config: static.
+        config: settings of the descriptor. Static.
         count: K. Static.
     """
     return _group_by_cloud(describe_strips(strips, network, config), aligned, strips, config, count)
@@ -204,7 +204,7 @@ def describe_looks(
     Args:
         clouds: [B, N] clouds in metres.
         network: colour network.
-        config: static.
+        config: settings of the descriptor. Static.
         count: number of looks K, one of `LOOK_COUNTS`; by default `config.looks`. Static.
 
     Raises:

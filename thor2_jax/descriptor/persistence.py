@@ -2,7 +2,7 @@
 
 The diagrams are computed by gudhi, in one host callback for a batch, or by a closed form.
 
-In the filtration of a slice, strip j adds two vertices, its points of least and greatest y, at j s2, and the edge
+In the filtration of a slice, strip j adds two vertices, its points of smallest and largest y, at j s2, and the edge
 between them at j s2 + (y_max - y_min). Each strip is a separate connected component: one vertex dies when the edge is
 added, the other one never dies. The finite H0 pairs are therefore (j s2, j s2 + y_max - y_min), one for each strip;
 this is the closed form.
@@ -114,7 +114,7 @@ def persistence_images(
 
     Args:
         diagrams: fields [..., J].
-        config: static.
+        config: settings of the descriptor. Static.
         variance: [], variance of the Gaussian; by default `config.image_variance`.
         persistence_weight: [], exponent n; by default `config.persistence_weight`.
 

@@ -109,7 +109,7 @@ def slices_and_strips(
         x: [N] float32, scaled units, first octant.
         z: [N] float32, likewise.
         mask: [N] bool.
-        config: static.
+        config: settings of the descriptor. Static.
 
     Returns:
         Two [N] int32 arrays. Numbers may lie outside the descriptor; the numbers of padding are meaningless.
@@ -128,7 +128,7 @@ def slices_and_strips(
 
 
 def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
-    """Return the least and the greatest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
+    """Return the smallest and the largest `y` [N] of each segment, [n_segments] each; inf and -inf if it is empty.
 
     Points whose segment number is `n_segments` or more are dropped. Tied points share the gradient of an extreme.
     """
@@ -153,7 +153,7 @@ def strips_of_cloud(
         mask: [N] bool.
         region_set: [N] int32, row of `sets.weights` for each point, as `color_sets` returns it.
         sets: the region sets of the colour network.
-        config: static.
+        config: settings of the descriptor. Static.
     """
     n_segments = config.n_slices * config.n_strips
     x, y, z = points

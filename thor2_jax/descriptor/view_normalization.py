@@ -186,7 +186,7 @@ def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[j
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Return `turn(view_normalize(clouds, config), config)`: aligned clouds in scaled units, ready for slicing.
 
-    Raises InputError as both.
+    Raises InputError as `view_normalize` and `turn`.
     """
     return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 

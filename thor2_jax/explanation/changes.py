@@ -1,4 +1,4 @@
-"""Smallest changes of the colour or the extents of an object that lead to another answer.
+"""Smallest changes of the colour or the side lengths of an object that lead to another answer.
 
 Steps along the gradient of the relaxed descriptor give directions of change. Along each direction, the smallest change
 with another answer is searched for with the exact descriptor, whose frames are recomputed for every change.
@@ -82,7 +82,7 @@ def _changed(clouds: PointClouds, axes: jax.Array, parameters: jax.Array, kind: 
 def changed_instance(
     instance: PreparedInstance, kind: Kind, parameters: NDArray[np.floating], axes: NDArray[np.floating]
 ) -> PreparedInstance:
-    """Return an instance with another colour or other extents.
+    """Return an instance with another colour or other side lengths.
 
     Args:
         instance: the instance.

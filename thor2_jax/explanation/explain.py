@@ -72,7 +72,7 @@ class NearestView:
 
     Attributes:
         name: name of the object.
-        number: number of the view of the object, in the order of enrolment.
+        number: number of the view of the object, in the order of enrollment.
         similarity: largest cosine between embeddings of the looks at the instance and at the view, at most 1.
         view: cloud of the view.
     """

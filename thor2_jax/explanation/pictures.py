@@ -111,7 +111,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
         f"Orange pixels support {explanation.name}, blue pixels oppose it, and grey pixels have little influence. If "
         "the outline decides, few pixels are coloured: the width of a strip depends only on its outermost points."
     )
-    return ExplanationPicture("photo", "decided", "What decided, on the photo", caption, figure)
+    return ExplanationPicture("photo", "decided", "What decided, on the colour image", caption, figure)
 
 
 def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
@@ -170,13 +170,13 @@ def change_text(change: Change) -> str:
 def _changes(explanation: Explanation) -> ExplanationPicture:
     shown = [(f"as it is:\n{explanation.name}", explanation.instance)]
     for change in explanation.changes:
-        title = "other colour" if change.kind == "color" else "other extents"
+        title = "other colour" if change.kind == "color" else "other side lengths"
         changed = apply_change(explanation.instance, change, explanation.config)
         shown.append((f"{title}:\n{change.answer}", changed))
     figure = _clouds(shown, len(shown), 2.6)
     caption = (
-        "The smallest changes of the object's colour and of its extents that were found to give another answer. Each "
-        "was confirmed by recognizing the changed cloud."
+        "The smallest changes of the object's colour and of its side lengths that were found to give another answer. "
+        "Each was confirmed by recognizing the changed cloud."
     )
     return ExplanationPicture("changes", "changes", "Smallest changes that change the answer", caption, figure)
 

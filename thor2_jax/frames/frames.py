@@ -251,7 +251,7 @@ def pixel_points(pixels: NDArray[np.intp], depth_m: NDArray[Any], width: int, in
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
-    """Read an 8-bit RGB image [H, W, 3]; an alpha channel is dropped. Raises InputError and OSError as `read_frame`."""
+    """Read an 8-bit RGB image [H, W, 3] without its alpha channel; raise errors as `read_frame`."""
     pixels, mode = read_image(path, "color")
     if mode not in ("RGB", "RGBA"):
         raise InputError(f"color: {path} has the mode {mode}; expected 8-bit RGB")
@@ -259,7 +259,7 @@ def read_color(path: str | Path) -> NDArray[np.uint8]:
 
 
 def read_labels(path: str | Path) -> NDArray[Any]:
-    """Read a one-channel or indexed image [H, W] of integers. Raises InputError and OSError as `read_frame`."""
+    """Read a one-channel or indexed image [H, W] of integers; raise errors as `read_frame`."""
     pixels, _ = read_image(path, "labels", lossless=True)
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
         raise InputError(

@@ -44,7 +44,7 @@ rational model (ROS: rational_polynomial)."""
 
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
-"""Distortion models with OpenCV's coefficients; other models are rejected unless all coefficients are 0."""
+"""Distortion models with OpenCV's coefficients; other models are refused unless all coefficients are 0."""
 
 
 def _is_number(value: Any) -> bool:

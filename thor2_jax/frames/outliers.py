@@ -93,7 +93,7 @@ GRID_REACH = 100
 points outside count as one piece."""
 
 MIN_PIECE_SHARE = 0.1
-"""Least number of points in a kept piece, as a fraction of those in the largest piece."""
+"""Smallest number of points in a kept piece, as a fraction of those in the largest piece."""
 
 
 def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:

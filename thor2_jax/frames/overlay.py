@@ -1,4 +1,4 @@
-"""Pictures of recognized frames: the photo with the outline of each instance and a label with its answer.
+"""Pictures of recognized frames: the colour image with the outline of each instance and a label with its answer.
 
 draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
 """
@@ -96,7 +96,7 @@ class _Lettering(NamedTuple):
 def draw_overlay(
     color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
 ) -> None:
-    """Draw the answers for a frame on its photo, and write a PNG atomically.
+    """Draw the answers for a frame on its colour image, and write a PNG atomically.
 
     A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
 
@@ -130,7 +130,7 @@ def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[R
 
 
 def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:
-    """Return a photo with the outlines and labels of instances.
+    """Return a colour image with the outlines and labels of instances.
 
     Letters and outlines grow with the picture. Labels lie inside it, without overlap while there is space; the labels
     of the first annotations are placed first. Letters shrink if a label is wider than the picture; a label that does

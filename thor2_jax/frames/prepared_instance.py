@@ -50,7 +50,7 @@ RIM = 2
 """Width of the rim of a mask, pixels, where the mask may extend past the object."""
 
 MIN_POINTS = 30
-"""Least number of points on that grid; an instance with fewer cannot be used."""
+"""Smallest number of points on that grid; an instance with fewer cannot be used."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -162,10 +162,10 @@ MARGIN = max(STEPS, GAP + 1)
 """Width of the searched margin around the mask, pixels."""
 
 NEARER = 0.01
-"""Least distance, metres, by which the other instance must be nearer; depth noise between touching objects is less."""
+"""Smallest distance, metres, by which the other instance must be nearer; noise between touching objects is smaller."""
 
 MIN_BOUNDARY_SHARE = 0.05
-"""Least fraction of the contour that is occlusion boundary in an occluded instance; noise causes a smaller one."""
+"""Smallest fraction of the contour that is occlusion boundary in an occluded instance; noise causes a smaller one."""
 
 BACKGROUND, OUTSIDE = 0, -1
 """Values in place of a label: no instance, and outside the image."""
@@ -278,7 +278,7 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
-    """Prepare one instance of a frame for enrolment or explanation.
+    """Prepare one instance of a frame for enrollment or explanation.
 
     Args:
         frame: the frame.

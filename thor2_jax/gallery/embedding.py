@@ -57,12 +57,12 @@ REFERENCES_FILE = "references.safetensors"
 """File of the references, in the directory of the embedding."""
 
 BACKGROUND = -1
-"""Label of background views."""
+"""Label of the views of distractors, the background."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class References:
-    """Reference views: embedded views of the classes of a run, and of background objects, which are none of them.
+    """Reference views: embedded views of the classes of a run, and of the background, objects of none of them.
 
     The regression of a gallery includes them (`Gallery.scores`). So an enrolled object is recognized by its differences
     from the references, and even a gallery with a single object rejects unknown objects. With `EmbeddingSizes.views`,

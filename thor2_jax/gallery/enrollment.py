@@ -205,7 +205,7 @@ class ObjectGallery:
                 lost index.
 
         Raises:
-            InputError: see `refresh`.
+            InputError: as `refresh`.
             OSError: the gallery cannot be written; it is unchanged.
         """
         self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
@@ -230,7 +230,7 @@ class ObjectGallery:
         if few:
             return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
         if objects and references is None and not self.gallery.trained and len(objects) < FEW:
-            return f"{len(objects)} objects are enrolled in a run without background views; enroll more of them"
+            return f"{len(objects)} objects are enrolled in a run without reference views; enroll more of them"
         return ""
 
     def refresh(self) -> bool:
@@ -307,7 +307,7 @@ class ObjectGallery:
         self._change(change)
 
     def forget(self, name: str) -> None:
-        """Remove the views of an object, and never answer its trained class again.
+        """Remove the views of an object; a trained class is no longer predicted.
 
         Raises:
             InputError: no object has this name.

@@ -143,7 +143,7 @@ class GalleryObject:
         embeddings: [E, D] float16 of unit length: several looks at each view, and its augmented copies.
         clouds: the views as they were enrolled.
         source: source of the views: "mesh", "frames" or "mesh and frames".
-        date: date of the last enrolment, ISO 8601.
+        date: date of the last enrollment, ISO 8601.
         file: name of its file in the gallery on disk; None until it is written.
     """
 
@@ -176,7 +176,7 @@ class Gallery:
 
     Attributes:
         embedding: fingerprint of the embedding of the views.
-        objects: name -> its views, in the order of enrolment.
+        objects: name -> its views, in the order of enrollment.
         trained: class names of the run, in the order of the classifiers' outputs.
         hidden: trained classes that were forgotten or replaced; the classifiers' outputs for them are ignored.
         references: reference views of the embedding; None if it has none.
@@ -226,7 +226,7 @@ class Gallery:
             replace: discard the views of an existing object, and hide a trained class with this name.
 
         Raises:
-            InputError: see `check_name`; or the name exists and neither `extend` nor `replace` is given, or both are.
+            InputError: the name exists and neither `extend` nor `replace` is given, or both are; also as `check_name`.
         """
         name = self.name_to_enroll(name, extend=extend, replace=replace)
         if name in self.objects and extend:
@@ -236,7 +236,7 @@ class Gallery:
         return dataclasses.replace(self, objects=objects, hidden=hidden)
 
     def without(self, name: str) -> "Gallery":
-        """Return the gallery without an object, and with a trained class of this name hidden.
+        """Return the gallery without an object, and with a trained class of this name hidden (no longer predicted).
 
         Raises:
             InputError: no object and no class has the name.
@@ -282,7 +282,7 @@ class Gallery:
 
     @functools.cached_property
     def unknown_below(self) -> NDArray[np.float64]:
-        """Default thresholds [n_objects]: the least confidence of an answer with the name of each object.
+        """Default thresholds [n_objects]: the lowest confidence of an answer with the name of each object.
 
         They follow from scores that are interpolated in `KEPT`, linearly in the logarithm of the number of views.
         """
@@ -349,7 +349,7 @@ class Gallery:
         own = [name for name in self.answered_names if name not in toys]
         listed = first_names(own, MAX_LISTED)
         if toys:
-            others = f", and {listed}" if own else "; it knows nothing of yours"
+            others = f", and {listed}" if own else "; none of yours"
             return f"{len(toys)} toy objects of the demo{others}"
         return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
 

@@ -121,7 +121,7 @@ class Model:
         run: the trained run.
         classifiers: its compiled classifiers by name.
         gallery: the enrolled objects.
-        unknown_below: least confidence, from 0 to 1, of an answer with a name; None for the defaults in `thresholds`.
+        unknown_below: lowest confidence, from 0 to 1, of an answer with a name; None for the defaults in `thresholds`.
         rule: fusion rule of the classifiers, see `fusion`; the paper's is "max".
         answer_by: source of the answers, see `answers_by`; None for the source in the run's record.
         color_transform: correction of the colours of every instance; None for no correction.
@@ -210,7 +210,7 @@ class Model:
         return wanted or "both"
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
-        """Return the least confidence [n] of an answer with each of the `names`: `unknown_below`, if it is set.
+        """Return the lowest confidence [n] of an answer with each of the `names`: `unknown_below`, if it is set.
 
         By default it is the confidence that 95 % of the correct answers on held-out views or frames reach (97 % in runs
         of earlier versions). For a class with an output of the classifiers, it is measured on held-out views and stored

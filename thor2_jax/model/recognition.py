@@ -35,12 +35,13 @@ class Recognition:
             `prepared_instance.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if the object
             is unknown. Unknown objects have a confidence below the threshold (see `inference.answers`).
         confidence: from 0 to 1, also for unknown objects: estimated probability that the name is correct if the object
-            is known; low for most unknown objects (see `model.fusion`). Without a calibration, the fused probability of
-            the most probable class or the score of the gallery. None if the instance could not be described.
+            is known; low for most unknown objects (see `model.fusion`). For an enrolled object, it follows from the
+            score of the gallery. Without a calibration, it is the fused probability of the most probable class. None if
+            the instance could not be described.
         classifier: the classifier that gives this class the largest probability ("tops", "tops2" or "embedding"), or
             "gallery".
         top: classifier or "gallery" -> its five most probable (name, probability) pairs.
-        occluded: whether another instance hides a part of the instance, or the image border cuts it.
+        occluded: whether another instance occludes a part of the instance, or the image border cuts it.
         overflow: number of points and persistence pairs outside the descriptor's grid, see `Descriptors`.
         points_used: number of points of the described cloud.
         kept_by_fallback: whether an outlier rule was skipped, since it would have dropped most of the cloud.

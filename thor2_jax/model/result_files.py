@@ -62,7 +62,7 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
     """Write `recognition.json`, one object per instance, and `overlay.png` to a directory; create it if necessary.
 
     Raises:
-        OSError: A file cannot be written.
+        OSError: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     instances = [dataclasses.asdict(recognition) for recognition in recognitions]

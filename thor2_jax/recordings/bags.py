@@ -344,7 +344,7 @@ _TAIL = bytes([_FOOTER]) + (20).to_bytes(8, "little") + bytes(20) + _MAGIC
 
 
 def _is_truncated(path: Path) -> bool:
-    """Return whether a file has the beginning, but not the end, of an MCAP file; raises OSError."""
+    """Return whether a file has the beginning, but not the end, of an MCAP file; raise OSError on failure."""
     with open_file(path) as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
             return False

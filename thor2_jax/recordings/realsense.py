@@ -96,7 +96,7 @@ class RealSenseCamera:
             )
 
     def _next(self) -> tuple[Any, Any]:
-        """Return the next colour frame and the depth frame that is aligned to it; raises RuntimeError."""
+        """Return the next colour frame and the depth frame aligned to it; raise RuntimeError if none arrives."""
         milliseconds = int(1000 * self._timeout)
         for _ in range(max(int(self._timeout * RATE), 10)):
             frames = self._source.wait_for_frames(milliseconds)

@@ -18,7 +18,7 @@ from thor2_jax.segmentation.planes import DepthImage, Plane
 __all__ = ["UNIT", "Evidence", "find_foreground"]
 
 HEIGHT = (0.006, 0.005)
-"""Least height of an object over its plane: the first in metres, plus the second times the squared depth in metres."""
+"""Smallest height of an object over its plane: the first in metres, plus the second times squared depth in metres."""
 
 FLAT = 0.05
 """Height, metres, below which smooth parts of the image may be the plane."""
@@ -36,16 +36,16 @@ WINDOWS_OF_OUTLIERS = (51, WINDOW)
 """Widths of windows whose mean colour the plane's pixels must have; large flat objects can fill the smaller window."""
 
 OUTLIER = 30.0
-"""Least colour difference between the plane and a coarse pixel outside it, summed over the channels."""
+"""Smallest colour difference between the plane and a coarse pixel outside it, summed over the channels."""
 
 LEAST_PLANE = 0.04
-"""Least fraction of a window that the plane must fill for its colour to be known there."""
+"""Smallest fraction of a window that the plane must fill for its colour to be known there."""
 
 DIFFERENCE = 22.0
-"""Least colour difference, in levels of 8 bits, between an object and the plane."""
+"""Smallest colour difference, in levels of 8 bits, between an object and the plane."""
 
 NOISE = 4.0
-"""Least colour difference between object and plane, as a multiple of the mean difference of the plane's pixels."""
+"""Smallest colour difference between object and plane, as a multiple of the mean difference of the plane's pixels."""
 
 DARKER, LIGHTER = 0.35, 0.5
 """Weights of differences in brightness, which are smaller because of shadows and highlights."""
@@ -202,13 +202,13 @@ def _floats(image: object) -> NDArray[np.float32]:
 
 
 STEP = (0.006, 0.015)
-"""Least step: the first in metres, plus the second times the squared depth in metres."""
+"""Smallest step: the first in metres, plus the second times the squared depth in metres."""
 
 NARROW = 0.4
-"""Least fraction of a step that lies between the two neighbours of a pixel."""
+"""Smallest fraction of a step that lies between the two neighbours of a pixel."""
 
 BEND = 0.4
-"""Least change of slope at a fold."""
+"""Smallest change of slope at a fold."""
 
 NEAR, FAR = 2, 6
 """Number of pixels between an edge and the extrapolated values."""

@@ -29,7 +29,7 @@ Answer = tuple[str | None, float]
 """Name (None for an unknown object) and confidence."""
 
 LEAST_PART, MOST_PARTS = 1000, 6
-"""Least average number of pixels of a part, and largest number of parts of a piece."""
+"""Smallest average number of pixels of a part, and largest number of parts of a piece."""
 
 MOST_JOINED = 4
 """Largest number of parts in a candidate that is not a whole piece."""
@@ -47,19 +47,19 @@ MARGIN = 10
 """Width, pixels, of the margin around a candidate that its recognition can read."""
 
 LEAST = 0.8
-"""Least confidence at which a candidate counts as known."""
+"""Lowest confidence at which a candidate counts as known."""
 
 MOST = 0.99
 """Confidences are clipped to this value."""
 
 SHARE = 0.5
-"""Least fraction of a piece that must be recognized in its division."""
+"""Smallest fraction of a piece that must be recognized in its division."""
 
 COST, COST_OF_UNKNOWN = 0.3, 0.5
 """Penalties for each known and each unknown candidate in a division: these log-odds times the area of the piece."""
 
 GAIN = 1.0
-"""Least increase of the log-odds of a known object when two objects are merged."""
+"""Smallest increase of the log-odds of a known object when two objects are merged."""
 
 
 def segment_known(

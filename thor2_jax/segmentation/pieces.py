@@ -21,7 +21,7 @@ from thor2_jax.segmentation.planes import DepthImage
 __all__ = ["find_pieces"]
 
 LEAST_MARKER = 10
-"""Least number of pixels of a marker."""
+"""Smallest number of pixels of a marker."""
 
 RIM = 3
 """Width, pixels, of the square around the border of an object in which depth is not trusted."""
@@ -33,10 +33,10 @@ OUTSIDE = 21
 """Width, pixels, of the square in which objects may extend over pixels without depth outside the plane."""
 
 LEAST_CONTACT = 0.08
-"""Least common border of two pieces of one object, as a fraction of the smaller piece's border."""
+"""Smallest common border of two pieces of one object, as a fraction of the smaller piece's border."""
 
 EDGE = 0.25
-"""Least fraction of the common border of two objects that is a depth step."""
+"""Smallest fraction of the common border of two objects that is a depth step."""
 
 PART = 90.0
 """Largest colour difference between a body and one of its parts that was found by colour."""
@@ -45,13 +45,13 @@ GAP = 5
 """Width, pixels, of closed gaps between parts of one object that are found by colour, plus one."""
 
 OPEN = 0.3
-"""Least fraction of a shadow's border that lies along the plane, which distinguishes it from the bottom of a bowl."""
+"""Smallest fraction of a shadow's border along the plane, which distinguishes it from the bottom of a bowl."""
 
 SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Least fraction of a piece's border along its object, for pieces without depth, inner sides and shadows."""
+"""Smallest fraction of a piece's border along its object, for pieces without depth, inner sides and shadows."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
@@ -60,7 +60,7 @@ SAME_HEIGHT, RIM_SHARE = 0.015, 97
 """Largest height difference, metres, between the rims of both sides of a hollow object; percentile of a rim."""
 
 CONCAVE = 0.1
-"""Least bend of the inner side of a hollow object, as a fraction of its size."""
+"""Smallest bend of the inner side of a hollow object, as a fraction of its size."""
 
 BEFORE, AFTER = 2, 2
 """Distances, pixels, from a border at which the two pieces are compared."""

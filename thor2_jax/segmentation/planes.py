@@ -30,17 +30,17 @@ TOLERANCE = (0.003, 0.004)
 """Largest distance of an inlier: the first in metres, plus the second times the squared depth in metres."""
 
 LEAST_SHARE = 0.05
-"""Least fraction of the points that lie on a dominant plane."""
+"""Smallest fraction of the points that lie on a dominant plane."""
 
 LEAST_SHARE_OF_LARGEST, LEAST_EXTENT_OF_LARGEST = 0.2, 0.15
 LEAST_EXTENT = 0.23
-"""Least extent, metres, across the longest direction of a plane after the largest; sides of boxes have less."""
+"""Smallest extent, metres, across the longest direction of a plane after the largest; sides of boxes have less."""
 
 LEAST_FILLING = 0.25
-"""Least fraction of a plane's hull that its inliers fill; the tops of several objects at equal height fill less."""
+"""Smallest fraction of a plane's hull that its inliers fill; the tops of several objects at equal height fill less."""
 
 PARALLEL, LARGEST_THING = 0.97, 0.15
-"""Least cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
+"""Smallest cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
 
 LEAST_SHARE_OF_SUPPORT = 0.08
 

@@ -30,19 +30,19 @@ MARGIN = 4
 
 LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
-"""Least and largest area of an object, square metres."""
+"""Smallest and largest area of an object, square metres."""
 
 LARGEST_SHARE = 0.25
 """Largest fraction of the image that an object fills."""
 
 LEAST_SUPPORT = 0.3
-"""Least fraction of the pixels of an object that lie in the hull of a plane."""
+"""Smallest fraction of the pixels of an object that lie in the hull of a plane."""
 
 HOLE = 0.3
 """Largest hole in an object that is filled, as a fraction of the object, such as the handle of scissors."""
 
 LEAST_INNER = 0.9
-"""Least fraction of an object inside its rim of half a working pixel; thinner objects keep their rim."""
+"""Smallest fraction of an object inside its rim of half a working pixel; thinner objects keep their rim."""
 
 
 def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:

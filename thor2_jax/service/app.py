@@ -38,7 +38,7 @@ from thor2_jax.service.signals import handlers_replaced
 __all__ = ["create_app"]
 
 WHY_SECONDS = 90.0
-"""Least deadline of an explanation, since explanations wait for one another."""
+"""Shortest deadline of an explanation, since explanations wait for one another."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
@@ -107,7 +107,7 @@ def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
 
 @contextlib.contextmanager
 def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
-    """Reject new requests as soon as the signal arrives; the server closes its connections later."""
+    """Refuse new requests as soon as the signal arrives; the server closes its connections later."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -167,7 +167,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})
     async def why(request: Request) -> schemas.WhyAnswer:
-        """Explain the answer for one instance: the contributions of points, and the smallest changes to another answer.
+        """Explain the answer for one instance: the attributions of points, and the smallest changes to another answer.
 
         The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
@@ -237,7 +237,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
 def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def check_teaches() -> None:
         if not service.settings.teach:
-            raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
+            raise RequestError(403, None, "Enrolling is disabled; start the service with `thor2 serve --teach`.")
 
     guards = [Depends(check_teaches), Depends(_check_same_site)]
     routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)
@@ -274,7 +274,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
-        """Forget an object: remove its views, and never answer with its trained class again."""
+        """Forget an object: remove its views; a trained class is no longer predicted."""
         async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # The request has no body.
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)

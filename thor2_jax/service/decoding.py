@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 MAX_BODY = 16 * 2**20
-"""Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
+"""Largest size of a request body, and of the arrays it decompresses to, in bytes."""
 
 MAX_UPLOAD_PIXELS = 1920 * 1080
-"""Maximum number of pixels of an image."""
+"""Largest number of pixels of an image."""
 
 MAX_INSTANCES = 256
-"""Maximum number of instances in a frame."""
+"""Largest number of instances in a frame."""
 
 MAX_INTRINSICS_BYTES = 4096
-"""Maximum size of the intrinsics file."""
+"""Largest size of the intrinsics file."""
 
 CloudArrays = list[tuple[NDArray[np.float32], NDArray[np.uint8]]]
 """Points [n, 3] in metres and sRGB colours [n, 3] of each cloud."""
@@ -65,7 +65,7 @@ async def _limited_stream(request: Request) -> AsyncGenerator[bytes, None]:
 
 
 async def read_body(request: Request) -> bytes:
-    """Return the whole body. Raises RequestError (413) if it is larger than `MAX_BODY`."""
+    """Return the whole body; raise RequestError (413) if it is larger than `MAX_BODY`."""
     return b"".join([data async for data in _limited_stream(request)])
 
 
@@ -142,7 +142,7 @@ def _parse_flag(fields: dict[str, bytes], name: str) -> bool:
 
 
 def parse_number(fields: dict[str, bytes], name: str) -> int:
-    """Remove a field from a form and return its number. Raises RequestError (422)."""
+    """Remove a field from a form and return its number; raise RequestError (422) if it is invalid."""
     content = fields.pop(name)
     if not re.fullmatch(rb"[0-9]{1,18}", content):
         raise RequestError(422, name, f"{name} is not a number; expected a whole number of at most 18 digits.")
@@ -228,7 +228,7 @@ def _mode_name(mode: str) -> str:
 
 
 def decode_json_clouds(content: bytes) -> CloudArrays:
-    """Decode clouds from JSON (`schemas.CloudsBody`). Raises RequestError (422)."""
+    """Decode clouds from JSON (`schemas.CloudsBody`); raise RequestError (422) if they are invalid."""
     try:
         body = CloudsBody.model_validate_json(content)
     except ValidationError as error:

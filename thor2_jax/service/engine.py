@@ -71,7 +71,7 @@ class Batcher:
 
         Args:
             process_batch: function that returns one result per instance, for at most `max_batch` instances.
-            max_batch: maximum number of instances in a batch.
+            max_batch: largest number of instances in a batch.
         """
         self._process_batch, self._max_batch = process_batch, max_batch
         self._waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()

@@ -84,7 +84,7 @@ class Service:
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Load the run. Raises InputError if it cannot be read."""
+        """Load the run; raise InputError if it cannot be read."""
         self.settings = settings
         self.metrics = Metrics()
         self.engine = InferenceEngine(settings)
@@ -153,7 +153,7 @@ class Service:
         return self._compiled[programs]
 
     def wait_until_ready(self) -> None:
-        """Return when the warm-up has ended. Raises RuntimeError if it failed."""
+        """Return when the warm-up has ended; raise RuntimeError if it failed."""
         self._warm_up_thread.join()
         if self.state == "failed":
             raise RuntimeError("warm-up failed")
@@ -165,7 +165,7 @@ class Service:
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
     def stop_accepting(self) -> None:
-        """Reject new requests; requests in progress are still answered."""
+        """Refuse new requests; requests in progress are still answered."""
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
 
@@ -262,7 +262,7 @@ class Service:
         return answer
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
-        """Describe the clouds of an npz or JSON body. Raises RequestError."""
+        """Describe the clouds of an npz or JSON body; raise RequestError if it is invalid."""
         prepared = await self._prepare(request, prepare_clouds, content, is_npz)
         return await self._infer(prepared.instances, request)
 
@@ -299,7 +299,7 @@ class Service:
 
         Args:
             change: function that changes a copy of the gallery.
-            refused: status if the gallery rejects the change.
+            refused: status if the gallery refuses the change.
             field: field of the request that the error then names.
             request: the request.
 
@@ -337,7 +337,7 @@ class Service:
             raise RequestError(refused, field, f"{error}.") from None
 
     def known_objects(self) -> ObjectGallery:
-        """Return the objects that the model can recognize, as stored on disk. Raises RequestError as `change`."""
+        """Return the objects that the model can recognize, as stored on disk; raise RequestError as `change`."""
         with self._gallery_errors(500, "gallery"):
             self.engine.objects.refresh()
         return self.engine.objects

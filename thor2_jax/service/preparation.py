@@ -33,10 +33,10 @@ from thor2_jax.service.signals import signals_blocked
 __all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
 MAX_LABEL_RUNS = 50_000
-"""Maximum number of runs in the label map of an explained frame."""
+"""Largest number of runs in the label map of an explained frame."""
 
 MIN_SECONDS = 1.0
-"""Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
+"""Shortest time that a process has for a request, so that only exceptionally slow requests are interrupted."""
 
 
 @contextlib.contextmanager
@@ -111,7 +111,7 @@ def _warm_up(name: str) -> None:
 
 
 def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance for enrolment or explanation.
+    """Decode a frame and compute the cloud of one instance for enrollment or explanation.
 
     Raises:
         RequestError: 422 if there is no such instance or it has too few points; also as `prepare_frame`.
@@ -138,7 +138,7 @@ def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
 
 
 def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
-    """Decode the clouds of a request body. Raises RequestError."""
+    """Decode the clouds of a request body; raise RequestError if they are invalid."""
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
         clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)

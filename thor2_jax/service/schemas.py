@@ -51,16 +51,16 @@ NPZ = "application/octet-stream"
 FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels), clouds, device, total."
 
 MAX_POINTS = POINT_BUCKETS[-1]
-"""Maximum number of points of a cloud."""
+"""Largest number of points of a cloud."""
 
 MAX_CLOUD_COORDINATE = 100.0
 """Largest absolute value of a coordinate of a cloud, in metres."""
 
 MAX_CLOUDS = 32
-"""Maximum number of clouds in a request."""
+"""Largest number of clouds in a request."""
 
 MAX_EXPLAINED = 32
-"""Maximum number of instances of a frame that are explained."""
+"""Largest number of instances of a frame that are explained."""
 
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
@@ -80,7 +80,7 @@ class InstanceAnswer(BaseModel):
     label: int = Field(description="Number of the instance in the label image.")
     name: str | None = Field(description="Name of the object; null if it is unknown or cannot be recognized.")
     confidence: float | None = Field(
-        description="Fused probability of the most probable class, or the score of the gallery."
+        description="Confidence in the most probable name, from 0 to 1; null if the cloud cannot be used."
     )
     classifier: str | None = Field(
         description="Classifier that gives this class the highest probability: tops, tops2 or embedding, or gallery."
@@ -88,7 +88,7 @@ class InstanceAnswer(BaseModel):
     top: dict[str, list[Candidate]] = Field(
         description="Five most probable classes of each classifier, and of the gallery."
     )
-    occluded: bool = Field(description="Partly hidden by another instance or cut off by the image border.")
+    occluded: bool = Field(description="Partly occluded by another instance or cut off by the image border.")
     overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
     points_used: int = Field(description="Number of points of the described cloud.")
     kept_by_fallback: bool = Field(description="Outlier removal was relaxed because it would have removed most points.")
@@ -143,7 +143,7 @@ class Details(BaseModel):
     colors: list[tuple[int, int, int]] = Field(description="sRGB colours of these points.")
     slice_borders: list[tuple[float, float]] = Field(description="Start and end of each slice along z.")
     calibrated_confidence: float | None = Field(
-        description="Confidence after temperature scaling; null if the model was trained without a held-out set."
+        description="Calibrated confidence; null without a calibration, with a gallery, or with forgotten classes."
     )
     image_peak: float = Field(description="Maximum of the persistence images.")
     slices: list[SliceDetails]
@@ -194,7 +194,7 @@ class WhyAnswer(BaseModel):
         description="Loss of the margin without the tenth of the points that supports the name most."
     )
     mean_loss_without_random_tenth: float = Field(description="Mean loss without a random tenth of the points.")
-    changes: list[str] = Field(description="Smallest changes of colour and extents to another name, in words.")
+    changes: list[str] = Field(description="Smallest changes of colour and side lengths to another name, in words.")
     pictures: list[WhyPicture]
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, explain, total.")
 
@@ -241,7 +241,7 @@ class ModelAnswer(BaseModel):
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
     color_network: str = Field(description="Fingerprint of the colour network.")
     teaches: bool = Field(description="Whether objects can be enrolled and forgotten.")
-    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are rejected.")
+    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are refused.")
 
 
 class ObjectAnswer(BaseModel):
@@ -251,7 +251,7 @@ class ObjectAnswer(BaseModel):
     trained: bool = Field(description="Whether the classifiers have an output for it.")
     views: int = Field(description="Number of enrolled views.")
     source: str | None = Field(description="Source of the views: frames, mesh, or mesh and frames; null without views.")
-    date: str | None = Field(description="Date of the last enrolment, ISO 8601; null without views.")
+    date: str | None = Field(description="Date of the last enrollment, ISO 8601; null without views.")
 
 
 class ObjectsAnswer(BaseModel):
@@ -268,7 +268,7 @@ class ChangeAnswer(BaseModel):
 
 
 class EnrolmentAnswer(ObjectAnswer, ChangeAnswer):
-    """The object after its enrolment."""
+    """The object after its enrollment."""
 
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, gallery, total.")
 
@@ -319,7 +319,7 @@ _FRAME: dict[str, Any] = {
         "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
     },
 }
-_INSTANCE = {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."}
+_INSTANCE = {"type": "integer", "minimum": 0, "description": "Label number of the object."}
 
 FRAME_FORM = _form(_FRAME, "labels")
 """OpenAPI schema of the body of /v1/recognize. `decoding` parses it, since FastAPI writes large files to disk."""

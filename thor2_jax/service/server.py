@@ -40,7 +40,7 @@ EARLY_ANSWER_SECONDS = 30.0
 """This limit after a response that preceded the end of its request, since many clients send everything first."""
 
 MAX_HEAD = 2**20
-"""Maximum number of bytes received between the first byte of a request head and its end."""
+"""Largest number of bytes received between the first byte of a request head and its end."""
 
 
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:

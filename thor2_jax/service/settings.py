@@ -27,16 +27,16 @@ class Settings:
     Attributes:
         model: run directory.
         token: token of `Authorization: Bearer TOKEN`, which callers must send; None disables authentication.
-        queue: maximum number of requests in progress; further requests receive status 429.
+        queue: largest number of requests in progress; further requests receive status 429.
         deadline: largest number of seconds from the arrival of a request to its response; after it, the status is 504.
-        max_batch: maximum batch size, one of `capacity.BATCH_BUCKETS`.
+        max_batch: largest batch size, one of `capacity.BATCH_BUCKETS`.
         processes: number of processes that decode images and compute clouds.
         unknown_below: confidence below which an object is unknown, as in `Recognizer`; None is the run's own.
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: whether callers may enroll and forget objects.
         adapt: whether the camera's colour transform is estimated from the latest frames and applied.
-        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None rejects
+        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
             them. Default: the result of `default_segmenter`.
         allow_host: names that the header Host may have, besides loopback names and the address of the connection.
         warm_why: whether explanations are compiled in the background after the start, or from the first request on.

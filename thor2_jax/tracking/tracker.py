@@ -60,7 +60,7 @@ VOXELS = (0.01, 0.02, 0.04)
 """Voxel sides, metres."""
 
 MIN_OVERLAP = 0.2
-"""Least overlap of two clouds of one object."""
+"""Smallest overlap of two clouds of one object."""
 
 _OFFSET = 2**20
 """Half the number of voxels along each axis that have distinct numbers."""

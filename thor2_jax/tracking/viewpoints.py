@@ -122,7 +122,7 @@ def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInsta
 
 
 MIN_PROBABILITY = 0.02
-"""Least probability of a plausible class."""
+"""Lowest probability of a plausible class."""
 
 SHARPNESS = 5.0
 """A training view has the likelihood exp(-SHARPNESS D); D is the divergence of its answer from the current answer."""

@@ -42,13 +42,13 @@ PLACES = 32
 """Number of candidate positions of a silhouette, on a line from outside the view to its centre."""
 
 SAMPLE_PIXELS = 400
-"""Approximate number of pixels from which the occluded share at each position is estimated."""
+"""Approximate number of pixels from which the occluded fraction at each position is estimated."""
 
 MAX_TRIES = 4
 """Number of silhouettes to try before a straight edge is used."""
 
 SHARE_TOLERANCE = 0.05
-"""Largest accepted difference between the drawn share and the share that a silhouette occludes."""
+"""Largest accepted difference between the drawn fraction and the one that a silhouette occludes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Occlusion:
     """Ranges of the occlusion; values are drawn once per view.
 
     Attributes:
-        share: occluded share of the view's pixels.
+        share: occluded fraction of the view's pixels.
         none: probability that a view is not occluded.
         straight: probability that an occluded view is occluded by a straight edge (a large object).
         nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
@@ -204,7 +204,7 @@ def _background(
 
 
 MAX_CUT = 0.4
-"""Largest share of the visible pixels that may be removed; without it, a flat object would disappear."""
+"""Largest fraction of the visible pixels that may be removed; without it, a flat object would disappear."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -179,12 +179,12 @@ class Sensor:
         axial: factor of `axial_deviation`; within a centimetre, it is 0.4 to 0.55 in real frames.
         lateral: standard deviation of the sampling position along rows and columns, in pixels of a real frame.
         grazing: smallest angle between surface normal and view direction at which a surface counts as an edge, degrees.
-        missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
-        flying: share of flying pixels among the other edge pixels: their depth is between surface and background.
+        missing: fraction of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
+        flying: fraction of flying pixels among the other edge pixels: their depth is between surface and background.
         background: distance of the background behind the object, metres.
         smooth: standard deviation of the smoothing of depth, in pixels of a real frame. Stereo matching and driver
             filters smooth depth, which correlates the noise and rounds the edges.
-        patches: share of the image in connected patches without depth, as on dark or shiny surfaces.
+        patches: fraction of the image in connected patches without depth, as on dark or shiny surfaces.
         patch: width of these patches, in pixels of a real frame.
     """
 

@@ -24,7 +24,7 @@ EDGE_STEP = 0.03
 """Smallest difference in depth within three pixels at which a pixel counts as an edge, metres."""
 
 MIN_MASK = 0.5
-"""Smallest share of a mask that must remain; otherwise the mask is not changed."""
+"""Smallest fraction of a mask that must remain; otherwise the mask is not changed."""
 
 TABLE_MARGIN = 15
 """Width of the region around the masks in which the table is searched, pixels."""
@@ -53,7 +53,7 @@ class SimulatedCamera:
         step: depth is rounded to multiples of this, millimetres.
         holes: number of elliptic holes in depth.
         radius: largest half axis of a hole, pixels.
-        edges: share of the pixels without depth along edges of depth.
+        edges: fraction of the pixels at depth edges that have no depth.
         mask: number of pixels by which masks are dilated; eroded if negative.
         base: height above the table up to which masks lack pixels, metres.
     """

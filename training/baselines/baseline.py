@@ -124,7 +124,7 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], s
     """Write a baseline file and its training time atomically, and create its directory if it is missing.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: the file cannot be written.
     """
     about: dict[str, Any] = {
         "format": BASELINE_FORMAT,
@@ -148,7 +148,7 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         classes: class names of its run.
 
     Raises:
-        InputError: if the file is damaged or has another format or other classes; the message names the file.
+        InputError: the file is damaged or has another format or other classes; the message names the file.
     """
     try:
         arrays, metadata = unpack_arrays(read_file(path))
@@ -177,7 +177,7 @@ class FitTask:
         source: views of the run.
         run: the run. Its fold is held out, unless it is the only fold.
         directory: directory of the run.
-        weights: directory of pretrained weights; None trains networks from scratch.
+        weights: folder of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 

@@ -117,14 +117,14 @@ def train_baselines(
         source: the views on which the run was trained; the held-out views of its fold are held out here, too.
         names: names from BASELINES, in the same order.
         progress: called with (stage, done, total, note).
-        weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
+        weights: folder of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
     Raises:
         InputError: `path` is not a run directory; the run was trained on other views; a baseline cannot be trained on
             them; `weights` lacks a file or has a file of another architecture; or a network of the run was trained
             without these weights.
-        OSError: A file cannot be written.
+        OSError: a file cannot be written.
     """
     for directory in find_run_directories([Path(path)]):
         run = load_run(directory)

@@ -162,7 +162,7 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     """Fit the library, each classifier in the same way as the run's own; an interrupted fit resumes.
 
     Raises:
-        InputError: `fit` raises it.
+        InputError: as `fit`.
     """
     job = task.source.record["job"]
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)

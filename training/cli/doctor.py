@@ -26,7 +26,7 @@ def doctor(
     ] = None,
     meshes: Annotated[
         Path | None,
-        typer.Option(help="Mesh of the object, or directory of meshes, to check units, sizes and the focal length."),
+        typer.Option(help="Mesh of the object, or folder of meshes, to check units, sizes and the focal length."),
     ] = None,
     mesh_scale: options.MeshScaleOption = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print findings and notes for each FRAME as JSON.")] = False,

@@ -93,7 +93,7 @@ def enroll(
         console.print(f"{each}: {count} views")
     if known.weak_rejection:
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
-    enrolled = f"enrolled in {gallery or model}, which knows {known.gallery.summary}"
+    enrolled = f"enrolled in {gallery or model}, which recognizes {known.gallery.summary}"
     finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
 
 

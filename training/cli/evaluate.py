@@ -22,7 +22,7 @@ app.add_typer(evaluate_app, name="evaluate")
 MAX_LISTED = 10
 """Largest number of labels that the summary lists."""
 
-DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of the dataset.")]
 MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
 
 

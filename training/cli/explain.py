@@ -19,7 +19,7 @@ def explain(
     given: options.FrameOptions,
     out: Annotated[Path, typer.Option(help="Directory; each page is OUT/<frame>/<instance>/explanation.html.")],
     instance: Annotated[
-        list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
+        list[int] | None, typer.Option(help="Label number of an object; repeatable. Default: all.")
     ] = None,
     segment: options.SegmentOption = None,
     unknown_below: options.UnknownOption = None,

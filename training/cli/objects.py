@@ -25,7 +25,7 @@ def objects(
         ),
     ] = False,
 ) -> None:
-    """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
+    """List the trained classes and the enrolled objects: number of views, source and date of enrollment."""
     from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, load_gallery
     from thor2_jax.model.run_record import read_description
 
@@ -50,4 +50,4 @@ def objects(
             sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    finish(f"{model} knows {known.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)
+    finish(f"{model} recognizes {known.summary}", "enroll an object", "enroll", "NAME", "FRAME", "--model", model)

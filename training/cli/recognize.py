@@ -175,7 +175,7 @@ def recognize(
     result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
     notes = sys.stderr if as_json else None
     if unknown:
-        print(escape_characters(f"{model} knows {recognizer.gallery.summary}"), file=notes)
+        print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
     segments = ["--segment", segment] if segment else []
     next_command = ("explain", *given.arguments, *segments, *options.given_options(arguments), "--out", "why")
     finish(result, "see why", *next_command, file=notes)

@@ -29,7 +29,7 @@ class AugmentationOptions:
 def render(
     *,
     processes: options.RenderWorkers,
-    meshes: Annotated[Path, typer.Option(help="Directory of meshes (GLB, OBJ, PLY), one per file or subdirectory.")],
+    meshes: Annotated[Path, typer.Option(help="Folder of meshes (GLB, OBJ, PLY), one per file or subfolder.")],
     out: Annotated[Path, typer.Option(help="Directory for the views: new, or begun by this command.")],
     names: options.NamesOption = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,

@@ -30,7 +30,7 @@ class _TrainCommand(options.ManyFrames):
 @app.command(cls=_TrainCommand)
 def train(
     out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")],
-    meshes: Annotated[Path | None, typer.Option(help="Directory of meshes (GLB, OBJ, PLY) to render.")] = None,
+    meshes: Annotated[Path | None, typer.Option(help="Folder of meshes (GLB, OBJ, PLY) to render.")] = None,
     dataset: Annotated[
         Path | None, typer.Option(help="Directory written by `thor2 render`, instead of --meshes.")
     ] = None,
@@ -89,7 +89,7 @@ def train(
     ] = "",
     weights: Annotated[
         Path | None,
-        typer.Option(help="Directory of pretrained weights (safetensors) for the networks. Default: from scratch."),
+        typer.Option(help="Folder of pretrained weights (safetensors) for the networks. Default: from scratch."),
     ] = None,
     leave_out: Annotated[str, typer.Option(help="Comma-separated objects to leave out of the training.")] = "",
     sequences: Annotated[
@@ -114,7 +114,7 @@ def train(
         ),
     ] = None,
     distractors: Annotated[
-        Path | None, typer.Option(help="Directory of meshes of further distractors: objects of none of the classes.")
+        Path | None, typer.Option(help="Folder of meshes of further distractors: objects of none of the classes.")
     ] = None,
     mesh_scale: options.MeshScaleOption = 1.0,
     workers: Annotated[int, typer.Option(min=1, max=options.MAX_WORKERS, help="Rendering processes.")] = 2,

@@ -102,16 +102,16 @@ MAX_INSTANCES = 150
 """Largest plausible number of instances on a table."""
 
 MAX_INSTANCE_SHARE = 0.6
-"""Largest plausible share of the image covered by one instance."""
+"""Largest plausible fraction of the image covered by one instance."""
 
 MAX_THIN_SHARE = 0.34
-"""Largest plausible share of thin instances, which vanish if their border of one pixel is removed."""
+"""Largest plausible fraction of thin instances, which vanish if their border of one pixel is removed."""
 
 MIN_THIN = 3
 """Smallest number of thin instances for a finding."""
 
 MIN_PIECES, MIN_PIECE_SHARE = 3, 0.08
-"""Smallest number of pieces, and share of each, at which the only instance is taken for a foreground mask."""
+"""Smallest number of pieces, and fraction of each, at which the only instance is taken for a foreground mask."""
 
 
 def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> None:

@@ -21,7 +21,7 @@ MIN_BRIGHTNESS = 22.0
 """Smallest plausible mean value of the pixels of the instances, from 0 to 255."""
 
 MAX_SATURATED = 0.65
-"""Largest plausible share of pixels of the instances with a channel at its maximum."""
+"""Largest plausible fraction of pixels of the instances with a channel at its maximum."""
 
 MAX_CAST = 2.2
 """Largest plausible ratio of two channels' contrasts (generalized means of order 4), which are equal in white light."""

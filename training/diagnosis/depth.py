@@ -12,13 +12,13 @@ from training.diagnosis.checks import Diagnosis
 __all__ = ["check_depth", "instance_extents"]
 
 MIN_VALID_INSTANCES = 0.3
-"""Smallest plausible share of the pixels of instances that have depth."""
+"""Smallest plausible fraction of the pixels of instances that have depth."""
 
 MIN_VALID_IMAGE = 0.15
-"""Smallest plausible share of the pixels of the whole image that have depth, if there are no labels."""
+"""Smallest plausible fraction of the pixels of the whole image that have depth, if there are no labels."""
 
 MIN_IN_RANGE = 0.5
-"""Smallest plausible share of the pixels with depth that lie between `MIN_DEPTH` and `MAX_DEPTH`."""
+"""Smallest plausible fraction of the pixels with depth that lie between `MIN_DEPTH` and `MAX_DEPTH`."""
 
 MIN_EXTENT, MAX_EXTENT = 0.02, 0.45
 """Plausible range of the median longest side of a frame's objects, metres, if no meshes are given."""

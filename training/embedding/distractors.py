@@ -159,8 +159,8 @@ def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
         build: function that returns the samples.
 
     Raises:
-        InputError: `build` raises it.
-        OSError: `build` raises it.
+        InputError: as `build`.
+        OSError: as `build`.
     """
     cache = cache_directory("distractors")
     if cache is None:

@@ -199,7 +199,7 @@ def fit_embedding(
 
 
 BACKGROUND_VIEWS = 1024
-"""Number of background views; docs/decisions.md explains it."""
+"""Number of reference views of distractors."""
 
 VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192
 """Largest number of views per class, and of all classes together."""

@@ -166,7 +166,7 @@ def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None =
         sequences: identifiers of the frames if there is a run for each sequence; None otherwise.
 
     Raises:
-        InputError: these functions raise it, or several directories of sequences are given.
+        InputError: several directories of sequences are given; also as `load_runs` and `load_sequence_runs`.
     """
     if sequences is None:
         return load_runs(models)
@@ -191,7 +191,7 @@ def answer_frames_in_pool(
         numbers: numbers of the frames.
 
     Raises:
-        InputError: `answer_frames` raises it.
+        InputError: as `answer_frames`.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
     answer = functools.partial(_answer_first, load)

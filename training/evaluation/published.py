@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 _LIGHTS = {"1": "bright", "2": "dim"}
-"""Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not say so; see the note in
+"""Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not state this; see the note in
 `published.json`."""
 
 
@@ -35,7 +35,7 @@ def published_tables(kind: str) -> list[dict[str, Any]]:
     """Return the published tables for a kind of dataset ("uwis", "ocid") from `published.json`; empty for most kinds.
 
     The rows are the `cells`, each with attribute values (`where`) and method -> mean and standard deviation in percent
-    (`accuracy`). The field `source` contains the publication itself.
+    (`accuracy`). The field `source` contains the citation of the publication.
     """
     content = _read()
     tables = (table for table in content["tables"] if table["kind"] == kind)
@@ -57,7 +57,7 @@ def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, 
 
 
 def published_seconds() -> dict[str, float]:
-    """Return system -> seconds per frame."""
+    """Return published method -> seconds per frame."""
     return dict(_read()["seconds_a_frame"])
 
 

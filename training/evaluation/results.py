@@ -185,7 +185,7 @@ def check_known(names: Collection[str], classes: Sequence[str]) -> None:
     if not any(find_name(name, classes) for name in names):
         raise InputError(
             f"model: no instance of the dataset is of a class of the runs; the dataset has {_listed(names)}, the runs "
-            f"know {_listed(classes)}; check the names, give other runs, or add frames with known objects"
+            f"have {_listed(classes)}; check the names, give other runs, or add frames with known objects"
         )
 
 

@@ -186,7 +186,7 @@ MAX_MOVE = 0.03
 """Largest distance between the positions of an unmoved object in two neighbouring frames, metres."""
 
 MIN_UNMOVED = 0.75
-"""Smallest fraction of unmoved objects in either frame; with fewer, the objects count as rearranged."""
+"""Smallest fraction of unmoved objects in each of two frames; with fewer, the objects count as rearranged."""
 
 
 def find_placements(frames: Sequence[FrameAnswers]) -> list[NDArray[np.intp]]:
@@ -194,8 +194,8 @@ def find_placements(frames: Sequence[FrameAnswers]) -> list[NDArray[np.intp]]:
 
     An instance continues the placement of the nearest instance with the same name in the previous frame under three
     conditions: both frames belong to one sequence (the identifier without its last part), the distance is at most
-    `MAX_MOVE`, and this is true for at least `MIN_UNMOVED` of the instances of either frame. Instances without a
-    position start a new placement.
+    `MAX_MOVE`, and this is true for at least `MIN_UNMOVED` of the instances of each frame. Instances without a position
+    start a new placement.
 
     Args:
         frames: frames in the order of the dataset.

@@ -1,1 +1,1 @@
-"""Fitting classifiers to views: samples, steps, folds, checkpoints, calibration and the training job."""
+"""Fitting classifiers to views: samples, the training loop with its checkpoints, and calibration."""

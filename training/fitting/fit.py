@@ -68,7 +68,7 @@ class FitContext:
     Attributes:
         feature: part of the descriptor that the classifier reads.
         network: colour network, which defines the colour regions and their similarity.
-        config: descriptor, as the samples were built with, but always in closed form, which is equal to gudhi's values.
+        config: descriptor of the samples, always in closed form, whose values equal those of gudhi.
     """
 
     feature: Feature
@@ -145,7 +145,7 @@ def train_step(
     """Make one step of Adam.
 
     Args:
-        context: static.
+        context: constants of the fit. Static.
         graph: the classifier without its arrays, from `initial_state`. Static.
         state: state before the step; it is donated and cannot be used afterwards.
         batch: batch on the devices, from `shard_batch`.
@@ -221,8 +221,8 @@ def fit(
         accuracy or, without a held-out set, the lowest training loss.
 
     Raises:
-        InputError: There are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
-        OSError: A checkpoint cannot be written. The last complete one is kept.
+        InputError: there are fewer than two training samples, a checkpoint is unreadable, or the loss is not finite.
+        OSError: a checkpoint cannot be written. The last complete one is kept.
     """
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]

@@ -61,7 +61,7 @@ class FitOptions:
         seed: seed for initial weights, sample order and dropout.
 
     Raises:
-        InputError: A value is out of range; the message names the field and the value.
+        InputError: a value is out of range; the message names the field and the value.
     """
 
     epochs: int = 100
@@ -117,7 +117,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Return the metrics of all epochs; a missing file has none, and a last line cut off by a crash is ignored.
 
     Raises:
-        InputError: if any other line is damaged.
+        InputError: any other line is damaged.
     """
     content = path.read_bytes() if path.exists() else b""
     try:
@@ -202,7 +202,7 @@ class Checkpoints:
             like: a state with the same structure, shapes and dtypes.
 
         Raises:
-            InputError: if the checkpoint is damaged or has another structure.
+            InputError: the checkpoint is damaged or has another structure.
         """
         return self._restore(self.last_epoch, like)
 
@@ -238,7 +238,7 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
     """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
 
     Raises:
-        InputError: A training is not finished. Other paths that are not run directories are rejected on loading.
+        InputError: a training is not finished. Other paths that are not run directories are refused on loading.
     """
     directories: list[Path] = []
     for path in map(Path, paths):

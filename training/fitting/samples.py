@@ -136,7 +136,7 @@ def build_samples(
         seed: seed for the orientations.
 
     Raises:
-        InputError: There are fewer than two classes, a class has no views, or the source is unreadable.
+        InputError: there are fewer than two classes, a class has no views, or the source is unreadable.
     """
     if len(source.classes) < 2:
         raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")

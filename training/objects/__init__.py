@@ -1,1 +1,1 @@
-"""Objects to train on: mesh files and built-in objects."""
+"""Objects to train on: mesh files, built-in objects and procedural objects."""

@@ -26,7 +26,7 @@ YCB_URL = "http://ycb-benchmarks.s3-website-us-east-1.amazonaws.com/data/google"
 LICENCE = (
     "The scans are those of the YCB Object and Model Set (Calli et al., IEEE Robotics and Automation Magazine 22(3), "
     "2015), licence CC BY 4.0, https://creativecommons.org/licenses/by/4.0/: whoever shares them, or pictures of them, "
-    "names this source."
+    "must name this source."
 )
 
 NAME = re.compile(r"\d{3}(-[a-z])?_[a-z0-9_-]+")
@@ -54,9 +54,9 @@ def fetch_ycb(
         progress: called with (object, downloaded kB, total kB, "").
 
     Raises:
-        InputError: A name or the address is invalid, the server has no such object or cannot be reached, an archive or
+        InputError: a name or the address is invalid, the server has no such object or cannot be reached, an archive or
             mesh is damaged, or another process writes to the directory.
-        OSError: The directory cannot be written.
+        OSError: the directory cannot be written.
     """
     wrong = [name for name in objects if not NAME.fullmatch(name)]
     if wrong or not objects:

@@ -109,7 +109,7 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     """Merge meshes in the same frame into one.
 
     Raises:
-        InputError: Some meshes have textures and others corner colours.
+        InputError: some meshes have textures and others corner colours.
     """
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     vertices = np.concatenate([part.vertices for part in parts])
@@ -144,7 +144,7 @@ def _ring_surface(points: Array, v: Array, texture: NDArray[np.uint8]) -> Textur
     faces = faces[np.linalg.norm(np.cross(second - first, third - first), axis=1) > 1e-12]
     u, v = np.meshgrid(np.linspace(0, 1, n), v)
     uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
-    # Clipped, so that the last texel does not wrap around to the first.
+    # Coordinates are clipped, so that the last texel does not wrap around to the first.
     uv = uv.clip(1e-4, 1 - 1e-4)
     return TexturedMesh(vertices, faces.astype(np.int32), uv[faces], (texture,), np.zeros(len(faces), np.int32))
 

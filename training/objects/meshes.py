@@ -28,14 +28,14 @@ __all__ = [
     "scaled_meshes",
 ]
 
-# Otherwise what trimesh logs about a damaged file, also with a traceback, is printed on standard error.
+# Without a handler, Python prints trimesh's log of a damaged file on standard error, also with a traceback.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
-"""Range of an object's longest side, metres; rejects scans in millimetres and keeps the camera outside the object."""
+"""Range of an object's longest side, metres; refuses scans in millimetres and keeps the camera outside the object."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -45,8 +45,8 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
-        InputError: The geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
-        ValueError: The geometry is inconsistent.
+        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
+        ValueError: the geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
     from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
@@ -103,7 +103,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
         scale: factor from the unit of the file to metres; 0.001 for millimetres.
 
     Raises:
-        InputError: The file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
+        InputError: the file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
             texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
             not a positive number.
     """
@@ -178,10 +178,10 @@ def _parsed(path: Path) -> TexturedMesh:
 
 
 def _mesh_in(folder: Path) -> Path | None:
-    """Return the mesh file of a directory: `textured.*`, else the only GLB, else the only mesh file; None without any.
+    """Return the mesh file of a folder: `textured.*`, else the only GLB, else the only mesh file; None without any.
 
     Raises:
-        InputError: There are several mesh files, and none takes precedence.
+        InputError: there are several mesh files, and none takes precedence.
     """
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
     named = [file for file in files if file.stem.lower() == "textured"]
@@ -200,15 +200,15 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     """Find mesh files: object name -> file, sorted by name.
 
     Args:
-        folder: directory with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subdirectories with one mesh file each, or
+        folder: folder with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subfolders with one mesh file each, or
             both.
-        names: object name -> scan (a subdirectory's name or a file's stem), or a file with this table, see
+        names: object name -> scan (a subfolder's name or a file's stem), or a file with this table, see
             `read_names`. By default every scan is an object under its own name.
 
     Raises:
-        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` is damaged or
-            has an unknown scan, or `check_name` refuses the name of an object.
-        OSError: The file `names` cannot be opened.
+        InputError: the folder is missing or has no mesh, a scan exists twice or is ambiguous, or `names` is damaged
+            or has an unknown scan; also as `check_name`.
+        OSError: the file `names` cannot be opened.
     """
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
@@ -250,7 +250,7 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
         name: name of the only object to find; None finds all objects of a folder, under their own names.
 
     Raises:
-        InputError: there is no such mesh, or `name` is None for a file.
+        InputError: there is no such mesh, or `name` is None for a file; also as `find_meshes`.
     """
     if not path.is_dir():
         if name is None:
@@ -273,8 +273,8 @@ def read_names(path: str | Path) -> dict[str, str]:
     """Read a table of object name -> scan from a file, JSON if its name ends with .json and YAML otherwise.
 
     Raises:
-        InputError: The file is missing, damaged, empty, or not a flat table of strings.
-        OSError: The file cannot be opened.
+        InputError: the file is missing, damaged, empty, or not a flat table of strings.
+        OSError: the file cannot be opened.
     """
     with with_context(f"names file {path}"):
         table = read_table(Path(path))

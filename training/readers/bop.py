@@ -42,7 +42,7 @@ class BOP(LabelledFrames):
             names: YAML or JSON file, obj_id -> name. Default: obj_000001 and so on.
 
         Raises:
-            InputError: There are no frames, or `names` is damaged.
+            InputError: there are no frames, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
         path = dataset_folder(named_path(path))
@@ -60,7 +60,7 @@ class BOP(LabelledFrames):
         """Read a frame, the names of its scored instances and its scene.
 
         Raises:
-            InputError: as indexing does, or a table has no entry for the image or an object.
+            InputError: a table has no entry for the image or an object; also as indexing.
         """
         image = self.sources[number]
         scene = _scene(image)

@@ -237,7 +237,7 @@ def _listed(labels: Iterable[int]) -> str:
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Read `labels.json`: label -> name of the object; raises InputError and OSError."""
+    """Read `labels.json`: label -> name of the object; raise InputError or OSError if it is unusable."""
     content = read_file(path)
     with decoding(f"{path} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
         entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
@@ -267,7 +267,7 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
         every: take every `every`-th frame.
 
     Raises:
-        InputError: the recording has no complete frame, or `Bag` raises it. Frames before a later damage are returned.
+        InputError: the recording has no complete frame; also as `Bag`. Frames before a later damage are returned.
         OSError: the recording cannot be opened.
     """
     recording = _Recording(open_bag, every)

@@ -106,7 +106,7 @@ class LabelledFrames(abc.ABC):
 
     @abc.abstractmethod
     def read(self, number: int) -> tuple[RGBDFrame, Mapping[int, str], Mapping[str, str]]:
-        """Read the images, the names and the attributes of a frame, see `LabelledFrame`; raises as indexing does."""
+        """Read the images, the names and the attributes of a frame, see `LabelledFrame`; raise errors as indexing."""
 
     def files(self, number: int) -> Sequence[Path]:
         """Return the files from which a frame is read; empty by default."""
@@ -123,5 +123,5 @@ class LabelledFrames(abc.ABC):
         return one
 
     def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read the frames one at a time; raises as indexing does."""
+        """Read the frames one at a time; raise errors as indexing."""
         return (self[number] for number in range(len(self)))

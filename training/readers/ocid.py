@@ -2,7 +2,7 @@
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
 Two cameras record each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects.
-A YAML or JSON file does: sequence -> names in the order of placement, which is also the order of the labels:
+A YAML or JSON file gives the names: sequence -> names in the order of placement, which is the order of the labels:
 
     seq36: [mug, bowl, banana]                      # of both cameras
     table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
@@ -53,7 +53,7 @@ class OCID(LabelledFrames):
             names: YAML or JSON file, see the module.
 
         Raises:
-            InputError: There are no frames, or `names` is damaged, lacks sequences (listed in the message), or is a
+            InputError: there are no frames, or `names` is damaged, lacks sequences (listed in the message), or is a
                 table of OCID-VLG without any of the frames.
             OSError: `names` cannot be opened.
         """
@@ -86,7 +86,7 @@ class OCID(LabelledFrames):
         """Read a frame, its names, and the place, the camera and the type of its sequence.
 
         Raises:
-            InputError: as indexing does, the cloud does not fit a pinhole camera, or a label has no name.
+            InputError: the cloud does not fit a pinhole camera, or a label has no name; also as indexing.
         """
         sequence = sequence_of(self.identifiers[number])
         image, depth_file, label_file, cloud_file = self.files(number)
@@ -172,7 +172,8 @@ def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
     errors, not the pixels: in the dataset's clouds z is a mean over time, x and y are not.
 
     Raises:
-        InputError: there are too few points, or they do not lie on the rays of a pinhole camera.
+        InputError: there are too few points, or they do not lie on the rays of a pinhole camera; the message has the
+            fit.
     """
     row, column = np.nonzero(np.isfinite(points).all(axis=-1) & (points[..., 2] > 0))
     if len(row) == 0 or np.ptp(row) == 0 or np.ptp(column) == 0:
@@ -250,7 +251,7 @@ def _binary(data: bytes, record: np.dtype[Any], n: int, axes: list[int], path: P
     if len(data) < n * record.itemsize:
         raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
     records = np.frombuffer(data, record, count=n)
-    with np.errstate(invalid="ignore"):  # of signalling NaN
+    with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
         return np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
 
 

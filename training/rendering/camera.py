@@ -126,7 +126,7 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
         [n, 2] float64, azimuth and polar angle in radians, azimuth varying fastest; 72 x 37 rows by default.
 
     Raises:
-        InputError: A step is not positive, does not divide its range or gives more than `MAX_VIEWS` views.
+        InputError: a step is not positive, does not divide its range or gives more than `MAX_VIEWS` views.
     """
     n, n_polar = _steps("azimuth_step", azimuth_step, 360), _steps("polar_step", polar_step, 180) + 1
     if n * n_polar > MAX_VIEWS:
@@ -259,7 +259,7 @@ def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = T
     """Render colours and depth from a pose.
 
     Args:
-        caster: index of the object.
+        caster: ray-casting index of the object.
         pose: [4, 4] camera to object frame, as from `camera_pose`.
         camera: size and intrinsics of the whole image.
 

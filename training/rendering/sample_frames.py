@@ -39,7 +39,7 @@ def write_sample_frames(directory: str | Path) -> None:
     """Write the frames, and `index.json` with their titles and objects, to a directory; files are overwritten.
 
     Raises:
-        OSError: A file cannot be written.
+        OSError: a file cannot be written.
     """
     directory, objects = Path(directory), builtin_objects()
     index = []

@@ -38,7 +38,7 @@ def write_sample_recording(path: str | Path) -> None:
         path: MCAP file (.mcap) or directory of a ROS 2 bag that does not exist; 0.45 MB.
 
     Raises:
-        InputError: as raised by `MessageBag`.
+        InputError: as `MessageBag`.
         OSError: the recording cannot be written.
     """
     topics = {COLOR: COMPRESSED_IMAGE, DEPTH: COMPRESSED_IMAGE, INFO: "sensor_msgs/msg/CameraInfo"}

@@ -1,1 +1,1 @@
-"""HTML pages, plots and pictures of instances."""
+"""HTML pages, plots, and the page of an explanation."""

@@ -144,11 +144,11 @@ def _advice(explanation: Explanation) -> str:
 
 
 def _changes_text(explanation: Explanation) -> str:
-    kinds = {"color": "A shift of all colours by", "extent": "A change of the box by"}
+    kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
     sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
     unchanged = {
         "color": "No shift of the colours by up to half of their range changes the answer.",
-        "extent": "No change of the sides from half to twice their length changes the answer.",
+        "extent": "No change of the side lengths by up to a factor of two changes the answer.",
     }
     changed = {change.kind for change in explanation.changes}
     return " ".join([*sentences, *(text for kind, text in unchanged.items() if kind not in changed)])

@@ -106,8 +106,8 @@ def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
 
     Args:
         progress: the callback to call with the extended name and note.
-        stages: name -> share of the time of all stages, in any unit, in the order of the stages; 0 if it is not known.
-            Other stages are passed on unchanged.
+        stages: name -> expected time in any unit, or 0 if it is not known, in the order of the stages. Other stages are
+            passed on unchanged.
     """
     names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
     earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))

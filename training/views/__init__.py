@@ -1,1 +1,1 @@
-"""Training views: normalized point clouds of rendered meshes, in memory and on disk."""
+"""Training views: normalized point clouds and crops of meshes and labelled instances, in memory and on disk."""

@@ -7,8 +7,9 @@
         views = dataset.read(index)                # views.xyz, views.rgb, views.counts, views.label
 
 A dataset contains normalized point clouds, not images: for each object, one cloud per camera angle as rendered (`copy`
-0) and, if the job has augmentations, further clouds of augmented copies of the same view (`copy` 1, 2, ...). Views with
-too few points are left out. Its directory has `manifest.json` and shards, safetensors files with views of one object:
+0) and, if the job has augmentations, its augmented copies (`copy` 1, 2, ...), which are seen from random cameras. Views
+with too few points are left out. Its directory has `manifest.json` and shards, safetensors files with views of one
+object:
 
     xyz     [n, 3] uint16   points of all views, one view after the other, in `COORDINATE_STEP` scaled units
     rgb     [n, 3] uint8    sRGB
@@ -123,7 +124,7 @@ class Manifest:
         """Write the manifest to the dataset's directory, replacing the one there.
 
         Raises:
-            OSError: The directory cannot be written.
+            OSError: the directory cannot be written.
         """
         table = {
             "format": MANIFEST_FORMAT,
@@ -140,7 +141,7 @@ class Manifest:
         """Parse the manifest from the bytes of a file.
 
         Raises:
-            InputError: The manifest is damaged or has another format; the message names `path`.
+            InputError: the manifest is damaged or has another format; the message names `path`.
         """
         try:
             table = json.loads(content)
@@ -173,7 +174,7 @@ class ViewDataset:
         """Open a dataset written by `render_dataset`; shards are read and checked by `read`.
 
         Raises:
-            InputError: The directory or its manifest is missing, the manifest is damaged or of another format or
+            InputError: the directory or its manifest is missing, the manifest is damaged or of another format or
                 descriptor version, or the rendering is not finished.
         """
         directory = Path(path)
@@ -226,7 +227,7 @@ class ViewDataset:
         """Read the views of a shard.
 
         Raises:
-            InputError: The shard's file is missing or damaged.
+            InputError: the shard's file is missing or damaged.
         """
         shard = self.shards[index]
         content = intact_content(self.directory, shard.file, shard.sha256)
@@ -245,7 +246,7 @@ class ViewDataset:
             size: side of the crops, pixels; larger stored crops are reduced.
 
         Raises:
-            InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
+            InputError: the dataset has no crops or smaller ones, or a file is missing or damaged.
         """
         return read_crops(self, index, size)
 
@@ -254,8 +255,8 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     """Return the manifest with the intact shards; write it if it is missing or lists damaged shards.
 
     Raises:
-        InputError: The directory holds another job.
-        OSError: The directory cannot be written.
+        InputError: the directory holds another job.
+        OSError: the directory cannot be written.
     """
     path = directory / MANIFEST
     stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
@@ -273,8 +274,8 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, i
     """Normalize the clouds of a shard and write its file; `planned` is the number including left-out clouds.
 
     Raises:
-        InputError: A cloud cannot be normalized or stored.
-        OSError: The file cannot be written.
+        InputError: a cloud cannot be normalized or stored.
+        OSError: the file cannot be written.
     """
     numbers = [number for number, _, _ in rendered], [copy for _, copy, _ in rendered]
     views = normalize_views([cloud for _, _, cloud in rendered], label, *numbers, DescriptorConfig())
@@ -300,8 +301,8 @@ def render_dataset(
         progress: called with (clouds done, total clouds) at the start and after each shard.
 
     Raises:
-        InputError: The job is invalid, see `RenderJob.record`; or `out` holds something else or views of another job
-            (the message names the difference), or another process writes to it. Nothing is written then.
+        InputError: `out` holds something else or views of another job (the message names the difference), or another
+            process writes to it; also as `RenderJob.record`. Nothing is written then.
         OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)

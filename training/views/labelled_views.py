@@ -74,7 +74,7 @@ def read_instances(
 
     Raises:
         InputError: a folder or a frame cannot be read, or an object has no usable view. Instances with a name that
-            `check_name` rejects are skipped.
+            `check_name` refuses are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
     crops: dict[str, list[QuantizedCrop]] = {}
@@ -170,7 +170,7 @@ class WithLabelledViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.
 
         Raises:
-            InputError: the source of the rendered views raises it, or an instance is too long.
+            InputError: an instance is too long; also as the source of the rendered views.
         """
         if index < self._first:
             assert self._rendered is not None
@@ -189,7 +189,7 @@ class WithLabelledViews:
         """Read the crops of a shard of the rendered views, or the crops of a class's instances, repeated for copies.
 
         Raises:
-            InputError: the source of the rendered views raises it.
+            InputError: as the source of the rendered views.
         """
         if index < self._first:
             assert self._rendered is not None

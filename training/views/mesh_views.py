@@ -99,7 +99,7 @@ def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64]) -> "Cloud":
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8.
 
     Raises:
-        InputError: The mesh is not visible.
+        InputError: the mesh is not visible.
     """
     xyz, rgb = cloud_of(render_view(RayCaster([mesh]), pose))
     if len(xyz) == 0:
@@ -175,7 +175,7 @@ def _checked_meshes(
     """Yield each object's name and mesh, one at a time, so that unusable meshes are found before the long rendering.
 
     Raises:
-        InputError: There are no meshes, or a mesh is unreadable or has no view of at least `MIN_VIEW_POINTS` points.
+        InputError: there are no meshes, or a mesh is unreadable or has no view of at least `MIN_VIEW_POINTS` points.
     """
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
@@ -293,7 +293,7 @@ def render_views(
         `view_angles`; views with fewer than `MIN_VIEW_POINTS` points are left out.
 
     Raises:
-        InputError: There are no meshes, a mesh is unreadable or never visible, or a step is invalid.
+        InputError: there are no meshes, a mesh is unreadable or never visible, or a step is invalid.
     """
     angles = view_angles(azimuth_step, polar_step)
     tasks = (ViewTask(name, mesh, angles) for name, mesh in _checked_meshes(meshes, angles))

@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 CLOUDS_PER_BATCH = 64
-"""Batch size of everything that is computed of the clouds of a training."""
+"""Batch size of all computations on the clouds of a training."""
 
 
 def padded_batches(
@@ -57,7 +57,7 @@ def padded_batches(
         The number of clouds in the batch without the empty ones, and the batch, padded by `batch_points`.
 
     Raises:
-        InputError: A cloud has more points than the largest bucket.
+        InputError: a cloud has more points than the largest bucket.
     """
     empty: Cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     for start in range(0, len(clouds), CLOUDS_PER_BATCH):
@@ -106,7 +106,7 @@ class SourceShard(NamedTuple):
 
 
 class ViewSource(Protocol):
-    """Normalized views in shards of one object each: a `ViewDataset` on disk, or `MemoryViews`."""
+    """Normalized views in shards of one object each, such as a `ViewDataset` on disk or `MemoryViews`."""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ class ViewSource(Protocol):
         """Read the crops of the views of a shard, in their order, with sides of `size` pixels.
 
         Raises:
-            InputError: There are no crops, or they are smaller.
+            InputError: there are no crops, or they are smaller.
         """
 
 
@@ -154,7 +154,7 @@ def normalize_views(
         boundary: points on the occlusion boundary, see `padded_batches`.
 
     Raises:
-        InputError: A cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
+        InputError: a cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
     xyz = [np.zeros((0, 3), np.float32)]
     # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory.
@@ -205,7 +205,7 @@ class MemoryViews:
         """Normalize the views of a class.
 
         Raises:
-            InputError: A cloud has more points than the largest bucket, or is too long.
+            InputError: a cloud has more points than the largest bucket, or is too long.
         """
         clouds = self._clouds[index]
         return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)
@@ -252,8 +252,8 @@ def fold_of_views(
 ) -> NDArray[np.intp]:
     """Return the fold of each cloud [M], from 0; the views of every class are distributed randomly and evenly.
 
-    All clouds of a view (mirrored and augmented copies) are in the same fold. They are nearly equal, so otherwise the
-    held-out set would be known from training.
+    All clouds of a view (mirrored and augmented copies) are in the same fold, since nearly equal clouds in the training
+    set would raise the held-out accuracy.
 
     Args:
         label: [M], index into `classes`.
@@ -287,7 +287,7 @@ def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
         Sequence -> views of its objects.
 
     Raises:
-        InputError: The table is unreadable or empty, a sequence is not a relative path, or the source has no views of
+        InputError: the table is unreadable or empty, a sequence is not a relative path, or the source has no views of
             an object.
     """
     sources: dict[str, ViewSource] = {}

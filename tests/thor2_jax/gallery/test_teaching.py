@@ -69,7 +69,7 @@ def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) 
 
 def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monkeypatch: pytest.MonkeyPatch) -> None:
     objects = ObjectGallery(tuple(builtin_objects()))
-    assert objects.gallery.summary == "18 toy objects of the demo; it knows nothing of yours"
+    assert objects.gallery.summary == "18 toy objects of the demo; none of yours"
     objects.forget("apple")
     assert objects.gallery.summary.startswith("17 toy objects")
     objects = taught(run, embedding).objects

@@ -97,4 +97,4 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert first["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.6
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
     error = refused(*command, at_once=False)  # without names, all objects are unknown
-    assert "obj_000013, obj_000014, the runs know bowl, mug" in error
+    assert "obj_000013, obj_000014, the runs have bowl, mug" in error

@@ -140,8 +140,8 @@ function show(answer, bitmap, selected) {
 /** Return a description of the model's objects, and of how to enroll others. */
 function unknownHint() {
   const { knows, teaches } = loaded.model;
-  const how = teaches ? "Click an object to name it." : "Teach it by thor2 enroll, or here after thor2 serve --teach.";
-  return `This model knows ${knows}${knows.endsWith(".") ? "" : "."} ${how}`;
+  const how = teaches ? "Click an object to name it." : "Enroll objects by thor2 enroll, or here after thor2 serve --teach.";
+  return `This model recognizes ${knows}${knows.endsWith(".") ? "" : "."} ${how}`;
 }
 
 function objectButton(instance, color) {
@@ -222,7 +222,7 @@ async function load() {
 }
 
 function showClasses({ classes, knows }) {
-  byId("model-title").textContent = `This model knows ${knows}`;
+  byId("model-title").textContent = `This model recognizes ${knows}`;
   byId("classes").replaceChildren(...classes.map((name) => element("li", {}, name)));
   byId("model").hidden = false;
 }

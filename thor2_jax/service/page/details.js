@@ -50,11 +50,11 @@ function calibration(confidence, calibrated) {
 function confidenceHelp(calibrated, sources) {
   if (!sources.length) return "No object is enrolled.";
   const gallery = "The score of the gallery is about 1 among the enrolled views of an object and about 0 far from all of them. ";
-  if (sources.length === 1 && sources[0] === "gallery") return `${gallery}It is the confidence; it is not calibrated.`;
-  const both = "An object without training takes this score as its confidence, a trained class the geometric mean of its probabilities, and of its score if it has views, too. ";
+  if (sources.length === 1 && sources[0] === "gallery") return `${gallery}The confidence rises with it and is 50 % at a score of 0.2; it is not calibrated.`;
+  const both = "An enrolled object is the answer only if its score is high and no trained class is likely. A trained class that is the answer keeps its confidence. ";
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
-  const known = "The embedding tells the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For objects that the model knows, it estimates the probability that the name is correct.";
+  const known = "The embedding separates the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For known objects, it estimates the probability that the name is correct.";
   const alone = sources.length === 1;
   if (sources.includes("embedding") && (!alone || calibrated !== null)) {
     return `The named class has the highest ${alone ? "probability" : "geometric mean of the other probabilities"}. ${known}`;

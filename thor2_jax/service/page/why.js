@@ -33,7 +33,7 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
   const subject = name === null ? `Most probable, though unknown: ${explained_name}. ` : "";
   const found = changes.length
     ? `Smallest changes that give another name: ${changes.join("; ")}.`
-    : "No small change of colour or extents gives another name.";
+    : "No small change of colour or side lengths gives another name.";
   const fall = `Without the tenth of the points that speaks most for the name, it falls by ${worst.toFixed(2)}; without a random tenth, by ${random.toFixed(2)}.`;
   return `${subject}${what}: ${margin.toFixed(1)}. ${fall} ${found}`;
 }

@@ -69,7 +69,7 @@ def weights_file(directory: Path, name: str) -> Path:
     """
     path = directory / f"{name}.safetensors"
     if not path.is_file():
-        raise InputError(f"weights: {path} does not exist; expected it in the directory, see docs/baselines.md")
+        raise InputError(f"weights: {path} does not exist; expected it in the folder, see docs/baselines.md")
     return path
 
 
@@ -80,7 +80,7 @@ def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -
         Name of each file -> its SHA-256.
 
     Raises:
-        InputError: a file does not exist, or `load_backbone` raises it.
+        InputError: a file does not exist; also as `load_backbone`.
     """
     digests = {}
     for model, name in backbones:
