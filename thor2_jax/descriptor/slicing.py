@@ -27,7 +27,7 @@ import numpy as np
 from colornet import ColorNetwork
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.descriptor.bounding_box import HIGHEST
+from thor2_jax.descriptor.view_normalization import HIGHEST
 from thor2_jax.types import Strips
 
 __all__ = [
