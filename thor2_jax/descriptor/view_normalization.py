@@ -1,15 +1,14 @@
 """View normalization and the rotation by alpha (paper, sections "View normalization" and "Slicing").
 
-View normalization rotates a cloud to a pose that does not depend on the camera's pose; `turn` prepares slicing.
-
 >>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
 >>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
 >>> aligned = turn(normal, DescriptorConfig())                   # doctest: +SKIP   the same as align(clouds, config)
 
-The pose is that of an approximately minimal-volume oriented bounding box (O'Rourke 1985). Along each of its axes, a
-minimal box projects to a minimum-area rectangle of the projected cloud. The search alternates over the axes: it keeps
-one axis and rotates the other two to the minimum-area rectangle. It uses support points only (the vertices of the
-convex hull that are extreme in a fixed set of directions), so that its cost does not depend on the number of points.
+View normalization rotates a cloud to a pose that does not depend on the camera's pose: that of an approximately
+minimal-volume oriented bounding box (O'Rourke 1985). Along each of its axes, a minimal box projects to a minimum-area
+rectangle of the projected cloud. The search alternates over the axes: it keeps one axis and rotates the other two to
+the minimum-area rectangle. It uses support points only (the vertices of the convex hull that are extreme in a fixed set
+of directions), so that its cost does not depend on the number of points. `turn` then prepares slicing.
 
 XLA keeps the order of a reduction of floats along the last axis, and therefore reduces one number at a time. `fold` and
 `argmax` combine rows of the axis elementwise, which uses vector registers and is several times as fast. They use
@@ -20,7 +19,6 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -32,17 +30,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.types import Parameters, PointClouds, check_batch
 
-__all__ = [
-    "HIGHEST",
-    "ROWS",
-    "Normalization",
-    "align",
-    "mirror",
-    "normalization_of",
-    "place_aligned",
-    "turn",
-    "view_normalize",
-]
+__all__ = ["ROWS", "Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
 HIGHEST = jax.lax.Precision.HIGHEST
 """Precision of all products; TF32, the default of recent GPUs, would lose three digits of a coordinate."""
@@ -63,17 +51,14 @@ COARSE_ANGLES = 17
 """Number of angles in a quarter turn. Two rounds of 9 finer angles around the best lead to steps of 0.33 degrees."""
 
 
-def _half_sphere(n: int = 4) -> np.ndarray:
-    """Return [33, 3] float32 unit vectors, no two of them opposite: integer points with |i| + |j| + |k| = n.
+def _half_sphere() -> np.ndarray:
+    """Return [33, 3] float32 unit vectors, no two of them opposite: integer points with |i| + |j| + |k| = 4.
 
     The set of lines along them does not change if an axis is reflected: eigenvectors have arbitrary signs, and the box
     must not depend on these signs.
     """
-    chosen: list[tuple[int, ...]] = []
-    for point in itertools.product(range(-n, n + 1), repeat=3):
-        if sum(map(abs, point)) == n and tuple(-a for a in point) not in chosen:
-            chosen.append(point)
-    directions = np.array(chosen, np.float64)
+    points = (p for p in itertools.product(range(-4, 5), repeat=3) if sum(map(abs, p)) == 4 and p < (0, 0, 0))
+    directions = np.array(list(points), np.float64)
     return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
 
 
@@ -101,16 +86,12 @@ def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array], row
     return functools.reduce(op, rows_of(folded))
 
 
-def _halves(values: jax.Array, half: int) -> list[jax.Array]:
-    return [jax.lax.slice_in_dim(values, start, start + half, axis=-1) for start in (0, half)]
-
-
 def argmax(values: jax.Array) -> jax.Array:
     """Return `values.argmax(axis=-1)` as int32, for any length > 0; the index may be that of any largest entry."""
     index = jnp.broadcast_to(jnp.arange(values.shape[-1], dtype=jnp.int32), values.shape)
     while values.shape[-1] > _PLAIN_LENGTH and values.shape[-1] % 2 == 0:
         half = values.shape[-1] // 2
-        (first, second), indices = _halves(values, half), _halves(index, half)
+        (first, second), indices = (jax.lax.split(each, (half, half), axis=each.ndim - 1) for each in (values, index))
         index = jax.lax.select(jax.lax.ge(first, second), *indices)
         values = larger(first, second)
     best = jnp.argmax(values, axis=-1)[..., None]
@@ -137,18 +118,14 @@ def support_points(points: jax.Array) -> jax.Array:
 
     # First find the best point index modulo N / 16, then the best of the 16 points with this residue.
     each = [rotate(half, row) for row in rows]
-    extremes = [functools.reduce(larger, each), -functools.reduce(smaller, each)]
-    residue = argmax(jnp.concatenate(extremes))
+    residue = argmax(jnp.concatenate([functools.reduce(larger, each), -functools.reduce(smaller, each)]))
     candidates = jnp.swapaxes(folded, 1, 2)[:, residue]
     row = argmax(rotate(jnp.concatenate([half, -half]), candidates))
     return points[:, row * folded.shape[2] + residue]
 
 
 def rotate(axes: jax.Array, points: jax.Array) -> jax.Array:
-    """Return the coordinates [K, N] of `points` [3, N] along the rows of `axes` [K, 3].
-
-    `points` may also be [3, K, N], with separate points for each row.
-    """
+    """Return the coordinates [K, N] of `points`, [3, N] or one set for each axis [3, K, N], along `axes` [K, 3]."""
     # Explicit sums are float32 on every device and faster than a matmul with a side of 3. They fuse with a reduction,
     # which then stores no [K, N] array.
     columns = (jax.lax.slice_in_dim(axes, k, k + 1, axis=1) for k in range(3))
@@ -195,30 +172,19 @@ def _minimum_area_angle(xy: jax.Array) -> jax.Array:
     return best
 
 
-def _search(support: jax.Array, starts: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Alternate minimum-area rectangles, starting from each of `starts` [K, 3, 3].
-
-    Return the axes of the boxes [K, 3, 3] as rows and their volumes [K] over `support` [3, M]; M is a multiple of 16.
-    """
-
-    def sweep(axes: jax.Array) -> jax.Array:
-        angle = _minimum_area_angle(rotate(axes, support)[:2])
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        # The cyclic shift moves the next axis to the last row, about which the next rotation is made.
-        return jnp.stack([c * axes[1] - s * axes[0], axes[2], c * axes[0] + s * axes[1]])
-
-    # With the loop inside `vmap`, it would be traced twice.
-    axes = jax.lax.fori_loop(0, SWEEPS, lambda _, axes: jax.vmap(sweep)(axes), starts)
-    rotated = jax.vmap(lambda each: rotate(each, support))(axes)
-    return axes, jnp.prod(rotated.max(axis=2) - rotated.min(axis=2), axis=1)
+def _sweep(axes: jax.Array, support: jax.Array) -> jax.Array:
+    """Rotate two of `axes` [3, 3] about the last one, to the minimum-area rectangle of `support` [3, M]."""
+    angle = _minimum_area_angle(rotate(axes, support)[:2])
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # The cyclic shift moves the next axis to the last row, about which the next rotation is made.
+    return jnp.stack([c * axes[1] - s * axes[0], axes[2], c * axes[0] + s * axes[1]])
 
 
 def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the axes of an approximately minimal-volume oriented box, longest side first, and its extents.
 
     The search starts from the principal axes of all points and from those of the support points (the released code uses
-    the vertices of the convex hull), and the smaller box is returned. No gradient flows through the axes, which are
-    discontinuous where another face of the cloud becomes flush with the box.
+    the vertices of the convex hull), and the smaller box is returned. No gradient flows through the axes.
 
     Args:
         points: [3, N] float32, mean zero, padding at the origin; N is a multiple of 16.
@@ -235,7 +201,10 @@ def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     support_axes = _eigenvectors(jnp.matmul(centred, centred.T, precision=HIGHEST))
     support = jnp.pad(support, ((0, 0), (0, -support.shape[1] % LANES)), mode="edge")
     starts = jnp.stack([jnp.eye(3, dtype=points.dtype), support_axes])
-    candidates, volumes = _search(support, starts)
+    # With the loop inside `vmap`, it would be traced twice.
+    candidates = jax.lax.fori_loop(0, SWEEPS, lambda _, axes: jax.vmap(_sweep, (0, None))(axes, support), starts)
+    rotated = jax.vmap(rotate, (0, None))(candidates, support)
+    volumes = jnp.prod(rotated.max(axis=2) - rotated.min(axis=2), axis=1)
     axes = candidates[jnp.argmin(volumes)]
     rotated = rotate(axes, principal)
     low, high = rotated.min(axis=1), rotated.max(axis=1)
@@ -411,7 +380,7 @@ def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters 
     return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 
 
-@partial(jax.jit, static_argnums=1)
+@functools.partial(jax.jit, static_argnums=1)
 def mirror(normal: PointClouds, axes: str) -> PointClouds:
     """Mirror normalized clouds within their boxes (paper, "Training": each view is also mirrored in x, y and xy).
 
