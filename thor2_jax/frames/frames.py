@@ -59,6 +59,7 @@ _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 MAX_INSTANCES = 1000
 """Largest number of instances of a frame; other images than labels, such as depth, have thousands of values."""
 
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class RGBDFrame:
     """A registered RGB-D image and the instances in it.

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, decoding, with_context
 from thor2_jax.files import parse_json, parse_yaml, read_file, read_npy
 
-__all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "check_camera", "distort", "parse_intrinsics", "read_intrinsics", "undistort"]
+__all__ = [
+    "DEFAULT_DEPTH_SCALE",
+    "Intrinsics",
+    "check_camera",
+    "distort",
+    "parse_intrinsics",
+    "read_intrinsics",
+    "undistort",
+]
 
 DEFAULT_DEPTH_SCALE = 1000.0
 
@@ -336,15 +344,12 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
         InputError: `content` is in none of the formats; also as `Intrinsics.of`.
     """
     values = _parse(content)
-    if (
-        isinstance(values, Mapping)
-        and values
-        and all(
-            str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry
-            for number, entry in values.items()
-        )
-    ):
-        numbers = {int(number): entry for number, entry in values.items()}
+    entries = values.items() if isinstance(values, Mapping) else []
+    is_image = [
+        str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry for number, entry in entries
+    ]
+    if is_image and all(is_image):
+        numbers = {int(number): entry for number, entry in entries}
         if len(numbers) > 1 and image not in numbers:
             raise InputError(
                 f"intrinsics has {len(numbers)} images and none has the number {image}; expected one that is the name "
