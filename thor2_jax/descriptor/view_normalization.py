@@ -190,7 +190,7 @@ def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         points: [3, N] float32, mean zero, padding at the origin; N is a multiple of 16.
 
     Returns:
-        Axes [3, 3] float32, orthonormal rows with arbitrary signs, and the least [3] and greatest [3] coordinate along
+        Axes [3, 3] float32, orthonormal rows with arbitrary signs, and smallest [3] and largest [3] coordinate along
         each axis.
     """
     points = jax.lax.stop_gradient(points)
