@@ -12,7 +12,7 @@ Of ten mutants for each module (seed 0), an earlier version of the tests killed 
 equal to the original: no `jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of
 equal length, bounds that no value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent
 of 80, indices JAX clips), another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again
-(the ball of `builder.py`, one rectangle fewer in `bounding_box.py`, its halving loop).
+(the ball of `builder.py`, one rectangle fewer in `view_normalization.py`, its halving loop).
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Atomic writes, digests, the check of output directories, files of named arrays, and values in JSON and YAML files."""
+"""Atomic writes, digests, the check of output directories, files of arrays, and values in JSON and YAML files."""
 
 import contextlib
 import errno
@@ -10,7 +10,7 @@ import re
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ __all__ = [
     "parse_json",
     "parse_yaml",
     "read_file",
+    "read_npy",
     "read_table",
     "remove_leftovers",
     "remove_written",
@@ -248,6 +249,21 @@ def safetensors_metadata(content: bytes) -> dict[str, str]:
     """
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
     return dict(header.get("__metadata__", {}))
+
+
+def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
+    """Read an array from an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
+
+    Raises:
+        Exception: of any type, if the file is damaged, contains Python objects or more than `max_bytes` of values.
+    """
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, dtype = read_header[version](stream)
+    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # also rejects values without bytes (type V0)
+        raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -60,15 +60,15 @@ Classifier = Callable[[LookDescriptors], jax.Array]
 """Function from the descriptors of K looks at B clouds to class probabilities [B, C], with sums of at most 1."""
 
 
-def check_features(names: object, argument: str) -> tuple[Feature, ...]:
+def check_features(names: object) -> tuple[Feature, ...]:
     """Return `names` as a tuple of known features in the order of FEATURES.
 
     Raises:
-        InputError: a name is unknown or given twice, or no name is given; the message names `argument`.
+        InputError: a name is unknown or given twice, or no name is given.
     """
     values = tuple(names) if isinstance(names, (list, tuple)) else ()
     if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
-        raise InputError(f"{argument} is {names!r}; expected one or more of {', '.join(FEATURES)}")
+        raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(FEATURES)}")
     return tuple(name for name in FEATURES if name in values)
 
 

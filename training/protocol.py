@@ -82,7 +82,7 @@ class Protocol:
 
     def __post_init__(self) -> None:
         if self.classifiers or self.distractors is None:
-            object.__setattr__(self, "classifiers", check_features(self.classifiers, "classifiers"))
+            object.__setattr__(self, "classifiers", check_features(self.classifiers))
 
     @property
     def network(self) -> colornet.ColorNetwork:

@@ -28,7 +28,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
-from thor2_jax.model.run_record import RUN_FILE
+from thor2_jax.model.run_record import RUN_FILE, run_directories
 from thor2_jax.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import (
@@ -80,8 +80,7 @@ def check_out(out: str | Path) -> None:
 
 def is_finished(out: Path) -> bool:
     """Return whether a directory holds a trained run or all of its folds."""
-    trained = any((directory / RUN_FILE).is_file() for directory in (out, *out.glob("fold-*")))
-    return trained and not (out / JOB).exists()
+    return bool(run_directories(out)) and not (out / JOB).exists()
 
 
 def check_trained(digest: str, out: Path, settings: Protocol) -> None:

@@ -106,12 +106,12 @@ def test_dropout_is_active_only_in_training() -> None:
 
 @pytest.mark.parametrize("names", [*itertools.permutations(FEATURES), ("tops",), ["tops2", "ce"]])
 def test_features_come_in_one_order(names: object) -> None:
-    assert check_features(names, "x") == tuple(name for name in ("ce", "tops", "tops2") if name in names)  # type: ignore[operator]
+    assert check_features(names) == tuple(name for name in ("ce", "tops", "tops2") if name in names)  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("names", [(), [], ["tops", "tops"], ["shape"], "tops", None, ["tops", None], 3])
 def test_bad_features_are_refused(names: object) -> None:
-    assert_refused(rf"^classifiers is {re.escape(repr(names))}.*ce, tops, tops2", check_features, names, "classifiers")
+    assert_refused(rf"^classifiers is {re.escape(repr(names))}.*ce, tops, tops2", check_features, names)
 
 
 def test_each_feature_is_its_descriptor() -> None:

@@ -182,8 +182,8 @@ def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
 )
 def test_bad_images(change: dict[str, Any]) -> None:
     diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
-    with pytest.raises(thor2.InputError, match=f"^{next(iter(change))} is [^\n]*$"):
-        persistence.images(diagrams, **({**IMAGE, "variance": 0.1} | change))
+    options = {**IMAGE, "variance": 0.1} | change
+    assert_refused(f"^{next(iter(change))} is [^\n]*$", persistence.images, diagrams, **options)
 
 
 def test_numbers_of_pixels_may_be_from_numpy() -> None:

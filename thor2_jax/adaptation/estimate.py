@@ -105,11 +105,10 @@ def objective(
     Args:
         instances: usable instances with the camera's colours.
         criterion: function that computes the probabilities of the names, see `adaptation_criterion`.
-        capacity: N, padded number of points, so that only one shape is compiled; larger clouds are left out. By default
-            each chunk has the point bucket of its largest cloud.
+        capacity: N, padded number of points of all chunks, so that only one shape is compiled. By default each chunk
+            has the point bucket of its largest cloud.
     """
-    fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
-    ordered = sorted(fitting, key=lambda each: len(each.points))
+    ordered = sorted(instances, key=lambda each: len(each.points))
     chunks = []
     for start in range(0, len(ordered), ROWS):
         part = ordered[start : start + ROWS]

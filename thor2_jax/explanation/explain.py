@@ -27,7 +27,7 @@ from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, g
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import embed_looks
-from thor2_jax.model.inference import answers, infer_clouds, values
+from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
@@ -234,9 +234,10 @@ def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]
     """Return the answer of the model and the most probable name."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    inference = infer_clouds(model, packed(instance))
+    inference = jax.tree.map(np.asarray, infer_clouds(model, packed(instance)))
     (recognition,) = answers(model, [instance], inference)
-    return recognition, model.names[int(values(model, inference)[0].argmax())]
+    values = model.combined(inference.probabilities, object_scores(model, inference))
+    return recognition, model.names[int(values[0].argmax())]
 
 
 def _scores_of(model: Model, name: str) -> ClassScores:

@@ -3,30 +3,36 @@
 frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
 frame.instances                        # label numbers; 0 is background
 points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, OpenCV camera frame
+
+Image files are not trusted. They are PNG, JPEG or TIFF; depth may also be NPY or EXR.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.image_files import read_depth, read_image
-from thor2_jax.frames.intrinsics import Intrinsics, read_intrinsics
+from thor2_jax.errors import InputError, decoding, needs_extra
+from thor2_jax.files import open_file, read_npy
+from thor2_jax.frames.intrinsics import Intrinsics, check_camera, read_intrinsics, undistort
 
 __all__ = [
+    "ImageSizeError",
     "Intrinsics",
     "MAX_DEPTH",
+    "MAX_IMAGE_PIXELS",
     "MIN_DEPTH",
     "RGBDFrame",
     "RecordedFrame",
     "backproject",
     "check_images",
-    "distort",
+    "check_size",
+    "decode_image",
     "frame_intrinsics",
     "pixel_points",
     "pixel_rays",
@@ -36,22 +42,24 @@ __all__ = [
     "read_intrinsics",
     "read_labels",
     "stamp_name",
-    "undistort",
 ]
 
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
 """Range of valid depth, metres."""
 
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
+"""Image formats that are read. For some of its other formats, Pillow runs external programs."""
+
+MAX_IMAGE_PIXELS = 2**26
+"""Largest number of pixels of an image that is read: a small file can decompress to gigabytes."""
+
+_EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
+
+_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
+"""Names of the depth channel in EXR files with several channels."""
+
 MAX_INSTANCES = 1000
 """Largest number of instances of a frame; other images than labels, such as depth, have thousands of values."""
-
-MAX_DISTORTION_ERROR = 0.5
-"""Largest error of the inverse of a lens distortion, pixels."""
-
-_ITERATIONS = 30
-"""Steps of the iteration that inverts a lens distortion."""
-
-Array = NDArray[np.floating[Any]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,7 +95,7 @@ class RGBDFrame:
         if labels is not None and labels.min() < 0:
             raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
         intrinsics = Intrinsics.of(self.intrinsics)
-        _check_camera(intrinsics, *color.shape[:2])
+        check_camera(intrinsics, *color.shape[:2])
         for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):
             object.__setattr__(self, name, value)
 
@@ -166,37 +174,6 @@ def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDA
         raise InputError(f"labels has type {labels.dtype}; expected integers")
 
 
-def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return the radial factor and both tangential terms of OpenCV's polynomial or rational model.
-
-    Coordinates, here and below, are x / z and y / z in the camera frame; the coefficients are `Intrinsics.distortion`.
-    """
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
-    squared = x * x + y * y
-    radial = (1 + squared * (k1 + squared * (k2 + squared * k3))) / (1 + squared * (k4 + squared * (k5 + squared * k6)))
-    product = 2 * x * y
-    return radial, p1 * product + p2 * (squared + 2 * x * x), p1 * (squared + 2 * y * y) + p2 * product
-
-
-def distort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
-    """Return the image coordinates of directions (x, y), which are the coordinates in an ideal pinhole camera."""
-    radial, tangential_x, tangential_y = _terms(x, y, coefficients)
-    return x * radial + tangential_x, y * radial + tangential_y
-
-
-def undistort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
-    """Return the inverse of `distort` at (x, y), computed by fixed-point iteration.
-
-    Where the model has no inverse, the result is arbitrary, and `distort` does not map it to (x, y).
-    """
-    ideal_x, ideal_y = x, y
-    with np.errstate(all="ignore"):
-        for _ in range(_ITERATIONS):
-            radial, tangential_x, tangential_y = _terms(ideal_x, ideal_y, coefficients)
-            ideal_x, ideal_y = (x - tangential_x) / radial, (y - tangential_y) / radial
-    return ideal_x, ideal_y
-
-
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:
     """Return the rays [n, 3] with z = 1 through pixels (flat indices [n]), in the OpenCV camera frame.
 
@@ -209,28 +186,6 @@ def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> 
     if intrinsics.distortion:
         rays[:, 0], rays[:, 1] = undistort(rays[:, 0], rays[:, 1], intrinsics.distortion)
     return rays
-
-
-def _check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
-    """Raise InputError unless the camera fits images of this size."""
-    size = intrinsics.width or width, intrinsics.height or height
-    if size != (width, height):
-        raise InputError(
-            f"intrinsics is for images of {size[0]} x {size[1]} pixels; color has {width} x {height}; expected the "
-            "intrinsics of this image size"
-        )
-    if not intrinsics.distortion:
-        return
-    row, column = np.mgrid[0:height, 0:width][:, :: max(height // 16, 1), :: max(width // 16, 1)].reshape(2, -1)
-    x, y = (column - intrinsics.cx) / intrinsics.fx, (row - intrinsics.cy) / intrinsics.fy
-    with np.errstate(all="ignore"):
-        again_x, again_y = distort(*undistort(x, y, intrinsics.distortion), intrinsics.distortion)
-        pixels = np.hypot((again_x - x) * intrinsics.fx, (again_y - y) * intrinsics.fy).max()
-    if not pixels < MAX_DISTORTION_ERROR:
-        raise InputError(
-            f"intrinsics has the distortion {list(intrinsics.distortion)}, which has no inverse within the image; "
-            "rectify the images and give the intrinsics of the rectified images"
-        )
 
 
 def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
@@ -248,6 +203,108 @@ def pixel_points(pixels: NDArray[np.intp], depth_m: NDArray[Any], width: int, in
     They are computed in float64 and returned in the type of the depths, in the frame of `backproject`.
     """
     return (pixel_rays(pixels, width, intrinsics) * depth_m[:, None]).astype(depth_m.dtype)
+
+
+class ImageSizeError(ValueError):
+    """Error of an image that has no pixels or too many."""
+
+
+def check_size(width: int, height: int, max_pixels: int = MAX_IMAGE_PIXELS) -> None:
+    """Raise ImageSizeError unless an image has 1 to `max_pixels` pixels."""
+    if not 0 < width * height <= max_pixels:
+        raise ImageSizeError(f"{width} x {height} pixels; expected at most {max_pixels}")
+
+
+def decode_image(
+    stream: BinaryIO,
+    formats: tuple[str, ...] = IMAGE_FORMATS,
+    max_pixels: int = MAX_IMAGE_PIXELS,
+    lossless: bool = False,
+) -> tuple[NDArray[Any], str]:
+    """Decode an image; return its pixels and its Pillow mode, with ";16" for colour of 16 bits per channel.
+
+    Pillow keeps 8 of these 16 bits.
+
+    Raises:
+        ImageSizeError: the image has more than `max_pixels` pixels.
+        Exception: of any type, if the image is damaged, not in `formats` or, with `lossless`, has JPEG compression.
+    """
+    with Image.open(stream, formats=formats) as image:
+        check_size(*image.size, max_pixels)
+        if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
+            raise ValueError("JPEG compression changes label numbers")
+        image.verify()  # decoding does not check the checksums of a PNG
+    stream.seek(0)
+    with Image.open(stream, formats=formats) as image:
+        is_deep = image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
+        return np.asarray(image), f"{image.mode};16" if is_deep else image.mode
+
+
+def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
+    """Read an image file with `decode_image`.
+
+    Raises:
+        InputError: the file is damaged, not in `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
+            JPEG compression; the message names `argument` and the file.
+        OSError: the file cannot be opened.
+    """
+    expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
+    with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
+        return decode_image(stream, lossless=lossless)
+
+
+def read_depth(path: str | Path) -> NDArray[Any]:
+    """Read a depth image [H, W].
+
+    Returns:
+        uint16 in depth units from a 16-bit PNG or TIFF, uint16 or uint32 from integers in NPY, and floats in metres
+        from a float TIFF, NPY or EXR.
+
+    Raises:
+        InputError: the file is damaged, of another kind or too large, or is an EXR file and the package OpenEXR is
+            missing; the message names the file.
+        OSError: the file cannot be opened.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        with open_file(path) as stream, decoding(f"depth: {path} is a damaged NPY file", _EXPECTED):
+            pixels = read_npy(stream, 8 * MAX_IMAGE_PIXELS)
+    else:
+        pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    kind, size = pixels.dtype.kind, pixels.dtype.itemsize
+    if pixels.ndim != 2 or 0 in pixels.shape or kind not in "uif" or (kind != "f" and size < 2):
+        raise InputError(
+            f"depth: {path} has shape {pixels.shape} and type {pixels.dtype}; expected {_EXPECTED}, not a picture of "
+            "depth"
+        )
+    if kind == "f":
+        return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    # Pillow reads some 16-bit files as 32-bit integers.
+    largest = 2**32 - 1 if suffix == ".npy" else 2**16 - 1
+    if pixels.min() < 0 or pixels.max() > largest:
+        raise InputError(f"depth: {path} has values from {pixels.min()} to {pixels.max()}; expected 0 to {largest}")
+    return pixels.astype(np.uint16 if pixels.max() < 2**16 else np.uint32)
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    """Read the depth channel of an EXR file."""
+    with open_file(path):  # raises OSError if it cannot be opened, unlike OpenEXR
+        pass
+    with needs_extra(f"depth: {path} is an EXR file; expected PNG, TIFF or NPY; EXR", "OpenEXR", "exr"):
+        import OpenEXR
+    with decoding(f"depth: {path} is a damaged EXR file", _EXPECTED):
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
+            low, high = header.header()["dataWindow"]
+        check_size(*(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)))
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    names = [*channels] if len(channels) == 1 else [name for name in _EXR_CHANNELS if name in channels]
+    if not names:
+        raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")
+    return channels[names[0]]
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:

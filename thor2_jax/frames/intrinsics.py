@@ -1,4 +1,4 @@
-"""Intrinsics of cameras, read from common formats; docs/frames.md shows an example of each.
+"""Cameras: intrinsics, read from common formats, and lens distortion; docs/frames.md shows an example of each format.
 
 | format | recognized by | depth_scale in it, if any |
 |---|---|---|
@@ -20,12 +20,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, decoding, with_context
-from thor2_jax.files import parse_json, parse_yaml, read_file
-from thor2_jax.frames.image_files import read_npy
+from thor2_jax.files import parse_json, parse_yaml, read_file, read_npy
 
-__all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
+__all__ = [
+    "DEFAULT_DEPTH_SCALE",
+    "Intrinsics",
+    "check_camera",
+    "distort",
+    "parse_intrinsics",
+    "read_intrinsics",
+    "undistort",
+]
 
 DEFAULT_DEPTH_SCALE = 1000.0
 
@@ -42,9 +50,17 @@ DISTORTION_LENGTHS = (0, 4, 5, 8)
 """Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and OpenCV's
 rational model (ROS: rational_polynomial)."""
 
+MAX_DISTORTION_ERROR = 0.5
+"""Largest error of the inverse of a lens distortion, pixels."""
+
+_ITERATIONS = 30
+"""Steps of the iteration that inverts a lens distortion."""
+
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
 """Distortion models with OpenCV's coefficients; other models are refused unless all coefficients are 0."""
+
+Array = NDArray[np.floating[Any]]
 
 
 def _is_number(value: Any) -> bool:
@@ -175,6 +191,59 @@ def _coefficients(distortion: Any) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
+def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array, Array]:
+    """Return the radial factor and both tangential terms of OpenCV's polynomial or rational model.
+
+    Coordinates, here and below, are x / z and y / z in the camera frame; the coefficients are `Intrinsics.distortion`.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    squared = x * x + y * y
+    radial = (1 + squared * (k1 + squared * (k2 + squared * k3))) / (1 + squared * (k4 + squared * (k5 + squared * k6)))
+    product = 2 * x * y
+    return radial, p1 * product + p2 * (squared + 2 * x * x), p1 * (squared + 2 * y * y) + p2 * product
+
+
+def distort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return the image coordinates of directions (x, y), which are the coordinates in an ideal pinhole camera."""
+    radial, tangential_x, tangential_y = _terms(x, y, coefficients)
+    return x * radial + tangential_x, y * radial + tangential_y
+
+
+def undistort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return the inverse of `distort` at (x, y), computed by fixed-point iteration.
+
+    Where the model has no inverse, the result is arbitrary, and `distort` does not map it to (x, y).
+    """
+    ideal_x, ideal_y = x, y
+    with np.errstate(all="ignore"):
+        for _ in range(_ITERATIONS):
+            radial, tangential_x, tangential_y = _terms(ideal_x, ideal_y, coefficients)
+            ideal_x, ideal_y = (x - tangential_x) / radial, (y - tangential_y) / radial
+    return ideal_x, ideal_y
+
+
+def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
+    """Raise InputError unless the camera fits images of this size."""
+    size = intrinsics.width or width, intrinsics.height or height
+    if size != (width, height):
+        raise InputError(
+            f"intrinsics is for images of {size[0]} x {size[1]} pixels; color has {width} x {height}; expected the "
+            "intrinsics of this image size"
+        )
+    if not intrinsics.distortion:
+        return
+    row, column = np.mgrid[0:height, 0:width][:, :: max(height // 16, 1), :: max(width // 16, 1)].reshape(2, -1)
+    x, y = (column - intrinsics.cx) / intrinsics.fx, (row - intrinsics.cy) / intrinsics.fy
+    with np.errstate(all="ignore"):
+        again_x, again_y = distort(*undistort(x, y, intrinsics.distortion), intrinsics.distortion)
+        pixels = np.hypot((again_x - x) * intrinsics.fx, (again_y - y) * intrinsics.fy).max()
+    if not pixels < MAX_DISTORTION_ERROR:
+        raise InputError(
+            f"intrinsics has the distortion {list(intrinsics.distortion)}, which has no inverse within the image; "
+            "rectify the images and give the intrinsics of the rectified images"
+        )
+
+
 def _supported(model: Any, distortion: Any) -> Any:
     """Return the coefficients of a distortion model, or none if all are 0.
 
@@ -275,15 +344,12 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
         InputError: `content` is in none of the formats; also as `Intrinsics.of`.
     """
     values = _parse(content)
-    if (
-        isinstance(values, Mapping)
-        and values
-        and all(
-            str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry
-            for number, entry in values.items()
-        )
-    ):
-        numbers = {int(number): entry for number, entry in values.items()}
+    entries = values.items() if isinstance(values, Mapping) else []
+    is_image = [
+        str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry for number, entry in entries
+    ]
+    if is_image and all(is_image):
+        numbers = {int(number): entry for number, entry in entries}
         if len(numbers) > 1 and image not in numbers:
             raise InputError(
                 f"intrinsics has {len(numbers)} images and none has the number {image}; expected one that is the name "

@@ -218,9 +218,7 @@ class ObjectGallery:
     @property
     def embedding(self) -> Embedding:
         """The embedding of the views; the packaged one is loaded on first use."""
-        if self._embedding is None:
-            self._embedding = load_default()
-        return self._embedding
+        return self._embedding or load_default()
 
     @property
     def weak_rejection(self) -> str:

@@ -36,10 +36,10 @@ from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 
 __all__ = [
     "GALLERY_DIRECTORY",
-    "INDEX_FILE",
     "LOCK_SECONDS",
     "GalleryBusyError",
     "GalleryError",
+    "check_exists",
     "check_index",
     "gallery_stamp",
     "load_gallery",
@@ -78,6 +78,12 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size
+
+
+def check_exists(directory: Path) -> None:
+    """Raise GalleryError unless a directory has an index, or objects from which a lost index can be rebuilt."""
+    if gallery_stamp(directory) is None and not any(_own_objects(directory)):
+        raise GalleryError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
 
 
 def check_index(directory: Path) -> None:

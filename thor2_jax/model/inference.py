@@ -33,7 +33,6 @@ __all__ = [
     "infer_clouds",
     "object_scores",
     "padded_rows",
-    "values",
 ]
 
 MIN_PART = 32
@@ -163,11 +162,6 @@ def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | N
     if inference.embeddings is None:
         return inference.scores
     return model.gallery.scores(inference.embeddings)
-
-
-def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:
-    """Return the values [B, n] of all names; the largest value is the confidence, and its name is the answer."""
-    return model.combined(jax.tree.map(np.asarray, inference.probabilities), object_scores(model, inference))
 
 
 def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:

@@ -130,7 +130,7 @@ def load_run(path: str | Path) -> TrainedRun:
         config = DescriptorConfig.of_record(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
         # A run with enrolled objects only has neither.
-        names = check_features(description["classifiers"], "classifiers") if description["classifiers"] else ()
+        names = check_features(description["classifiers"]) if description["classifiers"] else ()
         fingerprint = description["color_network"]
         digests = {name: description["weights"][name] for name in names}
     except (KeyError, TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The description of a run, run.json; this module does not import JAX."""
+"""The description of a run, run.json, and where runs are; this module does not import JAX."""
 
 import json
 from pathlib import Path
@@ -8,12 +8,20 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file
 
-__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description"]
+__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "run_directories"]
 
 RUN_FORMAT = 2
 """Version of the layout, see `run_directory`. Format 1, of versions before 0.2, cannot be read."""
 
 RUN_FILE = "run.json"
+
+
+def run_directories(path: Path) -> list[Path]:
+    """Return the path of a run directory, or those of fold-0, fold-1, ... in it; an empty list if there are neither."""
+    if (path / RUN_FILE).is_file():
+        return [path]
+    folds = [file.parent for file in path.glob(f"fold-*/{RUN_FILE}") if file.parent.name[5:].isdecimal()]
+    return sorted(folds, key=lambda fold: int(fold.name[5:]))
 
 
 def read_description(path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, decode_image
+from thor2_jax.frames.frames import MAX_IMAGE_PIXELS, decode_image
 from thor2_jax.model.recognition import Box, Detection
 
 __all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_of"]

@@ -18,8 +18,8 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.image_files import ImageSizeError, decode_image, read_npy
+from thor2_jax.files import read_npy
+from thor2_jax.frames.frames import ImageSizeError, RGBDFrame, decode_image
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.printable import check_name
 from thor2_jax.service.problem import FieldError, RequestError, field_errors

@@ -23,7 +23,7 @@ from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import ObjectGallery
-from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, check_index
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -246,9 +246,8 @@ def _load(settings: Settings) -> Recognizer:
         InputError: as `Recognizer.load`; also if the given gallery does not exist and `teach` is not set.
     """
     directory = settings.gallery
-    if directory is not None and not settings.teach and not (directory / INDEX_FILE).is_file():
-        check_index(directory)
-        raise InputError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
+    if directory is not None and not settings.teach:
+        check_exists(directory)
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
         directory = directory or settings.model / GALLERY_DIRECTORY

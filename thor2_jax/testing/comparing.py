@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.bounding_box import ROWS
+from thor2_jax.descriptor.view_normalization import ROWS
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [

@@ -56,11 +56,11 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
 
     A FRAME that is a run directory, or the directory of a training with several folds, is used as a further model.
     """
-    from thor2_jax.model.run_record import RUN_FILE
+    from thor2_jax.model.run_record import run_directories
     from training.readers.frames import FrameFolder
 
     paths = given.frames or ()
-    runs = [path for path in paths if (path / RUN_FILE).is_file() or any(path.glob(f"fold-*/{RUN_FILE}"))]
+    runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, (given.color, given.bag)))

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish
@@ -26,11 +25,11 @@ def objects(
     ] = False,
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrollment."""
-    from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, load_gallery
+    from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists, load_gallery
     from thor2_jax.model.run_record import read_description
 
-    if gallery is not None and not (gallery / INDEX_FILE).is_file() and not (gallery / "objects").is_dir():
-        raise InputError(f"gallery: {gallery} has no {INDEX_FILE}; expected the directory of a gallery")
+    if gallery is not None:
+        check_exists(gallery)
     if reembed:
         from thor2_jax.recognizer import Recognizer
 

@@ -180,7 +180,7 @@ def train(
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
     protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
     if classifiers is not None:
-        protocol = protocol.replace(classifiers=check_features(options.split_names(classifiers), "classifiers"))
+        protocol = protocol.replace(classifiers=check_features(options.split_names(classifiers)))
     job = TrainJob(
         out=out,
         protocol=protocol,

@@ -27,7 +27,7 @@ from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
-from thor2_jax.model.run_record import RUN_FILE
+from thor2_jax.model.run_record import run_directories
 from training.storage.jobs import Progress, load_arrays, load_metadata, save_arrays
 
 __all__ = [
@@ -242,15 +242,12 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
     """
     directories: list[Path] = []
     for path in map(Path, paths):
-        folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
-        if (path / RUN_FILE).is_file() or not folds:
-            directories.append(path)
-        elif (path / CHECKPOINTS / BEGUN).exists():
+        runs = run_directories(path) or [path]
+        if path not in runs and (path / CHECKPOINTS / BEGUN).exists():
             raise InputError(
                 f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
             )
-        else:
-            directories += sorted(folds, key=lambda fold: int(fold.name[5:]))
+        directories += runs
     return directories
 
 

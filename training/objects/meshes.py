@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
-from thor2_jax.frames.image_files import check_size
+from thor2_jax.frames.frames import check_size
 from thor2_jax.printable import check_name
 from training.objects.mesh import TexturedMesh, merge_meshes
 
