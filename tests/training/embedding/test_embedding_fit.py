@@ -21,13 +21,13 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.networks import EmbeddingSizes, model_arrays
-from training.augmentation import orientation
 from training.embedding import build, fit
 from training.embedding import samples as module
 from training.embedding.build import build_embedding
 from training.embedding.fit import fit_embedding
 from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
 from training.fitting.loop import Checkpoints
+from training.views import normalized_views
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
@@ -70,7 +70,7 @@ def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        orientation, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
+        normalized_views, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
     )
     rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
