@@ -66,8 +66,8 @@ def test_axes_of_degenerate_clouds_are_orthonormal(name: str) -> None:
 
 def test_volumes_against_an_exhaustive_search() -> None:
     ratios = [np.prod(box_of(points)[1]) / np.prod(trimesh.bounds.oriented_bounds(points)[1]) for points in shapes()]
-    assert np.median(ratios) <= 1.02
-    assert max(ratios) <= 1.08
+    assert np.median(ratios) <= 1.003
+    assert max(ratios) <= 1.015  # 1.020 with fewer sweeps, 1.023 from the principal axes alone
 
 
 def test_each_side_is_a_minimum_area_rectangle() -> None:
@@ -78,8 +78,8 @@ def test_each_side_is_a_minimum_area_rectangle() -> None:
         for a, b in ((0, 1), (1, 2), (0, 2)):
             width, height = cv2.minAreaRect(turned[:, [a, b]].astype(np.float32))[1]
             ratios.append(sides[a] * sides[b] / (width * height))
-    assert np.median(ratios) <= 1.005
-    assert max(ratios) <= 1.08
+    assert np.median(ratios) <= 1.002
+    assert max(ratios) <= 1.03  # 1.05 with fewer sweeps
 
 
 def test_support_points_are_vertices_of_the_hull() -> None:
