@@ -32,7 +32,7 @@ from training.embedding.samples import Batch, Samples
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
-__all__ = ["RUN_SIZES", "batch_descriptors", "fit_embedding", "reference_views"]
+__all__ = ["RUN_SIZES", "describe_batch", "fit_embedding", "reference_views"]
 
 RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
 """Sizes of each network of a run; several small networks give steadier answers than fewer large networks."""
@@ -51,27 +51,25 @@ MARGIN = 0.12
 """Subtracted from the cosine between a view and its own proxy."""
 
 
-def batch_descriptors(
-    length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig
-) -> Descriptors:
-    """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
-    length, overflow = length.astype(jnp.float32), jnp.zeros(len(length), jnp.int32)
+def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """Return the descriptors of the samples of a batch."""
+    length, color = jnp.asarray(batch.length, jnp.float32), jnp.asarray(batch.color, jnp.float32)
     occupied = length > 0  # the pair of a strip with one point has no persistence and adds nothing to the image
-    strips = Strips(jnp.zeros_like(length), length, occupied, color.astype(jnp.float32), overflow)
+    strips = Strips(jnp.zeros_like(length), length, occupied, color, jnp.zeros(len(length), jnp.int32))
     return describe_strips(strips, network, config)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> LookDescriptors:
     """Return the descriptors of the samples of a batch, one look each."""
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
     each, statistics = jax.tree.map(lambda a: a[:, None], (descriptors, jnp.asarray(batch.statistics)))
     return LookDescriptors(each, statistics)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _projected_features(version: int, network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
     return projected_features(descriptors, jnp.asarray(batch.statistics), version)
 
 
@@ -106,7 +104,7 @@ def _step(
     keys: jax.Array,
 ) -> tuple[tuple[FitState, ...], jax.Array]:
     """Make one step of every network; return the next states, and the mean loss and accuracy [2] before the step."""
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
 
     def step(graph: Any, state: FitState, seen: jax.Array, key: jax.Array) -> tuple[FitState, jax.Array]:
         def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:

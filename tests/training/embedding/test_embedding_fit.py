@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from failures import Interrupted
@@ -80,7 +79,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     batch = samples.take(rows, SMALL_CONFIG)
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     normal = thor2.view_normalize(thor2.PointClouds.pack([rendered[k][1] for k in order[rows]]), SMALL_CONFIG)
-    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
     actual = whole_embedding(nnx.merge(*embedding._embedder), descriptors, batch.statistics)
     similarity = []
     for mirror in ("", "x"):
@@ -148,7 +147,7 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
     embedding, losses = fitted
     assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
     batch = views.take(np.arange(len(views)), SMALL_CONFIG)
-    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
     same = batch.label[:, None] == batch.label
     gaps = []
     for one in (Embedding.create(SMALL_CONFIG, sizes=SIZES), embedding):
