@@ -284,7 +284,7 @@ def fit_network(
 
     checkpoints = Checkpoints(task.scratch / fit.directory)
     shown = fit_progress(task.progress, f"fit {task.name}", steps.epochs)
-    state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=shown)
+    state = run_epochs(task.name, checkpoints.last(state), steps, epoch, step, checkpoints, progress=shown)
     return nnx.merge(graph, state.params, state.rest)
 
 

@@ -183,13 +183,12 @@ def fit_embedding(
 
     states = run_epochs(
         "the embedding",
-        states,
+        jax.tree.map(jnp.asarray, checkpoints.last(states)),
         Steps(epochs, n_steps, BATCH_SIZE),
         epoch,
         step,
         checkpoints,
         progress=progress,
-        place=lambda states: jax.tree.map(jnp.asarray, states),
     )
     models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))

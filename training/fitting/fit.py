@@ -269,14 +269,13 @@ def fit(
 
     state = run_epochs(
         context.feature,
-        initial,
+        _to_devices(checkpoints.last(initial), PartitionSpec()),
         steps,
         epoch,
         step,
         checkpoints,
         progress=progress,
         held_out_accuracy=held_out_accuracy,
-        place=lambda state: _to_devices(state, PartitionSpec()),
     )
     wait_for_all(f"fitted {context.feature}")
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))

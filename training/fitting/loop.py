@@ -1,7 +1,7 @@
 """The training loop of all networks, with metrics and with checkpoints from which an interrupted fit resumes.
 
     checkpoints = Checkpoints(directory)
-    state = checkpoints.last(state) if checkpoints.last_epoch else state
+    state = checkpoints.last(state)
     for epoch in range(checkpoints.last_epoch + 1, epochs + 1):
         ...
         checkpoints.save(epoch, state, score)
@@ -196,7 +196,7 @@ class Checkpoints:
                 self._path(old).unlink(missing_ok=True)
 
     def last(self, like: Any) -> Any:
-        """Return the state of the last checkpoint, as NumPy arrays.
+        """Return the state of the last checkpoint, as NumPy arrays; without a checkpoint, return `like`.
 
         Args:
             like: a state with the same structure, shapes and dtypes.
@@ -204,7 +204,7 @@ class Checkpoints:
         Raises:
             InputError: if the checkpoint is damaged or has another structure.
         """
-        return self._restore(self.last_epoch, like)
+        return self._restore(self.last_epoch, like) if self.last_epoch else like
 
     def best(self, like: Any) -> Any:
         """Return the state of the checkpoint with the highest score, like `last`."""
@@ -285,7 +285,6 @@ def run_epochs(
     *,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     held_out_accuracy: Callable[[State], float | None] = lambda state: None,
-    place: Callable[[State], State] = lambda state: state,
 ) -> State:
     """Train for all epochs, or for the epochs after the last checkpoint, and return the last state.
 
@@ -293,7 +292,7 @@ def run_epochs(
 
     Args:
         name: name of the networks, for messages.
-        state: pytree of the arrays that a step changes.
+        state: pytree of the arrays that a step changes, after the last checkpoint (`Checkpoints.last`).
         steps: numbers of the fit.
         batches: function that yields the batches of an epoch, given its number from 1.
         step: function of the state, the number of the step from 0, and a batch. It returns the next state, and the loss
@@ -302,13 +301,11 @@ def run_epochs(
             without a held-out set, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         held_out_accuracy: function of the state after an epoch; None without a held-out set.
-        place: function that moves a state to the devices.
 
     Raises:
-        InputError: the loss is not finite (the last checkpoint is kept), or a checkpoint is unreadable.
+        InputError: the loss is not finite; the last checkpoint is kept.
         OSError: a checkpoint cannot be written; the previous one is kept.
     """
-    state = place(checkpoints.last(state) if checkpoints.last_epoch else state)
     for epoch in range(checkpoints.last_epoch + 1, steps.epochs + 1):
         total, pending, start = np.zeros(2), [], 0.0
         for number, batch in enumerate(batches(epoch), 1):
