@@ -172,21 +172,19 @@ def fit_embedding(
     seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0
 
-    def epoch(number: int) -> Iterator[Batch]:
+    def train_epoch(number: int, states: tuple[FitState, ...]) -> Iterator[tuple[tuple[FitState, ...], jax.Array]]:
         # Order and dropout depend only on seed and step, so that a resumed fit needs no generator state.
-        order = np.random.default_rng([seed, number]).permutation(len(samples))
-        return samples.batches(order[: n_steps * BATCH_SIZE], BATCH_SIZE, config)
-
-    def step(states: tuple[FitState, ...], number: int, batch: Batch) -> tuple[tuple[FitState, ...], Any]:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), number + 1), networks)
-        return _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
+        order = np.random.default_rng([seed, number]).permutation(len(samples))[: n_steps * BATCH_SIZE]
+        for step, batch in enumerate(samples.batches(order, BATCH_SIZE, config), (number - 1) * n_steps + 1):
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), step), networks)
+            states, computed = _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
+            yield states, computed
 
     states = run_epochs(
         "the embedding",
         jax.tree.map(jnp.asarray, checkpoints.last(states)),
         Steps(epochs, n_steps, BATCH_SIZE),
-        epoch,
-        step,
+        train_epoch,
         checkpoints,
         progress=progress,
     )

@@ -264,7 +264,6 @@ STEPS_PER_REPORT = 20
 """Number of steps dispatched to the devices before their results are awaited; the host gathers batches meanwhile."""
 
 State = TypeVar("State")
-Item = TypeVar("Item")
 
 
 class Steps(NamedTuple):
@@ -279,8 +278,7 @@ def run_epochs(
     name: str,
     state: State,
     steps: Steps,
-    batches: Callable[[int], Iterable[Item]],
-    step: Callable[[State, int, Item], tuple[State, Any]],
+    train_epoch: Callable[[int, State], Iterator[tuple[State, Any]]],
     checkpoints: Checkpoints,
     *,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
@@ -294,9 +292,8 @@ def run_epochs(
         name: name of the networks, for messages.
         state: pytree of the arrays that a step changes, after the last checkpoint (`Checkpoints.last`).
         steps: numbers of the fit.
-        batches: function that yields the batches of an epoch, given its number from 1.
-        step: function of the state, the number of the step from 0, and a batch. It returns the next state, and the loss
-            and accuracy of the batch.
+        train_epoch: function of the number of an epoch, from 1, and the state before it. It makes the steps of the
+            epoch, and yields the state after each step, with the loss and accuracy of its batch.
         checkpoints: checkpoints of this fit only, written after each epoch. Their score is the held-out accuracy or,
             without a held-out set, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
@@ -308,8 +305,8 @@ def run_epochs(
     """
     for epoch in range(checkpoints.last_epoch + 1, steps.epochs + 1):
         total, pending, start = np.zeros(2), [], 0.0
-        for number, batch in enumerate(batches(epoch), 1):
-            state, computed = step(state, (epoch - 1) * steps.of_epoch + number - 1, batch)
+        for number, (updated, computed) in enumerate(train_epoch(epoch, state), 1):
+            state = updated
             pending.append(computed)
             if number == 1:
                 jax.block_until_ready(computed)  # the first step may compile
