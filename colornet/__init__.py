@@ -13,7 +13,7 @@
 import functools
 from pathlib import Path
 
-from colornet.grid import grid_index
+from colornet.colors import grid_index
 from colornet.network import ColorNetwork
 
 __all__ = ["ColorNetwork", "build", "grid_index", "load", "load_default", "save"]

@@ -17,8 +17,7 @@ from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
 from sklearn.neighbors import sort_graph_by_row_values
 
-from colornet.grid import grid_colors
-from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
+from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, hyab, to_lab
 from colornet.network import ColorNetwork
 
 __all__ = [

@@ -12,8 +12,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
 from numpy.typing import NDArray
 
+from colornet.colors import LUMA, MEAN_WHITE, to_lab
 from colornet.files import atomic_write
-from colornet.lab import LUMA, MEAN_WHITE, to_lab
 from colornet.network import ColorNetwork
 
 __all__ = ["draw_network", "draw_similarity", "plot_network"]

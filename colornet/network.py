@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from colornet.colors import GRID_SIZE, grid_index
 from colornet.files import read_arrays, write_arrays
-from colornet.grid import GRID_SIZE, grid_index
 
 __all__ = ["ColorNetwork"]
 

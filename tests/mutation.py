@@ -188,7 +188,7 @@ def read_results(path: Path) -> dict[Mutant, dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Mutation testing; see the docstring of this file.")
-    parser.add_argument("modules", nargs="*", metavar="MODULE", help="such as colornet/lab.py; default: all")
+    parser.add_argument("modules", nargs="*", metavar="MODULE", help="such as colornet/colors.py; default: all")
     parser.add_argument("--results", type=Path, required=True, help="JSON lines, one for each mutant; resumes")
     parser.add_argument("--sample", type=int, help="number of mutants for each module; default: all")
     parser.add_argument("--seed", type=int, default=0)

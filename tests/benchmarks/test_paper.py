@@ -12,8 +12,7 @@ from rendered_objects import write_meshes, write_scene
 from safetensors.numpy import save_file
 
 from benchmarks import paper
-from benchmarks.paired import paired_difference
-from benchmarks.paper_measurement import CLAIMS
+from benchmarks.paper_measurement import CLAIMS, paired_difference
 from benchmarks.paper_report import report_text
 from training.baselines.job import TITLES
 from training.evaluation.answers import fusions

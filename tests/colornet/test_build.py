@@ -10,8 +10,7 @@ import pytest
 
 import colornet
 from colornet.builder import HyabDBSCAN
-from colornet.grid import grid_colors
-from colornet.lab import GRID_WHITE, to_lab
+from colornet.colors import GRID_WHITE, grid_colors, to_lab
 
 NETWORK = colornet.load_default()
 BUILD = """

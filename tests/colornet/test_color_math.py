@@ -7,8 +7,7 @@ from scipy.spatial.distance import cdist
 from sklearn.cluster import DBSCAN
 
 from colornet.builder import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
-from colornet.grid import grid_colors
-from colornet.lab import GRID_WHITE, MEAN_WHITE, to_lab
+from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, to_lab
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 
 import colornet
-from colornet.grid import grid_colors
+from colornet.colors import grid_colors
 
 NETWORK = colornet.load_default()
 COLORS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5).map(lambda s: (*s, 3)))

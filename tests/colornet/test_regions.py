@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 import colornet
 from colornet.builder import merge_redundant, relabel, similarity
-from colornet.grid import grid_colors
-from colornet.lab import MEAN_WHITE, hyab, to_lab
+from colornet.colors import MEAN_WHITE, grid_colors, hyab, to_lab
 
 from .test_color_math import reference_hyab, reference_lab
 

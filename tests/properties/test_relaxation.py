@@ -11,9 +11,9 @@ from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
-from colornet.lab import GRID_WHITE
-from colornet.lab import hyab as exact_hyab
-from colornet.lab import to_lab as exact_lab
+from colornet.colors import GRID_WHITE
+from colornet.colors import hyab as exact_hyab
+from colornet.colors import to_lab as exact_lab
 from thor2_jax.descriptor.slicing import interval_log_weights, region_sets, soft_regions
 
 NETWORK = colornet.load_default()

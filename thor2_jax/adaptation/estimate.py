@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from colornet.lab import LUMA
+from colornet.colors import LUMA
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError

@@ -28,7 +28,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from colornet import ColorNetwork
-from colornet.grid import GRID_SIZE
+from colornet.colors import GRID_SIZE
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_strips, persistence_images

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from colornet import ColorNetwork
-from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
+from colornet.colors import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.types import Strips
 
@@ -323,7 +323,7 @@ _TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193,
 """Matrix from linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
 
 _WHITE = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
-"""XYZ of D65, the white point of the colour grid (`colornet.lab.GRID_WHITE`)."""
+"""XYZ of D65, the white point of the colour grid (`colornet.colors.GRID_WHITE`)."""
 
 
 def to_lab(colors: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
-from colornet.lab import LUMA
+from colornet.colors import LUMA
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
 from thor2_jax.frames.frames import check_images

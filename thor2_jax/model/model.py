@@ -17,7 +17,7 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from colornet.lab import LUMA
+from colornet.colors import LUMA
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colornet import ColorNetwork
-from colornet.grid import GRID_SIZE, grid_colors
+from colornet.colors import GRID_SIZE, grid_colors
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.types import Cloud, PointClouds

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from colornet.lab import LUMA
+from colornet.colors import LUMA
 from training.rendering.camera import RenderedView, axial_deviation, depth_edges
 
 __all__ = ["FRAME_PIXEL", "Illumination", "Range", "Registration", "Sensor", "misregistered", "relit", "sensed"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from colornet.lab import LUMA
+from colornet.colors import LUMA
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from training.rendering.camera import axial_deviation
 

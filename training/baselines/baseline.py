@@ -30,7 +30,7 @@ from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
 from training.storage.jobs import Progress
-from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
+from training.views.crops import ViewCrops, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
 __all__ = [
@@ -81,7 +81,7 @@ def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: 
 
     @functools.cache
     def crops(size: int) -> ViewCrops:
-        return stacked([quantized(rgbd_crop(frame, view.label, size)) for view in described.usable], size)
+        return stacked([rgbd_crop(frame, view.label, size) for view in described.usable], size)
 
     return BaselineInputs(view_normalize(described.packed, config), np.asarray(described.descriptors.tops), crops)
 
@@ -272,19 +272,18 @@ def fit_network(
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
     graph, state = initial_state(model, fit.optimizer(0.0))
 
-    def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
+    def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, Any]]:
         rng = np.random.default_rng((task.options.seed, number - 1))
-        order = rng.permutation(rows)[: steps.of_epoch * batch_size]
-        for batch in order.reshape(-1, batch_size):
-            yield fit.draw(batch, rng), label[batch]
-
-    def step(state: FitState, number: int, batch: tuple[Any, Integers]) -> tuple[FitState, Any]:
-        rate = np.float32(fit.rate(number, steps.epochs * steps.of_epoch))
-        return _step(graph, fit.inputs, fit.optimizer, state, *batch, rate)
+        order = rng.permutation(rows)[: steps.of_epoch * batch_size].reshape(-1, batch_size)
+        for step, chosen in enumerate(order, (number - 1) * steps.of_epoch):
+            rate = np.float32(fit.rate(step, steps.epochs * steps.of_epoch))
+            batch = fit.draw(chosen, rng)
+            state, computed = _step(graph, fit.inputs, fit.optimizer, state, batch, label[chosen], rate)
+            yield state, computed
 
     checkpoints = Checkpoints(task.scratch / fit.directory)
     shown = fit_progress(task.progress, f"fit {task.name}", steps.epochs)
-    state = run_epochs(task.name, state, steps, epoch, step, checkpoints, progress=shown)
+    state = run_epochs(task.name, checkpoints.last(state), steps, train_epoch, checkpoints, progress=shown)
     return nnx.merge(graph, state.params, state.rest)
 
 

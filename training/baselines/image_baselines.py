@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import model_arrays, model_from_arrays
+from training.baselines.architectures import ARCHITECTURES, load_weights, network_inputs
 from training.baselines.baseline import (
     FitTask,
     NetworkFit,
@@ -30,8 +31,7 @@ from training.baselines.baseline import (
     in_batches,
     read_baseline,
 )
-from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
-from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
+from training.baselines.vit import VIT_DINOV2_SMALL, ViT
 from training.views.crops import ViewCrops
 
 __all__ = [

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from training.baselines.architectures import ARCHITECTURES, weights_file
 from training.baselines.baseline import (
     FitTask,
     Predictor,
@@ -17,7 +18,7 @@ from training.baselines.baseline import (
     read_baseline,
     write_baseline,
 )
-from training.baselines.forest import fit_forest, load_forest
+from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
 from training.baselines.image_baselines import (
     TEMPLATES,
     fit_image_network,
@@ -26,8 +27,6 @@ from training.baselines.image_baselines import (
     load_templates,
     pretrained_files,
 )
-from training.baselines.networks.architectures import ARCHITECTURES, weights_file
-from training.baselines.pointnet import fit_pointnet, load_pointnet
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress

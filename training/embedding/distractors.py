@@ -31,7 +31,6 @@ __all__ = [
     "Distractors",
     "distractor_samples",
     "held_out_clouds",
-    "stored_samples",
     "with_fitted_distractors",
 ]
 
@@ -98,6 +97,8 @@ def distractor_samples(
 ) -> Samples:
     """Return the samples of all distractors; render them unless they are in the user's cache or in `directory`.
 
+    A warning is logged if the cache cannot be used.
+
     Args:
         distractors: the distractors; labels are indices into `sources`.
         directory: directory of the training for finished samples, so that an interrupted training resumes.
@@ -112,11 +113,14 @@ def distractor_samples(
     sources = distractors.sources
     arguments = sources, network, config, distractors.views
     name = f"distractors-{json_digest(samples_record(*arguments))}"
-
-    def build() -> Samples:
-        return build_samples(*arguments, local_workers(distractors.workers), progress, directory=directory / name)
-
-    samples = stored_samples(f"{name}.safetensors", build)
+    cache = cache_directory("distractors")
+    file = None if cache is None else cache / f"{name}.safetensors"
+    samples = None if file is None else _read_stored(file)
+    if samples is None:
+        pool = local_workers(distractors.workers)
+        samples = build_samples(*arguments, pool, progress, directory=directory / name)
+        if file is not None:
+            _store(samples, file)
     progress(len(sources), len(sources))
     return samples
 
@@ -149,33 +153,17 @@ NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
 log = logging.getLogger(__name__)
 
 
-def stored_samples(name: str, build: Callable[[], Samples]) -> Samples:
-    """Return the samples from a file in the user's cache; if it does not exist, build and store them.
-
-    A warning is logged if the cache cannot be used.
-
-    Args:
-        name: name of the file, which contains the digest of the samples' record.
-        build: function that returns the samples.
-
-    Raises:
-        InputError: as `build`.
-        OSError: as `build`.
-    """
-    cache = cache_directory("distractors")
-    if cache is None:
-        return build()
-    file = cache / name
+def _read_stored(file: Path) -> Samples | None:
+    """Return the samples of a file in the cache; None if it does not exist or, with a warning, cannot be used."""
     try:
-        if file.is_file():
-            samples = Samples(**load_arrays(file))
-            with contextlib.suppress(OSError):  # the cache may be read-only
-                os.utime(file)
-            return samples
+        if not file.is_file():
+            return None
+        samples = Samples(**load_arrays(file))
     except (OSError, ValueError, TypeError) as error:
         log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
-    samples = build()
-    _store(samples, file)
+        return None
+    with contextlib.suppress(OSError):  # the cache may be read-only
+        os.utime(file)
     return samples
 
 

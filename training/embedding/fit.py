@@ -32,7 +32,7 @@ from training.embedding.samples import Batch, Samples
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
-__all__ = ["RUN_SIZES", "batch_descriptors", "fit_embedding", "reference_views"]
+__all__ = ["RUN_SIZES", "describe_batch", "fit_embedding", "reference_views"]
 
 RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
 """Sizes of each network of a run; several small networks give steadier answers than fewer large networks."""
@@ -51,27 +51,25 @@ MARGIN = 0.12
 """Subtracted from the cosine between a view and its own proxy."""
 
 
-def batch_descriptors(
-    length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig
-) -> Descriptors:
-    """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
-    length, overflow = length.astype(jnp.float32), jnp.zeros(len(length), jnp.int32)
+def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """Return the descriptors of the samples of a batch."""
+    length, color = jnp.asarray(batch.length, jnp.float32), jnp.asarray(batch.color, jnp.float32)
     occupied = length > 0  # the pair of a strip with one point has no persistence and adds nothing to the image
-    strips = Strips(jnp.zeros_like(length), length, occupied, color.astype(jnp.float32), overflow)
+    strips = Strips(jnp.zeros_like(length), length, occupied, color, jnp.zeros(len(length), jnp.int32))
     return describe_strips(strips, network, config)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> LookDescriptors:
     """Return the descriptors of the samples of a batch, one look each."""
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
     each, statistics = jax.tree.map(lambda a: a[:, None], (descriptors, jnp.asarray(batch.statistics)))
     return LookDescriptors(each, statistics)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _projected_features(version: int, network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
     return projected_features(descriptors, jnp.asarray(batch.statistics), version)
 
 
@@ -106,7 +104,7 @@ def _step(
     keys: jax.Array,
 ) -> tuple[tuple[FitState, ...], jax.Array]:
     """Make one step of every network; return the next states, and the mean loss and accuracy [2] before the step."""
-    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    descriptors = describe_batch(batch, network, config)
 
     def step(graph: Any, state: FitState, seen: jax.Array, key: jax.Array) -> tuple[FitState, jax.Array]:
         def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:
@@ -174,24 +172,21 @@ def fit_embedding(
     seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0
 
-    def epoch(number: int) -> Iterator[Batch]:
+    def train_epoch(number: int, states: tuple[FitState, ...]) -> Iterator[tuple[tuple[FitState, ...], jax.Array]]:
         # Order and dropout depend only on seed and step, so that a resumed fit needs no generator state.
-        order = np.random.default_rng([seed, number]).permutation(len(samples))
-        return samples.batches(order[: n_steps * BATCH_SIZE], BATCH_SIZE, config)
-
-    def step(states: tuple[FitState, ...], number: int, batch: Batch) -> tuple[tuple[FitState, ...], Any]:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), number + 1), networks)
-        return _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
+        order = np.random.default_rng([seed, number]).permutation(len(samples))[: n_steps * BATCH_SIZE]
+        for step, batch in enumerate(samples.batches(order, BATCH_SIZE, config), (number - 1) * n_steps + 1):
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), step), networks)
+            states, computed = _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
+            yield states, computed
 
     states = run_epochs(
         "the embedding",
-        states,
+        jax.tree.map(jnp.asarray, checkpoints.last(states)),
         Steps(epochs, n_steps, BATCH_SIZE),
-        epoch,
-        step,
+        train_epoch,
         checkpoints,
         progress=progress,
-        place=lambda states: jax.tree.map(jnp.asarray, states),
     )
     models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))

@@ -32,14 +32,13 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
-from training.augmentation.orientation import reorient
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
 from training.storage.jobs import load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
-from training.views.normalized_views import ViewSource, padded_batches
+from training.views.normalized_views import ViewSource, padded_batches, reorient
 
 __all__ = [
     "AUGMENTATIONS",

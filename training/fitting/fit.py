@@ -246,15 +246,13 @@ def fit(
         for first in range(jax.process_index() * chunk, len(rows), batch_size):
             yield shard_batch(samples.take(rows[first : first + chunk]))
 
-    def epoch(number: int) -> Iterator[Batch]:
+    def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, tuple[jax.Array, jax.Array]]]:
         # The order depends only on seed and epoch, so that a resumed fit needs no generator state.
-        order = np.random.default_rng((options.seed, number)).permutation(train_rows)
-        return batches(order[: steps.of_epoch * batch_size])
-
-    def step(state: FitState, number: int, batch: Batch) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
-        is_second_half = number // steps.of_epoch + 1 > (options.epochs + 1) // 2
-        rate = np.float32(options.learning_rates[is_second_half])
-        return train_step(context, graph, state, batch, rate, np.uint32(options.seed), np.uint32(number))
+        order = np.random.default_rng((options.seed, number)).permutation(train_rows)[: steps.of_epoch * batch_size]
+        seed, rate = np.uint32(options.seed), np.float32(options.learning_rates[number > (options.epochs + 1) // 2])
+        for step, batch in enumerate(batches(order), (number - 1) * steps.of_epoch):
+            state, computed = train_step(context, graph, state, batch, rate, seed, np.uint32(step))
+            yield state, computed
 
     def held_out_accuracy(state: FitState) -> float | None:
         if not len(held_out_rows):
@@ -269,14 +267,12 @@ def fit(
 
     state = run_epochs(
         context.feature,
-        initial,
+        _to_devices(checkpoints.last(initial), PartitionSpec()),
         steps,
-        epoch,
-        step,
+        train_epoch,
         checkpoints,
         progress=progress,
         held_out_accuracy=held_out_accuracy,
-        place=lambda state: _to_devices(state, PartitionSpec()),
     )
     wait_for_all(f"fitted {context.feature}")
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))

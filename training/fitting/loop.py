@@ -1,7 +1,7 @@
 """The training loop of all networks, with metrics and with checkpoints from which an interrupted fit resumes.
 
     checkpoints = Checkpoints(directory)
-    state = checkpoints.last(state) if checkpoints.last_epoch else state
+    state = checkpoints.last(state)
     for epoch in range(checkpoints.last_epoch + 1, epochs + 1):
         ...
         checkpoints.save(epoch, state, score)
@@ -196,7 +196,7 @@ class Checkpoints:
                 self._path(old).unlink(missing_ok=True)
 
     def last(self, like: Any) -> Any:
-        """Return the state of the last checkpoint, as NumPy arrays.
+        """Return the state of the last checkpoint, as NumPy arrays; without a checkpoint, return `like`.
 
         Args:
             like: a state with the same structure, shapes and dtypes.
@@ -204,7 +204,7 @@ class Checkpoints:
         Raises:
             InputError: the checkpoint is damaged or has another structure.
         """
-        return self._restore(self.last_epoch, like)
+        return self._restore(self.last_epoch, like) if self.last_epoch else like
 
     def best(self, like: Any) -> Any:
         """Return the state of the checkpoint with the highest score, like `last`."""
@@ -261,7 +261,6 @@ STEPS_PER_REPORT = 20
 """Number of steps dispatched to the devices before their results are awaited; the host gathers batches meanwhile."""
 
 State = TypeVar("State")
-Item = TypeVar("Item")
 
 
 class Steps(NamedTuple):
@@ -276,13 +275,11 @@ def run_epochs(
     name: str,
     state: State,
     steps: Steps,
-    batches: Callable[[int], Iterable[Item]],
-    step: Callable[[State, int, Item], tuple[State, Any]],
+    train_epoch: Callable[[int, State], Iterator[tuple[State, Any]]],
     checkpoints: Checkpoints,
     *,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     held_out_accuracy: Callable[[State], float | None] = lambda state: None,
-    place: Callable[[State], State] = lambda state: state,
 ) -> State:
     """Train for all epochs, or for the epochs after the last checkpoint, and return the last state.
 
@@ -290,26 +287,23 @@ def run_epochs(
 
     Args:
         name: name of the networks, for messages.
-        state: pytree of the arrays that a step changes.
+        state: pytree of the arrays that a step changes, after the last checkpoint (`Checkpoints.last`).
         steps: numbers of the fit.
-        batches: function that yields the batches of an epoch, given its number from 1.
-        step: function of the state, the number of the step from 0, and a batch. It returns the next state, and the loss
-            and accuracy of the batch.
+        train_epoch: function of the number of an epoch, from 1, and the state before it. It makes the steps of the
+            epoch, and yields the state after each step, with the loss and accuracy of its batch.
         checkpoints: checkpoints of this fit only, written after each epoch. Their score is the held-out accuracy or,
             without a held-out set, the negative loss.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         held_out_accuracy: function of the state after an epoch; None without a held-out set.
-        place: function that moves a state to the devices.
 
     Raises:
-        InputError: the loss is not finite (the last checkpoint is kept), or a checkpoint is unreadable.
+        InputError: the loss is not finite; the last checkpoint is kept.
         OSError: a checkpoint cannot be written; the previous one is kept.
     """
-    state = place(checkpoints.last(state) if checkpoints.last_epoch else state)
     for epoch in range(checkpoints.last_epoch + 1, steps.epochs + 1):
         total, pending, start = np.zeros(2), [], 0.0
-        for number, batch in enumerate(batches(epoch), 1):
-            state, computed = step(state, (epoch - 1) * steps.of_epoch + number - 1, batch)
+        for number, (updated, computed) in enumerate(train_epoch(epoch, state), 1):
+            state = updated
             pending.append(computed)
             if number == 1:
                 jax.block_until_ready(computed)  # the first step may compile

@@ -26,8 +26,7 @@ from thor2_jax.descriptor.slicing import RegionSets, region_sets
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.errors import InputError
 from thor2_jax.types import Strips
-from training.augmentation.orientation import reorient
-from training.views.normalized_views import ViewSource, padded_batches
+from training.views.normalized_views import ViewSource, padded_batches, reorient
 
 __all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand"]
 

@@ -1,7 +1,6 @@
 """Square crops of colour and surface normals, which are the input of RGB-D image networks.
 
-    crop = rgbd_crop(frame, label)
-    crop.color, crop.normals, crop.mask         # [224, 224, 3], [224, 224, 3], [224, 224]
+    color, normals = rgbd_crop(frame, label)         # [224, 224, 3] each
 
 A rendered view is cropped alike (`rgbd_crop(view.frame, 1)`). Image networks are trained on the crops of the views of a
 dataset, which are rendered once more for them:
@@ -37,10 +36,9 @@ if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
 __all__ = [
     "CROPS",
     "CROP_SIZE",
-    "QuantizedCrop",
+    "Crop",
     "ViewCrops",
     "fill_depth",
-    "quantized",
     "read_crops",
     "render_crops",
     "rgbd_crop",
@@ -55,22 +53,11 @@ _WINDOW = 5
 """Side of the median window for filling depth, pixels."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class RGBDCrop:
-    """An instance, resized to fill a square; all other pixels are 0.
-
-    Attributes:
-        color: [S, S, 3] float32 sRGB in [0, 1].
-        normals: [S, S, 3] float32 unit normals of the surface in the OpenCV camera frame, towards the camera.
-        mask: [S, S] pixels of the instance.
-    """
-
-    color: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+Crop = tuple[NDArray[np.uint8], NDArray[np.int8]]
+"""Colour and normals of an instance that fills a square, in the format of `ViewCrops`, [S, S, 3] each."""
 
 
-def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
+def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> Crop:
     """Crop an instance: its bounding box, centred and padded to a square, then resized.
 
     Missing depth is filled with `fill_depth`. Resized pixels are means over pixels of the instance only, so that the
@@ -98,7 +85,8 @@ def rgbd_crop(frame: RGBDFrame, label: int, size: int = CROP_SIZE) -> RGBDCrop:
     shown = coverage >= 0.5
     weight = np.where(shown, coverage, 1)[..., None]
     color = np.where(shown[..., None], np.clip(_resized(color, size) / weight, 0, 1), 0)
-    return RGBDCrop(color, np.where(shown[..., None], _unit(_resized(normals, size)), 0), shown)
+    normals = np.where(shown[..., None], _unit(_resized(normals, size)), 0)
+    return np.rint(color * 255).astype(np.uint8), np.rint(normals * 127).astype(np.int8)
 
 
 def fill_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -178,10 +166,6 @@ def _resized(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     return np.stack(resized, axis=-1).reshape(size, size, *image.shape[2:])
 
 
-QuantizedCrop = tuple[NDArray[np.uint8], NDArray[np.int8]]
-"""Colour and normals of a crop in the format of `ViewCrops`, [S, S, 3] each."""
-
-
 @dataclasses.dataclass(frozen=True)
 class ViewCrops:
     """Crops of several views, [V, S, S, 3] each; the background is 0 in both.
@@ -215,13 +199,8 @@ class ViewCrops:
         return stacked(list(zip(smaller(self.color), normals, strict=True)), size)
 
 
-def quantized(crop: RGBDCrop) -> QuantizedCrop:
-    """Return the colour and the normals of a crop in the format of `ViewCrops`."""
-    return np.rint(crop.color * 255).astype(np.uint8), np.rint(crop.normals * 127).astype(np.int8)
-
-
-def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
-    """Return quantized crops of `size` pixels, possibly none, as one record."""
+def stacked(crops: Sequence[Crop], size: int) -> ViewCrops:
+    """Return crops of `size` pixels, possibly none, as one record."""
     shape = (len(crops), size, size, 3)
     record = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
     for row, (color, normals) in enumerate(crops):
@@ -286,12 +265,10 @@ def _crop_file(shard: str) -> str:
     return Path(shard).with_suffix(".npz").name
 
 
-def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
+def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
     """Return (number of the view, number of the copy) -> crop for the views of a task that are not empty."""
     return {
-        (number, copy): quantized(rgbd_crop(view.frame, 1, size))
-        for number, copy, view in all_views(task)
-        if view.depth.any()
+        (number, copy): rgbd_crop(view.frame, 1, size) for number, copy, view in all_views(task) if view.depth.any()
     }
 
 

@@ -18,7 +18,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import augmented_view
 from thor2_jax.printable import check_name, normal_name
 from training.readers.frames import FrameFolder
-from training.views.crops import QuantizedCrop, ViewCrops, quantized, rgbd_crop, stacked
+from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views
 
 __all__ = ["MAX_COPIES", "LabelledInstances", "WithLabelledViews", "read_instances"]
@@ -45,7 +45,7 @@ class LabelledInstances:
 
     views: Mapping[str, Sequence[PreparedInstance]]
     skipped: Sequence[str] = ()
-    crops: Mapping[str, Sequence[QuantizedCrop]] | None = None
+    crops: Mapping[str, Sequence[Crop]] | None = None
 
     @functools.cached_property
     def digest(self) -> str:
@@ -77,7 +77,7 @@ def read_instances(
             `check_name` refuses are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
-    crops: dict[str, list[QuantizedCrop]] = {}
+    crops: dict[str, list[Crop]] = {}
     skipped = [("", frames.note)] if frames.note else []
     for item in frames:
         labels: list[tuple[int | None, str]] = [*sorted(item.truth.items())]
@@ -92,8 +92,7 @@ def read_instances(
                     of_object = views.setdefault(name, [])
                     of_object.append(instance_view(item.frame, label, sigma_s))
                     if crop_size is not None:
-                        crop = rgbd_crop(item.frame, of_object[-1].label, crop_size)
-                        crops.setdefault(name, []).append(quantized(crop))
+                        crops.setdefault(name, []).append(rgbd_crop(item.frame, of_object[-1].label, crop_size))
             except InputError as error:
                 skipped.append((name, str(error)))
     empty = [name for name, of_object in views.items() if not of_object]

@@ -12,7 +12,7 @@ from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
-from colornet.lab import GRID_WHITE, to_lab
+from colornet.colors import GRID_WHITE, to_lab
 from thor2_jax.descriptor import describe, looks
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import (

@@ -18,11 +18,11 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import image_baselines
+from training.baselines.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
 from training.baselines.baseline import BaselineInputs, read_baseline
 from training.baselines.image_baselines import compare, crop_size, pretrained_files
 from training.baselines.job import load_baselines, train_baselines
-from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
-from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
+from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops

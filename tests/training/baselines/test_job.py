@@ -18,9 +18,9 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
-from training.baselines import forest, job
+from training.baselines import cloud_baselines, job
 from training.baselines.baseline import baseline_inputs
-from training.baselines.forest import load_forest
+from training.baselines.cloud_baselines import load_forest
 from training.baselines.job import CLOUD_BASELINES, check_baselines, load_baselines, train_baselines
 from training.evaluation.runs import load_runs
 from training.views.normalized_views import MemoryViews, fold_of_views
@@ -63,7 +63,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with the forest, whose training compiles least."""
     folder = write_run(tmp_path_factory.mktemp("baselines") / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(forest, "TREES", 20)
+        patch.setattr(cloud_baselines, "TREES", 20)
         train_baselines(folder, SOURCE, ["forest"])
     return folder
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from failures import Interrupted
@@ -21,13 +20,13 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.networks import EmbeddingSizes, model_arrays
-from training.augmentation import orientation
 from training.embedding import build, fit
 from training.embedding import samples as module
 from training.embedding.build import build_embedding
 from training.embedding.fit import fit_embedding
 from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
 from training.fitting.loop import Checkpoints
+from training.views import normalized_views
 
 NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
@@ -70,7 +69,7 @@ def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        orientation, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
+        normalized_views, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
     )
     rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
@@ -80,7 +79,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     batch = samples.take(rows, SMALL_CONFIG)
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     normal = thor2.view_normalize(thor2.PointClouds.pack([rendered[k][1] for k in order[rows]]), SMALL_CONFIG)
-    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
     actual = whole_embedding(nnx.merge(*embedding._embedder), descriptors, batch.statistics)
     similarity = []
     for mirror in ("", "x"):
@@ -148,7 +147,7 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
     embedding, losses = fitted
     assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
     batch = views.take(np.arange(len(views)), SMALL_CONFIG)
-    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
     same = batch.label[:, None] == batch.label
     gaps = []
     for one in (Embedding.create(SMALL_CONFIG, sizes=SIZES), embedding):

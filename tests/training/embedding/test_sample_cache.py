@@ -15,11 +15,12 @@ from small_runs import SMALL_CONFIG
 import colornet
 import thor2_jax as thor2
 import training
-from thor2_jax.files import json_digest
 from training.embedding import distractors as module
-from training.embedding.distractors import Distractors, distractor_samples, stored_samples
+from training.embedding.distractors import Distractors, distractor_samples
 from training.embedding.samples import Samples, samples_record
 from training.storage.jobs import locked
+
+NETWORK = colornet.load_default()
 
 SAMPLES = Samples(
     strips=np.array([2, 1]),
@@ -41,12 +42,12 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def counted(tmp_path: Path) -> Callable[..., int]:
-    """Return a function that asks for the samples of an object, checks them and returns how often they were built."""
+    """Return a function that asks for the samples of distractors, checks them and returns how often they were built."""
 
     def get(number: int = 0) -> int:
-        build = mock.Mock(return_value=SAMPLES)
-        record = samples_record([number], colornet.load_default(), SMALL_CONFIG, 1)
-        samples = stored_samples(f"distractors-{json_digest(record)}.safetensors", build)
+        distractors = Distractors(procedural=10 + number)
+        with mock.patch.object(module, "build_samples", return_value=SAMPLES) as build:
+            samples = distractor_samples(distractors, tmp_path / "new", NETWORK, SMALL_CONFIG, lambda *values: None)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
         return build.call_count
@@ -133,19 +134,18 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
 
 def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
-    network = colornet.load_default()
-    stored = mock.Mock()
-    monkeypatch.setattr(module, "stored_samples", stored)
+    stored = mock.Mock(return_value=SAMPLES)
+    monkeypatch.setattr(module, "_read_stored", stored)
 
     def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> str:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}
         distractors = Distractors(**{"procedural": 10, **options}, meshes=meshes)
-        distractor_samples(distractors, tmp_path / "new", network, config, lambda *values: None)
+        distractor_samples(distractors, tmp_path / "new", NETWORK, config, lambda *values: None)
         return str(stored.call_args.args[0])
 
     same, box = key(), key(box=0.1)
     assert key(epochs=3, networks=2, workers=2) == same and key(box=0.1) == box
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
-    record = samples_record([0], network, SMALL_CONFIG, 1)
-    assert record["color_network"] == network.fingerprint and "augmentations" in record
+    record = samples_record([0], NETWORK, SMALL_CONFIG, 1)
+    assert record["color_network"] == NETWORK.fingerprint and "augmentations" in record

@@ -43,6 +43,7 @@ def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
     """Leftovers of a killed process are removed, and other files stay."""
     checkpoints = Checkpoints(tmp_path / "c")
     assert checkpoints.last_epoch == checkpoints.best_epoch == 0
+    assert_equal(checkpoints.last(state(0)), state(0))
     for epoch, score in enumerate((-3.0, 0.9, 0.9, -0.3), 1):
         checkpoints.save(epoch, state(epoch), score)
     assert epochs(tmp_path / "c") == {"3.safetensors", "4.safetensors"}

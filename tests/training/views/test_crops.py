@@ -14,6 +14,7 @@ from scipy.ndimage import generic_filter
 from written_files import files_of
 
 import thor2_jax as thor2
+from thor2_jax.frames.frames import backproject
 from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
 from training.views import crops as crops_module
@@ -21,7 +22,6 @@ from training.views.crops import (
     CROP_SIZE,
     ViewCrops,
     fill_depth,
-    quantized,
     render_crops,
     rgbd_crop,
     stacked,
@@ -57,17 +57,16 @@ def test_crop_of_a_plane(size: int) -> None:
     """
     normal = np.array([0.48, -0.36, -0.8])
     frame = plane_frame(tuple(normal), box(4, 10, 30, 18))
-    crop = rgbd_crop(frame, 3, size)
-    assert crop.color.shape == crop.normals.shape == (size, size, 3)
-    assert crop.color.dtype == crop.normals.dtype == np.float32
-    np.testing.assert_allclose(crop.color[crop.mask], np.tile([1, 0.2, 0], (crop.mask.sum(), 1)), atol=1e-5)
-    np.testing.assert_allclose(crop.normals[crop.mask], np.tile(normal, (crop.mask.sum(), 1)), atol=1e-3)
-    assert not crop.color[~crop.mask].any() and not crop.normals[~crop.mask].any()
+    color, normals = rgbd_crop(frame, 3, size)
+    assert color.shape == normals.shape == (size, size, 3)
+    assert (color.dtype, normals.dtype) == (np.uint8, np.int8)
+    shown = normals.any(axis=-1)
+    assert shown[size // 2, size // 2] and (color[shown] == [255, 51, 0]).all() and not color[~shown].any()
+    np.testing.assert_array_equal(normals[shown], np.tile(np.rint(127 * normal), (shown.sum(), 1)))
     depth = np.rint(100_000 * np.where(box(4, 10, 30, 18), frame.depth, 0)).astype(np.uint32)
     labels, scaled = (depth > 0).astype(np.uint8), dataclasses.replace(CAMERA, depth_scale=100_000)
     view = rgbd_crop(thor2.RGBDFrame(frame.color, depth, labels, scaled), 1, size)
-    np.testing.assert_array_equal(view.color, crop.color)
-    np.testing.assert_allclose(view.normals, crop.normals, atol=1e-3)
+    np.testing.assert_array_equal(view, (color, normals))
 
 
 def test_crop_is_centred_and_fills_the_square() -> None:
@@ -78,20 +77,26 @@ def test_crop_is_centred_and_fills_the_square() -> None:
     for mask in (box(4, 10, 30, 18), box(0, 0, 30, 18), box(18, 46, 30, 18)):
         frame = plane_frame((0, 0, -1), mask)
         frame.depth[20:30, 12:20] = 0
-        crop = rgbd_crop(frame, 3, 30)
-        np.testing.assert_array_equal(crop.mask, np.pad(np.ones((30, 18), bool), ((0, 0), (6, 6))))
-        np.testing.assert_allclose(crop.normals[crop.mask], np.tile([0, 0, -1], (30 * 18, 1)), atol=1e-6)
-    crop = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
+        _, normals = rgbd_crop(frame, 3, 30)
+        shown = np.pad(np.ones((30, 18), bool), ((0, 0), (6, 6)))
+        np.testing.assert_array_equal(normals, np.where(shown[..., None], [0, 0, -127], 0))
+    _, normals = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
     ray = np.array([(60 - CAMERA.cx) / CAMERA.fx, (3 - CAMERA.cy) / CAMERA.fy, 1])
-    np.testing.assert_allclose(crop.normals[0, 0], -ray / np.linalg.norm(ray), atol=1e-6)
+    np.testing.assert_array_equal(normals[0, 0], np.rint(-127 * ray / np.linalg.norm(ray)))
 
 
 def test_enlarged_mask_matches_opencv() -> None:
     mask = cv2.circle(np.zeros((48, 64), np.uint8), (30, 24), 15, 1, -1).astype(bool)
-    crop = rgbd_crop(plane_frame((0, 0, -1), mask), 3, 124)
+    _, normals = rgbd_crop(plane_frame((0, 0, -1), mask), 3, 124)
     coverage = cv2.resize(mask[9:40, 15:46].astype(np.float32), (124, 124), interpolation=cv2.INTER_LINEAR)
     decided = np.abs(coverage - 0.5) > 1e-3
-    np.testing.assert_array_equal(crop.mask[decided], coverage[decided] > 0.5)
+    np.testing.assert_array_equal(normals.any(axis=-1)[decided], coverage[decided] > 0.5)
+
+
+def test_normals_of_a_plane_are_equal_up_to_the_rim() -> None:
+    normal, mask = np.array([0.48, -0.36, -0.8]), box(4, 10, 30, 18)
+    points = backproject(plane_frame((0.48, -0.36, -0.8), mask).depth_m, CAMERA)
+    np.testing.assert_allclose(surface_normals(points, mask)[mask], np.tile(normal, (mask.sum(), 1)), atol=1e-5)
 
 
 def test_normals_of_a_sphere() -> None:
@@ -150,7 +155,7 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
     for row in np.flatnonzero(views.copy == 0):
         azimuth, polar = view_angles(180, 90)[views.view[row]]
         view = render_view(RayCaster([mesh]), camera_pose(azimuth, polar, mesh.centre))
-        color, normals = quantized(rgbd_crop(view.frame, 1, SIZE))
+        color, normals = rgbd_crop(view.frame, 1, SIZE)
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
     box = WithoutClasses(dataset, ["brick"]).read_crops(0, SIZE)

@@ -13,8 +13,15 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.networks import model_arrays
 from training.baselines.baseline import BaselineInputs, Predictor
-from training.baselines.forest import forest_features, load_forest, predict, tree_arrays
-from training.baselines.pointnet import POINTS, PointNet, load_pointnet
+from training.baselines.cloud_baselines import (
+    POINTS,
+    PointNet,
+    forest_features,
+    load_forest,
+    load_pointnet,
+    predict_forest,
+    tree_arrays,
+)
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -57,7 +64,7 @@ def test_predictions_match_scikit_learn(depth: int | None) -> None:
     y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
     grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
     features = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
-    np.testing.assert_allclose(predict(tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6)
+    np.testing.assert_allclose(predict_forest(tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6)
 
 
 def test_single_leaf_trees_and_missing_arrays() -> None:

@@ -1,4 +1,4 @@
-"""Table of the image networks: architecture, image size and pretrained weights.
+"""Table of the image networks with which the paper compares THOR2: architecture, image size and pretrained weights.
 
 Weights of backbones are read from local safetensors files of PyTorch models:
 
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest
-from training.baselines.networks.cnn import DENSENET_161, RCFusion, ViTCNN
-from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4, RGBDViT
+from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
+from training.baselines.vit import VIT_BASE, VIT_TINY_4, RGBDViT
 
 __all__ = [
     "ARCHITECTURES",

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from training.baselines.networks.vit import ViT, ViTConfig
+from training.baselines.vit import ViT, ViTConfig
 
 __all__ = ["DENSENET_161", "DenseNet", "GRU", "RCFusion", "ResNet18", "ViTCNN"]
 

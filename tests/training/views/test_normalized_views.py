@@ -1,10 +1,10 @@
-"""Augmentation of orientation: the axes, and what a reoriented cloud keeps."""
+"""Random orientations of normalized views: the axes, and what a reoriented cloud keeps."""
 
 import numpy as np
 from small_clouds import random_clouds
 
 import thor2_jax as thor2
-from training.augmentation.orientation import _random_axes, reorient
+from training.views.normalized_views import _random_axes, reorient
 
 
 def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:

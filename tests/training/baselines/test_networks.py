@@ -11,11 +11,11 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from training.baselines.networks.architectures import load_backbone, resampled_positions, tensor_shapes
-from training.baselines.networks.cnn import DENSENET_161, GRU, DenseNet, ResNet18
-from training.baselines.networks.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT, ViTConfig
+from training.baselines.architectures import load_backbone, resampled_positions, tensor_shapes
+from training.baselines.cnn import DENSENET_161, GRU, DenseNet, ResNet18
+from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT, ViTConfig
 
-GOLDEN = Path(__file__).parents[3] / "golden"
+GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
 from network_weights import random_images, random_tensor, random_tensors, sampled  # noqa: E402
 
