@@ -188,6 +188,19 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
     assert "track" in printed("recognize", "--model", model, *command)
 
 
+def test_a_damaged_frame_does_not_end_a_sequence(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(3):
+        write_frame_files(tmp_path / "video" / f"{number}", small_frame(number))
+    (tmp_path / "video" / "1" / "depth.png").write_bytes(b"damaged")
+    assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
+    out, err = capfd.readouterr()
+    answers = json_lines(out)
+    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 2)] == [[2, 2]] * 2
+    assert "depth" in answers[1]["error"] and "1 of 3 frames" in err
+
+
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(2)]
     poses, out = tmp_path / "poses.json", tmp_path / "out"
