@@ -138,7 +138,7 @@ def track_frames(
 ) -> Iterator[FrameAnswer]:
     """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
 
-    A frame that cannot be read has an `error` and does not stop the others. The recognitions are
+    A frame that cannot be read or has no labels has an `error` and does not stop the others. The recognitions are
     `TrackedRecognition`s. All instances of a track have the name and confidence of the track after the last frame.
 
     Args:
@@ -156,6 +156,7 @@ def track_frames(
     for number, source in enumerate(sources):
         try:
             frame = read_source(source)
+            _ = frame.instance_pixels  # raises InputError without labels
         except InputError as error:
             answered.append(([], 0.0, str(error)))
             continue

@@ -203,14 +203,15 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
 def test_a_damaged_frame_does_not_end_a_sequence(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    for number in range(3):
+    for number in range(4):
         write_frame_files(tmp_path / "video" / f"{number}", small_frame(number))
     (tmp_path / "video" / "1" / "depth.png").write_bytes(b"damaged")
+    (tmp_path / "video" / "2" / "mask.png").unlink()
     assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
     out, err = capfd.readouterr()
     answers = json_lines(out)
-    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 2)] == [[2, 2]] * 2
-    assert "depth" in answers[1]["error"] and "1 of 3 frames" in err
+    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 3)] == [[2, 2]] * 2
+    assert "depth" in answers[1]["error"] and "labels" in answers[2]["error"] and "2 of 4 frames" in err
 
 
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:
