@@ -138,8 +138,8 @@ def track_frames(
 ) -> Iterator[FrameAnswer]:
     """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
 
-    The recognitions are `TrackedRecognition`s. All instances of a track have the name and confidence of the track after
-    the last frame.
+    A frame that cannot be read or has no labels has an `error` and does not stop the others. The recognitions are
+    `TrackedRecognition`s. All instances of a track have the name and confidence of the track after the last frame.
 
     Args:
         recognizer: the recognizer.
@@ -147,20 +147,28 @@ def track_frames(
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
 
     Raises:
-        InputError: a frame cannot be read or has another size than the first frame, or a pose is not a rigid motion.
-            The message names the frame.
-        OSError: a file cannot be opened.
+        InputError: a frame has another size than the first frame, or a pose is not a rigid motion. The message names
+            the frame.
     """
     tracker = recognizer.track()
-    answered: list[tuple[list[TrackedRecognition], float]] = []
+    answered: list[tuple[list[TrackedRecognition], float, str | None]] = []
     last: dict[int | None, TrackedRecognition] = {}
     for number, source in enumerate(sources):
+        try:
+            frame = read_source(source)
+            _ = frame.instance_pixels  # raises InputError without labels
+        except InputError as error:
+            answered.append(([], 0.0, str(error)))
+            continue
+        start = time.perf_counter()
         with with_context(source.name):
-            frame, start = source.read(), time.perf_counter()
             recognitions = tracker.update(frame, None if poses is None else poses[number])
-        answered.append((recognitions, time.perf_counter() - start))
+        answered.append((recognitions, time.perf_counter() - start, None))
         last.update({each.track: each for each in recognitions})
-    for source, (recognitions, seconds) in zip(sources, answered, strict=True):
+    for source, (recognitions, seconds, reason) in zip(sources, answered, strict=True):
+        if reason is not None:
+            yield FrameAnswer(source.name, error=reason)
+            continue
         final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
         # The frame is read a second time, since a long sequence of images does not fit into memory.
         yield FrameAnswer(source.name, source.read(), final, seconds)

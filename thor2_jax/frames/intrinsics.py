@@ -11,6 +11,7 @@
 | 3 x 3 matrix | K, camera_matrix or the nine numbers alone, as JSON, YAML, text or NPY | depth units per metre |
 """
 
+import codecs
 import dataclasses
 import io
 import re
@@ -362,6 +363,7 @@ def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
 def _parse(content: bytes) -> Any:
     """Return the value in a file, whose first bytes determine the format."""
     expected = "fx, fy, cx, cy or another known format"
+    content = content.removeprefix(codecs.BOM_UTF8)  # written by editors on Windows
     if content.lstrip()[:1] in (b"{", b"["):
         with decoding("intrinsics is not valid JSON", expected):
             return parse_json(content)
@@ -374,11 +376,15 @@ def _parse(content: bytes) -> Any:
         with decoding("intrinsics is a damaged NPY file", "a 3 x 3 matrix"):
             return read_npy(io.BytesIO(content), MAX_TEXT_BYTES)
     try:
-        return np.array([float(word) for word in content.replace(b",", b" ").split()]) if content.strip() else None
+        words = re.sub(rb"#.*|,", b" ", content).split()
+        return np.array([float(word) for word in words]) if words else None
     except ValueError:
         with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
             # OpenCV's FileStorage writes a directive and tags that YAML parsers reject.
-            return parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
+            values = parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
+            if isinstance(values, str):
+                raise ValueError(f"it begins with {content.decode(errors='replace')[:30]!r}") from None
+            return values
 
 
 def _first_document(content: bytes) -> bytes:

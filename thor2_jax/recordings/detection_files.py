@@ -8,8 +8,9 @@ with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) a
 import contextlib
 import io
 import os
+import sqlite3
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
@@ -65,6 +66,16 @@ def _check_folder(path: Path) -> None:
         pass
 
 
+@contextlib.contextmanager
+def _bag_errors(path: Path) -> Iterator[None]:
+    """Turn errors of the files and the database of a bag into an OSError that names `path`."""
+    with errors_name(path):
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise OSError(None, str(error)) from None
+
+
 def detection_types() -> Any:
     """Return a typestore of rosbags for ROS 2 Humble with the messages of `VISION_MSGS`.
 
@@ -114,22 +125,23 @@ class MessageBag:
         """Create a temporary bag beside `path`."""
         from rosbags.rosbag2 import StoragePlugin, Writer
 
-        self._stack = contextlib.ExitStack()
-        folder = self._stack.enter_context(temporary_directory(self._path.absolute().parent))
         plugin = StoragePlugin.MCAP if self._path.suffix == ".mcap" else StoragePlugin.SQLITE3
-        # ROS 2 names the files of a bag after its directory.
-        self._bag = folder / self._path.stem
-        self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
-        self._writer.open()
-        self._connections = {
-            topic: self._writer.add_connection(topic, kind, typestore=self._types)
-            for topic, kind in self._topics.items()
-        }
+        with _bag_errors(self._path), contextlib.ExitStack() as stack:
+            folder = stack.enter_context(temporary_directory(self._path.absolute().parent))
+            # ROS 2 names the files of a bag after its directory.
+            self._bag = folder / self._path.stem
+            self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
+            self._writer.open()
+            self._connections = {
+                topic: self._writer.add_connection(topic, kind, typestore=self._types)
+                for topic, kind in self._topics.items()
+            }
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
-        with self._stack, errors_name(self._path):
+        with self._stack, _bag_errors(self._path):
             self._writer.close()
             if self._n_messages:
                 is_file = self._path.suffix == ".mcap"
@@ -148,7 +160,7 @@ class MessageBag:
             )
         kind = self._topics[topic]
         content = self._types.serialize_cdr(ros_message(fields), kind)
-        with errors_name(self._path):
+        with _bag_errors(self._path):
             self._writer.write(self._connections[topic], max(stamp, 0), content)
         self._n_messages += 1
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, print_note
@@ -42,8 +42,9 @@ def explain(
     recognizer = load()
     explained, last = 0, 0
     for source in sources:
-        frame = source.read()
-        labels = frame.instances if instance is None else instance
+        with with_context(source.name):
+            frame = source.read()
+            labels = frame.instances if instance is None else instance
         if not len(labels):
             print_note(f"skipped: {source.name}: it has no instances")
         for label in labels:

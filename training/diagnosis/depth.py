@@ -101,7 +101,8 @@ def check_depth(
     median = float(np.median(valid))
     if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, extents, mesh_sides, names):
         return
-    if _check_unit(diagnosis, frame, median, list(extents.values()), list(mesh_sides.values())):
+    own_sides = [mesh_sides[name] for name in names.values() if name in mesh_sides] or list(mesh_sides.values())
+    if _check_unit(diagnosis, frame, median, list(extents.values()), own_sides):
         return
     in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
     if in_range < MIN_IN_RANGE:

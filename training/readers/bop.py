@@ -6,6 +6,7 @@ identifies objects by numbers; a YAML or JSON file maps each obj_id to a name.
 """
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,9 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_dept
 from training.readers.labelled import LabelledFrames, dataset_folder, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
+
+MASKS = "mask_visib"
+"""Folder of the masks of a scene."""
 
 SMALLEST_VISIBLE = 0.1
 """Smallest visible fraction of an instance that is scored, as in BOP's own evaluation."""
@@ -64,8 +68,7 @@ class BOP(LabelledFrames):
         """
         image = self.sources[number]
         scene = _scene(image)
-        with _entry(image, "camera") as entry:
-            intrinsics = _intrinsics(entry)
+        frame = self.unlabelled(number)
         with _entry(image, "gt") as entry:
             objects = _values(entry, "obj_id", int)
         visible: list[float] = [1.0] * len(objects)
@@ -74,23 +77,34 @@ class BOP(LabelledFrames):
                 visible = _values(entry, "visib_fract", (int, float))
                 if len(visible) != len(objects):
                     raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
-        depth = read_depth(scene / "depth" / f"{image.stem}.png")
-        masks = [_mask(scene / "mask_visib" / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
+        masks = [_mask(scene / MASKS / f"{image.stem}_{k:06d}.png", frame.depth) for k in range(len(objects))]
         sizes = [int(mask.sum()) for mask in masks]
-        labels = np.zeros(depth.shape, np.int32)
+        labels = np.zeros(frame.depth.shape, np.int32)
         for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
             labels[masks[k]] = k + 1
         scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
         truth = {k + 1: self._name(objects[k]) for k in scored}
-        frame = RGBDFrame(read_color(image), depth, labels, intrinsics)
-        return frame, truth, {"scene": scene.name}
+        return dataclasses.replace(frame, labels=labels), truth, {"scene": scene.name}
+
+    def unlabelled(self, number: int) -> RGBDFrame:
+        """Read a frame without its masks; raises as `read`."""
+        image = self.sources[number]
+        with _entry(image, "camera") as entry:
+            intrinsics = _intrinsics(entry)
+        depth = read_depth(_scene(image) / "depth" / f"{image.stem}.png")
+        return RGBDFrame(read_color(image), depth, None, intrinsics)
+
+    def has_labels(self, number: int) -> bool:
+        """Return whether the scene of a frame has ground truth and masks, which BOP keeps back for some test sets."""
+        scene = _scene(self.sources[number])
+        return (scene / "scene_gt.json").exists() and (scene / MASKS).exists()
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame: its images, its masks and the tables of its scene."""
         image = self.sources[number]
         scene = _scene(image)
         tables = [scene / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
-        masks = sorted((scene / "mask_visib").glob(f"{image.stem}_*.png"))
+        masks = sorted((scene / MASKS).glob(f"{image.stem}_*.png"))
         return [image, scene / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
 
     def _name(self, obj_id: int) -> str:

@@ -118,7 +118,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     Args:
         paths: frame folders, folders that contain frame folders (at any depth) or links to them, and BOP splits or
             scenes.
-        depth_scale: see `read_frame`; BOP scenes have their own depth scale.
+        depth_scale: see `read_frame`.
 
     Raises:
         InputError: a path is not a directory or contains no frame, a frame is given twice, or `depth_scale` is out of
@@ -135,7 +135,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         if any(path.glob("scene_camera.json")) or any(path.glob("*/scene_camera.json")):
             dataset = BOP(path)
             of_path = [
-                FrameSource(name, functools.partial(_read_bop, dataset.only(k)))
+                FrameSource(name, functools.partial(_read_bop, dataset.only(k), depth_scale))
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
@@ -253,8 +253,11 @@ def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -
     return segmented(source.read(), segmenter)
 
 
-def _read_bop(dataset: BOP) -> RGBDFrame:
-    return dataset[0].frame
+def _read_bop(dataset: BOP, depth_scale: float | None) -> RGBDFrame:
+    frame = dataset.read(0)[0] if dataset.has_labels(0) else dataset.unlabelled(0)
+    if depth_scale is None:
+        return frame
+    return dataclasses.replace(frame, intrinsics=dataclasses.replace(frame.intrinsics, depth_scale=depth_scale))
 
 
 def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[FrameSource], list[str]]:

@@ -44,7 +44,7 @@ class Section:
 _STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 72rem; margin: 0 auto;
-  padding: 1rem; }
+  padding: 1rem; overflow-wrap: break-word; }
 h1 { line-height: 1.2; margin-bottom: .3rem; }
 .lead { color: #555; margin-top: 0; }
 .scroll { overflow-x: auto; }

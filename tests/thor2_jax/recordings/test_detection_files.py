@@ -1,4 +1,4 @@
-"""Files for the Rerun viewer, read back with its own reader."""
+"""Files for the Rerun viewer, read back with its own reader, and bags on a full disk."""
 
 import sys
 from pathlib import Path
@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from failures import small_disk
 from recording_files import table_frame
 from refusals import assert_refused
 
 from thor2_jax.model.recognition import Recognition, detections_of
-from thor2_jax.recordings.detection_files import RerunFile
+from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
 from thor2_jax.segmentation.segmenters import segmented
 
 ANSWERS = [Recognition(1, "mug", 0.9), Recognition(2, reason="unknown: 0.1", confidence=0.1)]
@@ -71,3 +72,17 @@ def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         RerunFile(tmp_path / "none" / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert_refused(r"\.\[rerun\]", RerunFile, tmp_path / "b.rrd")
+
+
+@pytest.mark.parametrize("size", [1000, 50_000])
+def test_a_database_on_a_full_disk_is_named(tmp_path: Path, size: int) -> None:
+    frame, path = segmented(table_frame()), tmp_path / "out"
+
+    def write() -> None:
+        with DetectionBag(path) as bag:
+            for stamp in range(20):
+                bag.write(frame, detections_of(frame, ANSWERS), stamp=stamp)
+
+    with small_disk(size), pytest.raises(OSError, match="disk") as caught:
+        write()
+    assert caught.value.filename == str(path) and list(tmp_path.iterdir()) == []

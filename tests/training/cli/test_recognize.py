@@ -15,6 +15,9 @@ from PIL import Image
 from recording_files import table_frame
 from written_files import files_of
 
+from thor2_jax.model.recognition import Recognition
+from training.cli import recognize as recognize_command
+
 
 def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
@@ -87,6 +90,15 @@ def test_a_frame_of_background_has_no_table(model: Path, tmp_path: Path, printed
     Image.fromarray(np.zeros_like(small_frame().labels)).save(folder / "mask.png")
     out = printed("recognize", "--model", model, folder)
     assert "no instances" in out and "confidence" not in out
+
+
+def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recognize_command.console, "_width", 80)
+    unknown = Recognition(2, reason="unknown: a confidence of 0.448, below 0.573", confidence=0.448)
+    recognize_command._print_table("f", [Recognition(1, "021_bleach_cleanser", 0.954, "embedding"), unknown])
+    out = capfd.readouterr().out
+    assert "021_bleach_cleanser" in out and "unrecognized" in out and "0.954" in out and "…" not in out
+    assert max(map(len, out.splitlines())) == 80
 
 
 def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,6 +198,20 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
         assert [a["instances"][index]["frames"] for a in answers] == [3, 3, 3]
     assert (tmp_path / "out" / "2" / "overlay.png").is_file()
     assert "track" in printed("recognize", "--model", model, *command)
+
+
+def test_a_damaged_frame_does_not_end_a_sequence(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(4):
+        write_frame_files(tmp_path / "video" / f"{number}", small_frame(number))
+    (tmp_path / "video" / "1" / "depth.png").write_bytes(b"damaged")
+    (tmp_path / "video" / "2" / "mask.png").unlink()
+    assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
+    out, err = capfd.readouterr()
+    answers = json_lines(out)
+    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 3)] == [[2, 2]] * 2
+    assert "depth" in answers[1]["error"] and "labels" in answers[2]["error"] and "2 of 4 frames" in err
 
 
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:

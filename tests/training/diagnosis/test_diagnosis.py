@@ -135,6 +135,8 @@ def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
     names = {label: str(label) for label in frame.instances}
     assert_found("intrinsics-focal", check_depth, with_focal_factor(frame, 0.6), longer | {"large": 0.6}, names)
     assert_found("depth-unit", check_depth, frame, {name: side / 10 for name, side in sides.items()})
+    near = with_scale(frame, 6 * frame.intrinsics.depth_scale)
+    assert_found("depth-unit", check_depth, near, sides | {"pin": side / 10}, names)
     assert_found("", check_depth, frame, {"pin": 0.01}, trust_camera=False)
 
 

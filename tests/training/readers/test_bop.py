@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers.bop import BOP
+from training.readers.frames import find_frames
 
 
 def test_a_frame(tmp_path: Path) -> None:
@@ -98,3 +100,16 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
     error = refused(*command, at_once=False)  # without names, all objects are unknown
     assert "obj_000013, obj_000014, the runs have bowl, mug" in error
+
+
+def test_a_scene_without_ground_truth_can_be_segmented(tmp_path: Path) -> None:
+    scene = write_bop(tmp_path / "000048")
+    for missing in ("mask_visib", "scene_gt.json"):
+        shutil.move(scene / missing, tmp_path / f"moved_{missing}")
+        (source,) = find_frames([tmp_path])
+        frame = source.read()
+        assert frame.labels is None and frame.depth.any()
+        shutil.move(tmp_path / f"moved_{missing}", scene / missing)
+    assert len(source.read().instances) == 2
+    (source,) = find_frames([tmp_path], depth_scale=500)
+    assert source.read().intrinsics.depth_scale == 500

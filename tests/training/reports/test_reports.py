@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -21,6 +22,9 @@ from training.objects.builtin_objects import builtin_objects
 from training.reports import plots
 from training.reports.html import Picture, Section, write_page
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
 pytestmark = pytest.mark.usefixtures("drawn_pictures")
 
 
@@ -34,6 +38,14 @@ def test_page_escapes_its_content(tmp_path: Path) -> None:
     assert {"more & more", "<i>", "T<script>", "A < B", "x & y", "<b>", 'the "first"'} <= set(page.text)
     assert page.pictures == [{"src": "p.png", "alt": 'the "first"'}]
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_long_names_fit_a_narrow_page(tmp_path: Path, browser: "Browser") -> None:
+    write_page(tmp_path / "page.html", title="002_master_chef_can_of_coffee", lead="l" * 50, sections=[])
+    page = browser.new_page(viewport={"width": 300, "height": 600})
+    page.goto((tmp_path / "page.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == 300
+    page.close()
 
 
 def colors_in(path: Path) -> int:
