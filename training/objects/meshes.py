@@ -1,5 +1,6 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
+import dataclasses
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -90,7 +91,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
 
 
 def _longest(mesh: TexturedMesh) -> float:
-    return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    return float(np.ptp(mesh.vertices, axis=0).max())
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -165,6 +166,9 @@ def _parsed(path: Path) -> TexturedMesh:
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)
+        # The bounds of an object are those of its faces.
+        used, faces = np.unique(mesh.faces, return_inverse=True)
+        mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
         if not np.isfinite(mesh.vertices).all():
             raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
         if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():

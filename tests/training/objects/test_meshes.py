@@ -171,6 +171,14 @@ def test_a_ply_without_its_texture_prints_nothing(tmp_path: Path, capfd: pytest.
     assert capfd.readouterr().err == ""
 
 
+def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
+    colors = np.full((5, 4), 100, np.uint8)
+    for stray in ([[0.5, 0.0, 0.0]], [[np.nan, 0.0, 0.0]]):
+        mesh = trimesh.Trimesh([*stray, *QUAD], QUAD_FACES + 1, vertex_colors=colors, process=False)
+        mesh.export(tmp_path / "quad.ply")
+        np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
+
+
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
