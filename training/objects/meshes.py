@@ -1,6 +1,7 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
 import dataclasses
+import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,6 +38,15 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
 """Range of an object's longest side, metres; rejects scans in millimetres and keeps the camera outside the object."""
+
+UNSUPPORTED_EXTENSIONS = {
+    "EXT_meshopt_compression",
+    "KHR_draco_mesh_compression",
+    "KHR_mesh_quantization",
+    "KHR_texture_basisu",
+    "KHR_texture_transform",
+}
+"""Extensions of glTF that trimesh ignores, and then reads other vertices or colours."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -92,6 +102,16 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
 
 def _longest(mesh: TexturedMesh) -> float:
     return float(np.ptp(mesh.vertices, axis=0).max())
+
+
+def _check_extensions(path: Path) -> None:
+    """Raise InputError if a GLB uses an extension of glTF that is not supported."""
+    if path.suffix.lower() != ".glb":
+        return
+    content = read_file(path)
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
+        raise InputError(f"it uses {', '.join(sorted(unsupported))}; expected a GLB without it: export the mesh again")
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -155,6 +175,7 @@ def _parsed(path: Path) -> TexturedMesh:
     try:
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
+        _check_extensions(path)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
         parts = []

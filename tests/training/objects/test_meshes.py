@@ -1,5 +1,6 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
+import functools
 import json
 import logging
 import os
@@ -177,6 +178,14 @@ def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
         mesh = trimesh.Trimesh([*stray, *QUAD], QUAD_FACES + 1, vertex_colors=colors, process=False)
         mesh.export(tmp_path / "quad.ply")
         np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
+
+
+def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
+    material, path = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)), tmp_path / "quad.glb"
+    quad = textured_quad(material)
+    for name in ("KHR_texture_transform", "KHR_draco_mesh_compression"):
+        quad.export(path, tree_postprocessor=functools.partial(dict.update, extensionsUsed=[name]))
+        check_refused(path, f"it uses {name}")
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
