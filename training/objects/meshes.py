@@ -87,10 +87,14 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if image is not None:
         check_size(image.width, image.height)  # before it is decoded
         is_simple = isinstance(material, SimpleMaterial)
+        if visual.uv is None:
+            raise InputError("a texture, but no texture coordinates for it")
+        if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
+            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
-    if image is None or visual.uv is None:
+    if image is None:
         uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
     else:
         uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))

@@ -188,6 +188,17 @@ def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
         check_refused(path, f"it uses {name}")
 
 
+def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
+    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "quad.obj")
+    (picture,) = tmp_path.glob("*.png")
+    Image.fromarray(np.full((2, 2), 9000, np.uint16)).save(picture)
+    check_refused(tmp_path / "quad.obj", "mode I;16; expected 8 bits")
+    textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))).export(tmp_path / "quad.glb")
+    content = (tmp_path / "quad.glb").read_bytes()
+    (tmp_path / "quad.glb").write_bytes(content.replace(b"TEXCOORD_0", b"TEXCOORD_1"))
+    check_refused(tmp_path / "quad.glb", "no texture coordinates")
+
+
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
