@@ -12,7 +12,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.image_baselines import check_weights, crop_size, pretrained_files
+from training.baselines.image_baselines import check_backbone, check_weights, crop_size, pretrained_files
 from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
@@ -103,6 +103,8 @@ def run_train_job(
             raise InputError(f"weights is {job.weights}, {reason}; leave it out")
         for name in baselines:
             check_weights(job.weights, name)
+    else:
+        check_backbone(baselines, job.out)
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
@@ -123,6 +125,8 @@ def run_train_job(
         _check_batch_size(job.protocol, views)
         if not is_finished(directory):
             check_out(directory)
+            if job.crop_size is not None:
+                views.read_crops(0, job.crop_size)  # raises if there are none
         elif not baselines or job.sequences is not None:
             check_trained(views.digest, directory, job.protocol)
     runs: dict[Path, list[TrainedRun]] = {}
