@@ -23,7 +23,7 @@ from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.crops import render_crops
 from training.views.dataset import ViewDataset, remove_views, render_dataset
-from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
+from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
 from training.views.mesh_views import RenderJob
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
@@ -122,7 +122,7 @@ def run_train_job(
     if job.sequences is not None:
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
     for directory, views in sources.items():
-        _check_batch_size(job.protocol, views)
+        _check_batch_size(job.protocol, sum(shard.views for shard in views.shards))
         if not is_finished(directory):
             check_out(directory)
             if job.crop_size is not None:
@@ -141,9 +141,9 @@ def run_train_job(
     return runs
 
 
-def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
+def _check_batch_size(protocol: Protocol, n_views: int) -> None:
     """Raise InputError if a batch is larger than all samples; default batch sizes are reduced later instead."""
-    size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
+    size = protocol.fit.batch_size
     n_samples = n_views * (len(protocol.mirrors) + protocol.orientation_copies)
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
         raise InputError(
@@ -259,6 +259,9 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         _check_folds(job, rendering, labelled)
+        n_instances = sum(map(len, labelled.views.values())) if labelled else 0
+        n_views = len(rendering.meshes) * len(rendering.angles) * rendering.copies + n_instances * (1 + MAX_COPIES)
+        _check_batch_size(job.protocol, n_views)  # later again, since some views may have too few points
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

@@ -93,6 +93,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--meshes meshes --mesh-scale 0", "mesh_scale is 0"),
         ("--meshes meshes --classifiers shape", "shape"),
         ("--meshes meshes --epochs 0", "epochs"),
+        ("--meshes meshes --batch-size 100000", "batch_size is 100000"),
         ("--meshes meshes --leave-out nobody", "leave_out has 'nobody'"),
         ("--meshes meshes --leave-out brick,box", "leave_out has box, brick, all"),
         ("--meshes meshes --embedding 9 --distractors meshes", "also a class"),
