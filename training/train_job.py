@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import jax
 
@@ -80,14 +79,14 @@ class TrainJob:
 
 
 def run_train_job(
-    job: TrainJob, progress: Progress, later: Mapping[str, float] = MappingProxyType({})
+    job: TrainJob, progress: Progress, stages: Mapping[str, float] | None = None
 ) -> dict[Path, list[TrainedRun]]:
     """Train all runs and baselines of the job that are not finished yet.
 
     Args:
         job: the job.
         progress: called with (stage, done, total, note); the stages are numbered, those of a sequence after its name.
-        later: stages of the caller after the training, with their times, which are counted with those of the job.
+        stages: stages to number, with their times; empty if `progress` numbers them. None numbers those of the job.
 
     Returns:
         Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
@@ -113,7 +112,7 @@ def run_train_job(
             _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    stages = {**job.stages, **later}
+    stages = job.stages if stages is None else stages
     shown = numbered(progress, stages)
     source = _open_views(job, labelled, shown)
     if job.leave_out:

@@ -20,6 +20,8 @@ from training.fitting.loop import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports import plots
 from training.reports.html import Picture, Section, write_page
+from training.storage.jobs import Progress
+from training.train_job import TrainJob
 
 pytestmark = pytest.mark.usefixtures("drawn_pictures")
 
@@ -73,6 +75,20 @@ def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
     (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
     assert_refused("already contains pictures", demo.run_demo, tmp_path)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["scene-0.png"]
+
+
+def test_one_counter_numbers_all_stages_of_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time that is left after the training is estimated from the pace of the training, too."""
+
+    def train(job: TrainJob, progress: Progress, stages: object) -> None:
+        progress("render", 1, 1, "")
+        raise Interrupted
+
+    shown: list[str] = []
+    monkeypatch.setattr(demo, "run_train_job", train)
+    with pytest.raises(Interrupted):
+        demo.run_demo(tmp_path, 1, lambda stage, *_: shown.append(stage))
+    assert shown == ["stage 1 of 7: render"]
 
 
 @pytest.mark.slow
