@@ -38,6 +38,7 @@ def test_a_frame(tmp_path: Path, place: str, first: int, data: str) -> None:
     assert item.identifier == f"{place}/top/curved/seq36/{STEM}"
     assert item.attributes == {"place": place, "camera": "upper", "type": "curved"}
     assert item.truth == {first: "mug", first + 1: "bowl", first + 2: "banana"}
+    assert OCID(tmp_path, write_names(tmp_path)).names() == {"mug", "bowl", "banana"}
     np.testing.assert_array_equal(item.frame.color, color)
     np.testing.assert_array_equal(item.frame.depth, depth)
     assert item.frame.instances == (first, first + 1, first + 2)
