@@ -208,6 +208,15 @@ def test_options_replace_values_of_the_protocols(
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
 
 
+def test_baselines_of_a_finished_run_were_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command
+) -> None:
+    monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
+    command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
+    assert "nothing was trained" in printed(*command)
+    assert "nothing was trained" not in printed(*command, "--baselines", "forest")
+
+
 @pytest.mark.usefixtures("small_descriptors", "weights")
 def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
