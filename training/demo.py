@@ -69,7 +69,7 @@ class DemoSummary:
         names: names of the compared recognizers.
         accuracy: subset of the instances ("all", "occlusion none", ...) -> one accuracy for each of `names`.
         instances: subset of the instances -> number of instances.
-        seconds: wall time of the demo.
+        seconds: wall time of this call; an interrupted demo took longer.
         peak_gib: peak resident memory of this process, GiB.
     """
 
@@ -104,8 +104,8 @@ def run_demo(
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
     job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
-    run_train_job(job, progress, SCENE_STAGES)
     shown = numbered(progress, job.stages | SCENE_STAGES)
+    run_train_job(job, shown, stages={})
     trained = load_run(out / "run")
     pictures.mkdir(exist_ok=True)
     scenes = _compose_scenes(objects, seed, shown)
@@ -194,7 +194,8 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
         f"Trained on {n_views:,} synthetic views of {n_objects} objects, evaluated on {N_SCENES} cluttered scenes "
         "as ten simulated cameras see them: with other light and colours, colour shifted against depth, noise and "
         "holes in depth, and masks that are too small or too large. "
-        f"{summary.seconds:.0f} s, {summary.peak_gib:.1f} GiB of memory."
+        f"The command took {summary.seconds:.0f} s, without earlier calls that were interrupted, and "
+        f"{summary.peak_gib:.1f} GiB of memory."
     )
     accuracy = (
         "Fraction of the instances that are recognized correctly. CE uses colour only, TOPS shape only, TOPS2 "

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import jax
 
@@ -12,7 +11,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.image_baselines import check_weights, crop_size, pretrained_files
+from training.baselines.image_baselines import check_backbone, check_weights, crop_size, pretrained_files
 from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
@@ -23,7 +22,7 @@ from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.crops import render_crops
 from training.views.dataset import ViewDataset, remove_views, render_dataset
-from training.views.labelled_views import LabelledInstances, WithLabelledViews, read_instances
+from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
 from training.views.mesh_views import RenderJob
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
@@ -80,14 +79,14 @@ class TrainJob:
 
 
 def run_train_job(
-    job: TrainJob, progress: Progress, later: Mapping[str, float] = MappingProxyType({})
+    job: TrainJob, progress: Progress, stages: Mapping[str, float] | None = None
 ) -> dict[Path, list[TrainedRun]]:
     """Train all runs and baselines of the job that are not finished yet.
 
     Args:
         job: the job.
         progress: called with (stage, done, total, note); the stages are numbered, those of a sequence after its name.
-        later: stages of the caller after the training, with their times, which are counted with those of the job.
+        stages: stages to number, with their times; empty if `progress` numbers them. None numbers those of the job.
 
     Returns:
         Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
@@ -103,6 +102,8 @@ def run_train_job(
             raise InputError(f"weights is {job.weights}, {reason}; leave it out")
         for name in baselines:
             check_weights(job.weights, name)
+    else:
+        check_backbone(baselines, job.out)
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
@@ -111,7 +112,7 @@ def run_train_job(
             _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    stages = {**job.stages, **later}
+    stages = job.stages if stages is None else stages
     shown = numbered(progress, stages)
     source = _open_views(job, labelled, shown)
     if job.leave_out:
@@ -120,9 +121,11 @@ def run_train_job(
     if job.sequences is not None:
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
     for directory, views in sources.items():
-        _check_batch_size(job.protocol, views)
+        _check_batch_size(job.protocol, sum(shard.views for shard in views.shards))
         if not is_finished(directory):
             check_out(directory)
+            if job.crop_size is not None:
+                views.read_crops(0, job.crop_size)  # raises if there are none
         elif not baselines or job.sequences is not None:
             check_trained(views.digest, directory, job.protocol)
     runs: dict[Path, list[TrainedRun]] = {}
@@ -137,9 +140,9 @@ def run_train_job(
     return runs
 
 
-def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
+def _check_batch_size(protocol: Protocol, n_views: int) -> None:
     """Raise InputError if a batch is larger than all samples; default batch sizes are reduced later instead."""
-    size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
+    size = protocol.fit.batch_size
     n_samples = n_views * (len(protocol.mirrors) + protocol.orientation_copies)
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
         raise InputError(
@@ -255,6 +258,9 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         _check_folds(job, rendering, labelled)
+        n_instances = sum(map(len, labelled.views.values())) if labelled else 0
+        n_views = len(rendering.meshes) * len(rendering.angles) * rendering.copies + n_instances * (1 + MAX_COPIES)
+        _check_batch_size(job.protocol, n_views)  # later again, since some views may have too few points
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

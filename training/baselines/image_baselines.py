@@ -36,6 +36,7 @@ from training.views.crops import ViewCrops
 
 __all__ = [
     "TEMPLATES",
+    "check_backbone",
     "check_weights",
     "compare",
     "crop_size",
@@ -154,6 +155,11 @@ DINOV2 = "vit_small_patch14_dinov2"
 
 DINOV2_SIZE = 224
 
+NO_BACKBONE = (
+    f"baselines: templates needs a backbone; expected --weights with {DINOV2}.safetensors, or the "
+    "baseline rgbd-vit or rgbd-vit-small in the same run"
+)
+
 BACKBONES = (DINOV2, "rgbd-vit", "rgbd-vit-small")
 """DINOv2 from a file of weights, or the colour stream of a network that was trained on the same views."""
 
@@ -226,10 +232,7 @@ def _backbone(task: FitTask) -> tuple[int, ViT, Mapping[str, str]]:
             create = partial(ARCHITECTURES[name].build, len(task.source.classes), 0)
             network: Any = model_from_arrays(create, stored.arrays)
             return number, network.color, stored.weights
-    raise InputError(
-        f"baselines: templates needs a backbone; expected --weights with {DINOV2}.safetensors, or the "
-        "baseline rgbd-vit or rgbd-vit-small in the same run"
-    )
+    raise InputError(NO_BACKBONE)
 
 
 def fit_templates(task: FitTask) -> StoredBaseline:
@@ -269,6 +272,13 @@ def crop_size(names: Sequence[str], weights: bool) -> int | None:
     if TEMPLATES in names:
         sizes.append(DINOV2_SIZE if weights else ARCHITECTURES["rgbd-vit-small"].size)
     return max(sizes, default=None)
+
+
+def check_backbone(names: Sequence[str], out: Path) -> None:
+    """Raise InputError if templates without pretrained weights have no backbone in `names` or in the runs in `out`."""
+    files = [baseline_file(Path(), name) for name in BACKBONES]
+    if TEMPLATES in names and not set(BACKBONES) & set(names) and not any(any(out.rglob(str(file))) for file in files):
+        raise InputError(NO_BACKBONE)
 
 
 def check_weights(directory: Path, name: str) -> None:

@@ -113,6 +113,7 @@ def _evaluate(
     given: Sequence[str] = (),
 ) -> None:
     from thor2_jax.files import file_digest
+    from thor2_jax.model.run_record import RUN_FILE
     from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_evaluated
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
@@ -129,7 +130,10 @@ def _evaluate(
     result = "no report was written (--out)"
     if out is not None:
         result = f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}"
-    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), "--model", models[0], "--out", "why")
+    # The run itself, or the first fold, of the first sequence.
+    files = models[0].rglob(RUN_FILE)
+    run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
+    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), "--model", run, "--out", "why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

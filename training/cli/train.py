@@ -204,7 +204,8 @@ def train(
             fold = f"fold {run.record['fold']}: " if len(runs) > 1 else ""
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
-        written = "run written to" if runs else "finished already: nothing was trained; the run is in"
+        finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
+        written = "run written to" if runs else f"{finished}; the run is in"
         model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
         frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
         finish(f"{written} {directory}", "recognize a frame", "recognize", "--model", model, *frame)

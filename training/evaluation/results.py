@@ -1,7 +1,7 @@
 """Computation of all values of a report from the answers, as one JSON table."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -180,13 +180,17 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     }
 
 
-def check_known(names: Collection[str], classes: Sequence[str]) -> None:
-    """Raise InputError unless an object of a dataset is of a class of the runs."""
-    if not any(find_name(name, classes) for name in names):
-        raise InputError(
-            f"model: no instance of the dataset is of a class of the runs; the dataset has {_listed(names)}, the runs "
-            f"have {_listed(classes)}; check the names, give other runs, or add frames with known objects"
-        )
+def check_known(names: Iterable[str], classes: Sequence[str]) -> None:
+    """Raise InputError unless an object of a dataset is of a class of the runs; read names until there is one."""
+    unknown: set[str] = set()
+    for name in names:
+        if name not in unknown and find_name(name, classes):
+            return
+        unknown.add(name)
+    raise InputError(
+        f"model: no instance of the dataset is of a class of the runs; the dataset has {_listed(unknown)}, the runs "
+        f"have {_listed(classes)}; check the names, give other runs, or add frames with known objects"
+    )
 
 
 def _listed(names: Iterable[str]) -> str:

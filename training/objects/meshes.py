@@ -1,5 +1,7 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
+import dataclasses
+import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -36,6 +38,15 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
 """Range of an object's longest side, metres; refuses scans in millimetres and keeps the camera outside the object."""
+
+UNSUPPORTED_EXTENSIONS = {
+    "EXT_meshopt_compression",
+    "KHR_draco_mesh_compression",
+    "KHR_mesh_quantization",
+    "KHR_texture_basisu",
+    "KHR_texture_transform",
+}
+"""Extensions of glTF that trimesh ignores, and then reads other vertices or colours."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -76,10 +87,14 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if image is not None:
         check_size(image.width, image.height)  # before it is decoded
         is_simple = isinstance(material, SimpleMaterial)
+        if visual.uv is None:
+            raise InputError("a texture, but no texture coordinates for it")
+        if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
+            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
-    if image is None or visual.uv is None:
+    if image is None:
         uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
     else:
         uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
@@ -90,7 +105,17 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
 
 
 def _longest(mesh: TexturedMesh) -> float:
-    return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    return float(np.ptp(mesh.vertices, axis=0).max())
+
+
+def _check_extensions(path: Path) -> None:
+    """Raise InputError if a GLB uses an extension of glTF that is not supported."""
+    if path.suffix.lower() != ".glb":
+        return
+    content = read_file(path)
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
+        raise InputError(f"it uses {', '.join(sorted(unsupported))}; expected a GLB without it: export the mesh again")
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -154,6 +179,7 @@ def _parsed(path: Path) -> TexturedMesh:
     try:
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
+        _check_extensions(path)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
         parts = []
@@ -165,6 +191,9 @@ def _parsed(path: Path) -> TexturedMesh:
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)
+        # The bounds of an object are those of its faces.
+        used, faces = np.unique(mesh.faces, return_inverse=True)
+        mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
         if not np.isfinite(mesh.vertices).all():
             raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
         if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():

@@ -107,6 +107,13 @@ class BOP(LabelledFrames):
         masks = sorted((scene / MASKS).glob(f"{image.stem}_*.png"))
         return [image, scene / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
 
+    def names(self) -> Iterator[str]:
+        """Yield the names of the objects in all scenes, frame by frame."""
+        for image in self.sources:
+            with _entry(image, "gt") as entry:
+                objects = _values(entry, "obj_id", int)
+            yield from map(self._name, objects)
+
     def _name(self, obj_id: int) -> str:
         if self._names is None:
             return f"obj_{obj_id:06d}"

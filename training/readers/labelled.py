@@ -112,8 +112,12 @@ class LabelledFrames(abc.ABC):
         """Return the files from which a frame is read; empty by default."""
         return ()
 
-    def names(self) -> set[str] | None:
-        """Return the names of all objects, if they can be read without the images; by default they are unknown."""
+    def names(self) -> Iterable[str] | None:
+        """Return the names of all objects, if they can be read without the images; by default they are unknown.
+
+        Raises:
+            InputError: when a name is read, its file is missing or damaged.
+        """
         return None
 
     def only(self, number: int) -> Self:

@@ -117,6 +117,10 @@ class OCID(LabelledFrames):
         cloud = folder / "pcd" / f"{image.stem}.pcd"
         return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
 
+    def names(self) -> set[str]:
+        """Return the names of the objects in the table."""
+        return {name for names in self._names.values() for name in names.values()}
+
 
 def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[str]) -> dict[str, dict[int, str]]:
     """Return label -> name for each sequence; the entry of a sequence is the longest end of its path in the table."""

@@ -3,6 +3,7 @@
 `<video>/images/<frame>_{rgb,depth,labels}.png` and `<frame>_poses.yaml`; 1280 x 720, depth in millimetres.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from thor2_jax.errors import InputError, decoding
@@ -68,6 +69,11 @@ class UWISOccluded(LabelledFrames):
         color = self.sources[number]
         names = "rgb.png", "depth.png", "labels.png", "poses.yaml"
         return [color.with_name(f"{_stem(color)}_{name}") for name in names]
+
+    def names(self) -> Iterator[str]:
+        """Yield the names of the objects in all frames, frame by frame."""
+        for number in range(len(self)):
+            yield from _truth(self.files(number)[-1]).values()
 
 
 def _video(color: Path) -> str:

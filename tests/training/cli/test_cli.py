@@ -6,6 +6,7 @@ import shlex
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rendered_objects import write_meshes
 from written_files import files_of
 
 import colornet
+from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.networks import FEATURES
@@ -208,6 +210,15 @@ def test_options_replace_values_of_the_protocols(
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
 
 
+def test_baselines_of_a_finished_run_were_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command
+) -> None:
+    monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
+    command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
+    assert "nothing was trained" in printed(*command)
+    assert "nothing was trained" not in printed(*command, "--baselines", "forest")
+
+
 @pytest.mark.usefixtures("small_descriptors", "weights")
 def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
@@ -276,12 +287,17 @@ def test_train_by_sequences(
 
 
 @UNFITTED
-def test_rendered_views_are_kept_for_another_attempt(meshes: Path, tmp_path: Path, refused: Command) -> None:
+def test_rendered_views_are_kept_for_another_attempt(
+    meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)
     assert "folds is 99" in refused(*command, "--folds", 99, at_once=False)
-    assert not out.exists()  # no view was rendered
     assert "batch_size is 100000" in refused(*command, "--batch-size", 100_000, at_once=False)
+    assert not out.exists()  # no view was rendered
+    with monkeypatch.context() as patch:
+        patch.setattr(train_job, "train_run", mock.Mock(side_effect=InputError("stopped")))
+        assert "stopped" in refused(*command, at_once=False)
     assert [p.name for p in out.iterdir()] == ["views"]
     last = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--embedding", 0)
     assert run_thor2(*command, *last) == 0

@@ -1,5 +1,6 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
+import functools
 import json
 import logging
 import os
@@ -169,6 +170,33 @@ def test_a_ply_without_its_texture_prints_nothing(tmp_path: Path, capfd: pytest.
     with mock.patch.object(logging.getLogger(), "handlers", []):
         check_refused(tmp_path / "quad.ply", "'absent.png' is missing")
     assert capfd.readouterr().err == ""
+
+
+def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
+    colors = np.full((5, 4), 100, np.uint8)
+    for stray in ([[0.5, 0.0, 0.0]], [[np.nan, 0.0, 0.0]]):
+        mesh = trimesh.Trimesh([*stray, *QUAD], QUAD_FACES + 1, vertex_colors=colors, process=False)
+        mesh.export(tmp_path / "quad.ply")
+        np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
+
+
+def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
+    material, path = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)), tmp_path / "quad.glb"
+    quad = textured_quad(material)
+    for name in ("KHR_texture_transform", "KHR_draco_mesh_compression"):
+        quad.export(path, tree_postprocessor=functools.partial(dict.update, extensionsUsed=[name]))
+        check_refused(path, f"it uses {name}")
+
+
+def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
+    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "quad.obj")
+    (picture,) = tmp_path.glob("*.png")
+    Image.fromarray(np.full((2, 2), 9000, np.uint16)).save(picture)
+    check_refused(tmp_path / "quad.obj", "mode I;16; expected 8 bits")
+    textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))).export(tmp_path / "quad.glb")
+    content = (tmp_path / "quad.glb").read_bytes()
+    (tmp_path / "quad.glb").write_bytes(content.replace(b"TEXCOORD_0", b"TEXCOORD_1"))
+    check_refused(tmp_path / "quad.glb", "no texture coordinates")
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ def test_a_frame(tmp_path: Path, place: str, first: int, data: str) -> None:
     assert item.identifier == f"{place}/top/curved/seq36/{STEM}"
     assert item.attributes == {"place": place, "camera": "upper", "type": "curved"}
     assert item.truth == {first: "mug", first + 1: "bowl", first + 2: "banana"}
+    assert OCID(tmp_path, write_names(tmp_path)).names() == {"mug", "bowl", "banana"}
     np.testing.assert_array_equal(item.frame.color, color)
     np.testing.assert_array_equal(item.frame.depth, depth)
     assert item.frame.instances == (first, first + 1, first + 2)
@@ -188,7 +189,11 @@ def test_each_sequence_has_its_own_run(
     error = refused(*command, "--per-sequence")
     assert f"error: model: {models} has no run for table/top/mixed/seq08; " in error
     (models / "table/top/mixed/seq08").mkdir(parents=True)
+    for folder in ("table/top/mixed/seq08/fold-1", "seq36/fold-1", "seq36/fold-0"):
+        (models / folder).mkdir()
+        (models / folder / "run.json").touch()
     output = printed(*command, "--per-sequence", "--out", tmp_path / "report")
+    assert f"--model {models}/seq36/fold-0 " in output  # of the command that explains answers
     assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]

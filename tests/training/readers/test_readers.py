@@ -46,6 +46,7 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     items = list(dataset)
     assert [item.identifier for item in items] == ["219/000002", "219/000010", "1000/000000"] == dataset.identifiers
     assert [item.truth for item in items] == [{1: "mug"}, {1: "mug"}, {1: "mug", 77: "spoon"}]
+    assert list(dataset.names()) == ["mug", "mug", "mug", "spoon"]
     for item, seed in zip(items, (2, 1, 0), strict=True):
         assert_images_of(item, seed)
         camera = 920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406

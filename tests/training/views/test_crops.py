@@ -16,7 +16,9 @@ from written_files import files_of
 import thor2_jax as thor2
 from thor2_jax.frames.frames import backproject
 from training.objects.meshes import find_meshes, load_mesh
+from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
+from training.train_job import TrainJob, run_train_job
 from training.views import crops as crops_module
 from training.views.crops import (
     CROP_SIZE,
@@ -194,6 +196,8 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     job = RenderJob(find_meshes(meshes), 180, 90)
     plain = render_dataset(job, tmp_path / "plain")
     assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
+    training = TrainJob(tmp_path / "run", DEFAULT, dataset=plain.directory, baselines=["vit-cnn-small"])
+    assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
     content = json.loads(manifest.read_text())
