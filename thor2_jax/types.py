@@ -34,6 +34,7 @@ __all__ = [
     "check_batch",
     "check_capacity",
     "check_cloud",
+    "check_settings",
     "is_positive_integer",
     "is_sized",
 ]
@@ -179,6 +180,14 @@ def check_batch(clouds: PointClouds) -> None:
         raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
+def check_settings(**settings: object) -> None:
+    """Raise InputError unless each setting has the type that belongs to its name."""
+    for name, value in settings.items():
+        expected = _SETTINGS[name]
+        if not isinstance(value, expected) and not (name == "parameters" and value is None):
+            raise InputError(f"{name} is a {type(value).__name__}; expected a {expected.__name__}")
+
+
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
     """Return `values` as an array; rows of different lengths raise InputError."""
     try:
@@ -316,9 +325,18 @@ class Parameters:
 
     @classmethod
     def of(cls, network: ColorNetwork, config: DescriptorConfig) -> "Parameters":
-        """Return the parameters that a network and a config contain."""
+        """Return the parameters that a network and a config contain.
+
+        Raises:
+            InputError: `network` or `config` is of another type.
+        """
+        check_settings(network=network, config=config)
         # The arrays are concrete even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
             # NumPy converts the values, since JAX would compile a program for each conversion.
             return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))
+
+
+_SETTINGS = {"network": ColorNetwork, "config": DescriptorConfig, "parameters": Parameters, "strips": Strips}
+"""Types of the arguments that `check_settings` checks."""

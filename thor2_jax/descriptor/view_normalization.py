@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, rotate
 from thor2_jax.errors import InputError
-from thor2_jax.types import Parameters, PointClouds, check_batch
+from thor2_jax.types import Parameters, PointClouds, check_batch, check_settings
 
 __all__ = ["Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
@@ -28,6 +28,7 @@ OCCLUSION_BIN = 0.01
 
 
 def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) -> tuple[ArrayLike, ArrayLike]:
+    check_settings(config=config, parameters=parameters)
     if parameters is None:
         return np.float32(config.sigma_s), np.float32(config.alpha)
     return parameters.sigma_s, parameters.alpha
@@ -121,7 +122,7 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
 
     Raises:
-        InputError: `clouds` is not a batch of clouds.
+        InputError: `clouds` is not a batch of clouds, or another argument is of another type.
     """
     sigma_s, _ = _sigma_s_and_alpha(config, parameters)
     return _normalized_and_turned(clouds, sigma_s, jnp.zeros_like(sigma_s))
@@ -153,7 +154,7 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
         Aligned clouds in scaled units, in the first octant.
 
     Raises:
-        InputError: `normal` is not a batch of clouds.
+        InputError: `normal` is not a batch of clouds, or another argument is of another type.
     """
     check_batch(normal)
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
@@ -191,7 +192,6 @@ def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters 
     return _normalized_and_turned(clouds, *_sigma_s_and_alpha(config, parameters))
 
 
-@partial(jax.jit, static_argnums=1)
 def mirror(normal: PointClouds, axes: str) -> PointClouds:
     """Mirror normalized clouds within their boxes (paper, "Training": each view is also mirrored in x, y and xy).
 
@@ -200,10 +200,16 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
         axes: axes to mirror, letters of "xyz"; "" returns equal clouds. Static.
 
     Raises:
-        InputError: `axes` has another letter.
+        InputError: `normal` is not a batch of clouds, or `axes` has another letter.
     """
-    if not set(axes) <= set("xyz"):
+    check_batch(normal)
+    if not isinstance(axes, str) or not set(axes) <= set("xyz"):
         raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
+    return _mirror(normal, axes)
+
+
+@partial(jax.jit, static_argnums=1)
+def _mirror(normal: PointClouds, axes: str) -> PointClouds:
     flip = jnp.array([letter in axes for letter in "xyz"])
     high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)
     points = jnp.where(flip & normal.mask[..., None], high - normal.points, normal.points)

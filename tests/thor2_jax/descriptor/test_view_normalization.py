@@ -142,3 +142,5 @@ def test_mirror_keeps_the_box(axes: str) -> None:
     np.testing.assert_array_equal(mirrored.points[1], 0)
     np.testing.assert_array_equal(mirrored.mask, normal.mask)
     assert_refused(f"axes is '{axes}w'", thor2.mirror, normal, f"{axes}w")
+    assert_refused("axes is None", thor2.mirror, normal, None)
+    assert_refused("clouds is DescriptorConfig", thor2.mirror, CONFIG, axes)
