@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, is_positive_integer, is_sized
+from thor2_jax.types import Diagrams, check_types, is_positive_integer, is_sized
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -193,8 +193,7 @@ def images(
             the type of the births, `pixels` is not two positive integers, or `variance` or `exponent` is not a positive
             number.
     """
-    if not isinstance(diagrams, Diagrams):
-        raise InputError(f"diagrams is a {type(diagrams).__name__}; expected Diagrams, as from sublevel_diagrams")
+    check_types(diagrams=diagrams)
     dtype = diagrams.births.dtype
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         numbers = _real_numbers(bounds, (2,), dtype)

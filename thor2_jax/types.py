@@ -34,7 +34,7 @@ __all__ = [
     "check_batch",
     "check_capacity",
     "check_cloud",
-    "check_settings",
+    "check_types",
     "is_positive_integer",
     "is_sized",
 ]
@@ -180,10 +180,10 @@ def check_batch(clouds: PointClouds) -> None:
         raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
-def check_settings(**settings: object) -> None:
-    """Raise InputError unless each setting has the type that belongs to its name."""
-    for name, value in settings.items():
-        expected = _SETTINGS[name]
+def check_types(**arguments: object) -> None:
+    """Raise InputError unless each argument has the type that belongs to its name."""
+    for name, value in arguments.items():
+        expected = _TYPES[name]
         if not isinstance(value, expected) and not (name == "parameters" and value is None):
             raise InputError(f"{name} is a {type(value).__name__}; expected a {expected.__name__}")
 
@@ -330,7 +330,7 @@ class Parameters:
         Raises:
             InputError: `network` or `config` is of another type.
         """
-        check_settings(network=network, config=config)
+        check_types(network=network, config=config)
         # The arrays are concrete even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
@@ -338,5 +338,11 @@ class Parameters:
             return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))
 
 
-_SETTINGS = {"network": ColorNetwork, "config": DescriptorConfig, "parameters": Parameters, "strips": Strips}
-"""Types of the arguments that `check_settings` checks."""
+_TYPES = {
+    "network": ColorNetwork,
+    "config": DescriptorConfig,
+    "parameters": Parameters,
+    "strips": Strips,
+    "diagrams": Diagrams,
+}
+"""Types of the arguments that `check_types` checks."""

@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, rotate
 from thor2_jax.errors import InputError
-from thor2_jax.types import Parameters, PointClouds, check_batch, check_settings
+from thor2_jax.types import Parameters, PointClouds, check_batch, check_types
 
 __all__ = ["Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
@@ -28,7 +28,7 @@ OCCLUSION_BIN = 0.01
 
 
 def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) -> tuple[ArrayLike, ArrayLike]:
-    check_settings(config=config, parameters=parameters)
+    check_types(config=config, parameters=parameters)
     if parameters is None:
         return np.float32(config.sigma_s), np.float32(config.alpha)
     return parameters.sigma_s, parameters.alpha
