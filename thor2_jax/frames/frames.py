@@ -25,6 +25,7 @@ __all__ = [
     "RGBDFrame",
     "RecordedFrame",
     "backproject",
+    "check_frame",
     "check_images",
     "distort",
     "frame_intrinsics",
@@ -151,6 +152,12 @@ class RGBDFrame:
         The frame is that of `backproject`.
         """
         return pixel_rays(pixels, self.depth.shape[1], self.intrinsics) * self.depth_m.ravel()[pixels, None]
+
+
+def check_frame(frame: object) -> None:
+    """Raise InputError unless the value is a frame."""
+    if not isinstance(frame, RGBDFrame):
+        raise InputError(f"frame is a {type(frame).__name__}; expected an RGBDFrame, as read_frame returns it")
 
 
 def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
