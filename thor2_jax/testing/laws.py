@@ -110,7 +110,7 @@ def assert_company_invariant(describe: Describe, clouds: PointClouds, others: Po
     """
     expected = describe(clouds)
     for b in range(clouds.mask.shape[0]):
-        mixed = jax.tree.map(lambda one, other, b=b: other.at[b].set(one[b]), clouds, others)
+        mixed = jax.tree.map(lambda one, other, b=b: jnp.asarray(other).at[b].set(one[b]), clouds, others)
         assert_equal(*(jax.tree.map(lambda a, b=b: a[b], d) for d in (describe(mixed), expected)))
 
 
