@@ -44,7 +44,7 @@ Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class PointClouds:
     """A batch of coloured point clouds, padded to the same number of points.
 
@@ -226,7 +226,7 @@ def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[n
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Strips:
     """The extremes and the colour vector of every strip of aligned clouds, from which descriptors are computed.
 
@@ -246,7 +246,7 @@ class Strips:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Diagrams:
     """Finite H0 persistence pairs of every slice, padded to the number of strips.
 
@@ -269,7 +269,7 @@ def _interleave(images: jax.Array, embeddings: jax.Array) -> jax.Array:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Descriptors:
     """TOPS, TOPS2 and the colour embeddings (CE) of a batch of clouds.
 
@@ -304,7 +304,7 @@ class Descriptors:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Parameters:
     """Learnable parameters of a descriptor, which replace the same values of the network and the config.
 

@@ -144,7 +144,10 @@ def test_records_are_frozen() -> None:
         assert record.__dataclass_params__.frozen, record
 
 
-@pytest.mark.parametrize("record", [PreparedInstance, thor2.RGBDFrame])
-def test_records_of_numpy_arrays_compare_by_identity(record: type) -> None:
+RECORDS_OF_JAX = [thor2.PointClouds, thor2.Strips, thor2.Diagrams, thor2.Descriptors, thor2.Parameters]
+
+
+@pytest.mark.parametrize("record", [PreparedInstance, thor2.RGBDFrame, *RECORDS_OF_JAX])
+def test_records_of_arrays_compare_by_identity(record: type) -> None:
     """Comparing their arrays would raise."""
     assert record.__eq__ is object.__eq__ and record.__hash__ is object.__hash__
