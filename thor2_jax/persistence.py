@@ -189,12 +189,14 @@ def images(
         [..., P, Q] of the type of the births, axes birth and persistence. The image of an empty diagram is zero.
 
     Raises:
-        InputError: `diagrams` is of another type, a range is not two increasing numbers that are finite and differ in
-            the type of the births, `pixels` is not two positive integers, or `variance` or `exponent` is not a positive
-            number.
+        InputError: `diagrams` is of another type or not floating, a range is not two increasing numbers that are finite
+            and differ in the type of the births, `pixels` is not two positive integers, or `variance` or `exponent` is
+            not a positive number.
     """
     check_types(diagrams=diagrams)
-    dtype = diagrams.births.dtype
+    dtype = getattr(diagrams.births, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+        raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         numbers = _real_numbers(bounds, (2,), dtype)
         if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:

@@ -208,6 +208,12 @@ def test_bad_images(change: dict[str, Any]) -> None:
         persistence.images(**({"diagrams": diagrams, **IMAGE, "variance": 0.1} | change))
 
 
+@pytest.mark.parametrize("births", [np.zeros(3, np.int32), [0.0, 1.0, 2.0]])
+def test_births_are_floating_arrays(births: Any) -> None:
+    diagrams = thor2.Diagrams(births, births, births)
+    assert_refused("diagrams has births .*floating", persistence.images, diagrams, **IMAGE, variance=0.1)
+
+
 def test_variance_and_exponent_may_be_integers() -> None:
     diagrams = persistence.sublevel_diagrams(np.array([0, 2, 1, 3], np.float32))
     images = [persistence.images(diagrams, **IMAGE, variance=kind(1), exponent=kind(2)) for kind in (int, float)]
