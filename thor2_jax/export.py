@@ -21,7 +21,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.types import PointClouds
+from thor2_jax.types import PointClouds, is_positive_integer
 
 __all__ = ["PLATFORMS", "export_recognizer"]
 
@@ -47,10 +47,12 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         "embedding"; its probabilities sum to the probability that the object is one of the classes.
 
     Raises:
-        InputError: a size is not a bucket, or a platform is unknown.
+        InputError: `run` is of another type, a size is not a bucket, or a platform is unknown.
     """
+    if not isinstance(run, TrainedRun):
+        raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun, as load_run returns it")
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
-        if value not in buckets:
+        if not is_positive_integer(value) or value not in buckets:
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, buckets))}")
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {tuple(platforms)!r}; expected some of {', '.join(PLATFORMS)}")

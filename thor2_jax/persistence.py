@@ -16,15 +16,18 @@ complexes, and no distances between diagrams. Use GUDHI for these.
 """
 
 import math
+import reprlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from numpy.typing import NDArray
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, is_positive_integer
+from thor2_jax.types import Diagrams, check_types, is_positive_integer, is_sized
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -60,11 +63,11 @@ def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Dia
     Raises:
         InputError: `heights` or `edges` is not floating, or has another shape.
     """
-    heights = jnp.asarray(heights)
+    heights = _as_jax("heights", heights, "floating [..., N]")
     if heights.ndim == 0 or not jnp.issubdtype(heights.dtype, jnp.floating):
         raise InputError(f"heights is {heights.dtype} {list(heights.shape)}; expected floating [..., N]")
     if edges is not None:
-        edges = jnp.asarray(edges)
+        edges = _as_jax("edges", edges, "floating [..., N - 1]")
         shape = (*heights.shape[:-1], max(heights.shape[-1] - 1, 0))
         if edges.shape != shape or not jnp.issubdtype(edges.dtype, jnp.floating):
             raise InputError(
@@ -72,6 +75,16 @@ def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Dia
                 f"neighbours in heights {list(heights.shape)}"
             )
     return _sublevel_diagrams(heights, edges)
+
+
+def _as_jax(name: str, values: ArrayLike, expected: str) -> jax.Array:
+    """Return the values as an array of JAX, which takes no NumPy arrays of the other byte order."""
+    if isinstance(values, np.ndarray):
+        values = values.astype(values.dtype.newbyteorder("="), copy=False)
+    try:
+        return jnp.asarray(values)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {reprlib.repr(values)}; expected {expected}, rows of equal length") from None
 
 
 @jax.jit
@@ -176,20 +189,40 @@ def images(
         [..., P, Q] of the type of the births, axes birth and persistence. The image of an empty diagram is zero.
 
     Raises:
-        InputError: a range is not two finite increasing numbers, `pixels` is not two positive integers, or `variance`
-            or `exponent` is a number that is not positive.
+        InputError: `diagrams` is of another type or not floating, a range is not two increasing numbers that are finite
+            and differ in the type of the births, `pixels` is not two positive integers, or `variance` or `exponent` is
+            not a positive number.
     """
+    check_types(diagrams=diagrams)
+    dtype = getattr(diagrams.births, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+        raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
-        if len(bounds) != 2 or not all(map(math.isfinite, bounds)) or not bounds[0] < bounds[1]:
-            raise InputError(f"{name} is {bounds}; expected two finite numbers, the smaller one first")
-    if len(pixels) != 2 or not all(map(is_positive_integer, pixels)):
-        raise InputError(f"pixels is {pixels}; expected two positive integers")
+        numbers = _real_numbers(bounds, (2,), dtype)
+        if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:
+            raise InputError(f"{name} is {bounds!r}; expected two finite numbers, the smaller one first, in {dtype}")
+    if not is_sized(pixels) or len(pixels) != 2 or not all(map(is_positive_integer, pixels)):
+        raise InputError(f"pixels is {pixels!r}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
-        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 < np.asarray(value) < math.inf):
-            raise InputError(f"{name} is {value}; expected a positive number")
+        number = value if isinstance(value, jax.core.Tracer) else _real_numbers(value, (), dtype)
+        if number is None or (number is not value and not 0 < number < math.inf):
+            raise InputError(f"{name} is {value!r}; expected a positive number")
     ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
-    dtype = diagrams.births.dtype
-    return _images(diagrams, *(jnp.linspace(*bounds, n + 1, dtype=dtype) for bounds, n in ends), variance, exponent)
+    edges = (jnp.linspace(*bounds, n + 1, dtype=dtype) for bounds, n in ends)
+    return _images(diagrams, *edges, jnp.asarray(variance, dtype), exponent)
+
+
+def _real_numbers(values: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+    """Return the values in a floating type; None if they are no real numbers or have another shape."""
+    try:
+        numbers = np.asarray(values)
+    except ValueError:
+        return None
+    kinds = (jnp.integer, jnp.floating)
+    if numbers.shape != shape or not any(jnp.issubdtype(numbers.dtype, kind) for kind in kinds):
+        return None
+    with np.errstate(over="ignore"):  # infinite numbers are rejected
+        return numbers.astype(dtype)
 
 
 @jax.jit

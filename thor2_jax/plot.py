@@ -9,6 +9,7 @@ Every function draws on given axes `ax`, which may be part of any figure:
 Lengths keep their unit: metres for clouds in the camera frame, scaled units for aligned clouds.
 """
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ from colornet.draw import plot_network
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.figures import name_style, plain_text
-from thor2_jax.types import Diagrams
+from thor2_jax.types import Diagrams, check_types
 
 __all__ = [
     "PALETTE",
@@ -65,8 +66,17 @@ def attribution_colors(values: ArrayLike) -> ScalarMappable:
     return ScalarMappable(Normalize(-end, end), _DIVERGING)
 
 
+def _as_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Return an array of real numbers; texts, rows of different lengths and other objects raise InputError."""
+    try:
+        np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {reprlib.repr(values)}; expected an array of numbers") from None
+    return np.asarray(values)
+
+
 def _check_points(points: ArrayLike, colors: ArrayLike) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    xyz, rgb = np.asarray(points), np.asarray(colors)
+    xyz, rgb = _as_numbers("points", points), _as_numbers("colors", colors)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise InputError(f"points is {list(xyz.shape)}; expected [n, 3], for example a cloud of PointClouds.unpack")
     if rgb.shape != xyz.shape:
@@ -90,7 +100,7 @@ def _scatter(
         ax.set_facecolor("#e4e4e4")  # White points must be visible.
         order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
-        given = np.asarray(values, float)
+        given = _as_numbers("values", values).astype(float)
         if given.shape != (len(colors),):
             raise InputError(f"values is {list(given.shape)}; expected [{len(colors)}], one value for each point")
         colors, magnitude = (scale or attribution_colors(given)).to_rgba(given), np.abs(given)
@@ -162,9 +172,10 @@ def slices(
     Raises:
         InputError: the shapes do not fit, or `colors` has another type.
     """
+    check_types(config=config)
     xyz, rgb = _check_points(points, colors)
     drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], rgb, values, scale, size)
-    right, top = xyz[:, [0, 2]].max(axis=0, initial=0)
+    right, top = np.where(np.isfinite(xyz), xyz, 0)[:, [0, 2]].max(axis=0, initial=0)
     used = min(config.n_slices, int(top / config.sigma_1) + 1)
     for level in np.arange(used + 1) * config.sigma_1:
         ax.axhline(level, color="#888888", linewidth=0.7, zorder=0.5)
@@ -192,6 +203,7 @@ def persistence_diagram(ax: Axes, diagrams: Diagrams, config: DescriptorConfig) 
     Raises:
         InputError: the fields have more axes, for example a whole batch.
     """
+    check_types(diagrams=diagrams, config=config)
     fields = [np.asarray(field) for field in (diagrams.births, diagrams.deaths, diagrams.mask)]
     if fields[0].ndim not in (1, 2):
         raise InputError(f"diagrams has births {list(fields[0].shape)}; expected [J] or [S, J], those of one cloud")
@@ -225,7 +237,8 @@ def persistence_image(
     Raises:
         InputError: the image has another shape.
     """
-    values = np.asarray(image)
+    check_types(config=config)
+    values = _as_numbers("image", image)
     if values.shape != (config.image_size,) * 2:
         raise InputError(
             f"image is {list(values.shape)}; expected {[config.image_size] * 2}, one of Descriptors.images"
@@ -238,7 +251,8 @@ def persistence_image(
 
 
 def _check_matrix(matrix: ArrayLike, network: ColorNetwork) -> NDArray[np.float64]:
-    values = np.asarray(matrix, float)
+    check_types(network=network)
+    values = _as_numbers("matrix", matrix).astype(float)
     if values.ndim != 2 or values.shape[1] != network.n_regions:
         raise InputError(f"matrix is {list(values.shape)}; expected [J, {network.n_regions}], strips by colour regions")
     return values
@@ -285,10 +299,12 @@ def color_matrix(
         largest: value of an entry that is drawn opaque; by default the largest entry.
 
     Raises:
-        InputError: the matrix has another shape.
+        InputError: the matrix has another shape, or the network lacks a region.
     """
     color = _check_matrix(matrix, network)
     rows = np.flatnonzero(color.any(axis=0)) if regions is None else np.asarray(regions, int)
+    if not ((rows >= 0) & (rows < network.n_regions)).all():
+        raise InputError(f"regions is {rows.tolist()}; expected numbers from 0 to {network.n_regions - 1}")
     top = (float(color.max(initial=0)) if largest is None else largest) or 1.0
     cells = np.zeros((len(rows), len(color), 4))
     cells[..., :3] = (network.mean_rgb[rows] / 255)[:, None]
@@ -314,11 +330,15 @@ def color_network(ax: Axes, network: ColorNetwork, weights: ArrayLike | None = N
             of the number of colours in the region, and regions without points are pale.
 
     Raises:
-        InputError: the weights have another shape, or a negative value.
+        InputError: the weights have another shape, or a value that is negative or not finite.
     """
-    used = None if weights is None else np.asarray(weights, float)
-    if used is not None and (used.shape != (network.n_regions,) or (used < 0).any()):
-        raise InputError(f"weights is {list(used.shape)}; expected [{network.n_regions}] numbers of points, at least 0")
+    check_types(network=network)
+    used = None if weights is None else _as_numbers("weights", weights).astype(float)
+    if used is not None and (used.shape != (network.n_regions,) or not ((used >= 0) & (used < np.inf)).all()):
+        raise InputError(
+            f"weights is {reprlib.repr(used.tolist())} of shape {list(used.shape)}; expected [{network.n_regions}] "
+            "finite numbers of points, at least 0"
+        )
     plot_network(ax, network, used)
 
 
@@ -334,7 +354,7 @@ def confusion(ax: Axes, counts: ArrayLike, classes: Sequence[str]) -> None:
     Raises:
         InputError: the shape does not fit the classes.
     """
-    table = np.asarray(counts)
+    table, classes = _as_numbers("counts", counts), list(map(str, classes))
     if table.shape not in ((len(classes),) * 2, (len(classes), len(classes) + 1)):
         raise InputError(f"counts is {list(table.shape)}; expected {[len(classes)] * 2}, or one column more")
     columns = [*map(plain_text, classes), "none"][: table.shape[1]]
@@ -357,7 +377,14 @@ def reliability(ax: Axes, bins: Mapping[str, Sequence[Any]], *, counts: Axes | N
         ax: matplotlib axes.
         bins: "answers" and "accuracy" of bins of equal width from 0 to 1; the accuracy of an empty bin is None.
         counts: further axes, on which the number of answers in each bin is drawn.
+
+    Raises:
+        InputError: there is no bin, or the numbers of answers and of accuracies differ.
     """
+    if not 0 < len(bins.get("answers", ())) == len(bins.get("accuracy", ())):
+        raise InputError(
+            f"bins is {reprlib.repr(dict(bins))}; expected answers and accuracy, one number in each for every bin"
+        )
     answers = np.array(bins["answers"])
     edges = np.linspace(0, 1, len(answers) + 1)
     accuracy = np.array([np.nan if value is None else value for value in bins["accuracy"]])

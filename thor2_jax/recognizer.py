@@ -27,7 +27,7 @@ from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criteri
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery
@@ -78,6 +78,11 @@ class DescribedFrame:
         return pack_instances(self.usable, self.oriented.shape[0])
 
 
+def _check_frames(frames: object) -> None:
+    if not isinstance(frames, Iterable):
+        raise InputError(f"frames is a {type(frames).__name__}; expected a list of frames")
+
+
 class Recognizer:
     """A model and its enrolled objects on disk, ready to recognize the objects of a frame.
 
@@ -114,9 +119,11 @@ class Recognizer:
             chunk: see `Recognizer`.
 
         Raises:
-            InputError: `unknown_below` is not between 0 and 1, `chunk` is not a positive integer, or `rule` or
-                `answer_by` is unknown.
+            InputError: `run` is of another type, `unknown_below` is not between 0 and 1, `chunk` is not a positive
+                integer, or `rule` or `answer_by` is unknown.
         """
+        if not isinstance(run, TrainedRun):
+            raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun; Recognizer.load reads a directory")
         if not is_positive_integer(chunk):
             raise InputError(f"chunk is {chunk!r}; expected a positive integer")
         if embedding is not None:
@@ -216,9 +223,10 @@ class Recognizer:
                 the name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
             OSError: the gallery cannot be written; it is unchanged.
         """
+        _check_frames(frames)
         views = []
         for number, item in enumerate(frames):
-            frame, label = item if isinstance(item, tuple | list) else (item, None)
+            frame, label = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
             with with_context(f"frames[{number}]"):
                 views.append(self.model.corrected(instance_view(frame, label, self.run.config.sigma_s)))
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
@@ -250,6 +258,7 @@ class Recognizer:
             InputError: the frames have different sizes, or fewer than `adaptation.estimate.MIN_INSTANCES` usable
                 instances. Nothing changes.
         """
+        _check_frames(frames)
         instances = camera_instances(frames, self.run.config.sigma_s)
         adaptation = estimate_transform(instances, adaptation_criterion(self.model), report)
         self.model = dataclasses.replace(self.model, color_transform=adaptation.transform)
@@ -275,6 +284,7 @@ class Recognizer:
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
         """Prepare the given instances of a frame (by default all) one by one, with corrected colours."""
+        check_frame(frame)
         model, config = self.model, self.run.config
         chosen = frame.instances if labels is None else labels
         prepared = (prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in chosen)

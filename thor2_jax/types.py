@@ -34,7 +34,9 @@ __all__ = [
     "check_batch",
     "check_capacity",
     "check_cloud",
+    "check_types",
     "is_positive_integer",
+    "is_sized",
 ]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
@@ -42,7 +44,7 @@ Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class PointClouds:
     """A batch of coloured point clouds, padded to the same number of points.
 
@@ -91,8 +93,8 @@ class PointClouds:
                 integer; `camera` is not finite or has another shape; `boundary` or `rim` does not fit the clouds. The
                 message gives the index of the cloud.
         """
-        if not isinstance(clouds, Sized) or len(clouds) == 0:
-            actual = "empty" if isinstance(clouds, Sized) else f"a {type(clouds).__name__}"
+        if not is_sized(clouds) or len(clouds) == 0:
+            actual = "empty" if is_sized(clouds) else f"a {type(clouds).__name__}"
             raise InputError(f"clouds is {actual}; expected a list of at least one pair (xyz, rgb)")
         arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]
@@ -115,8 +117,9 @@ class PointClouds:
 
 
 def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int], n: int) -> NDArray[np.bool_]:
-    if len(flags) != len(sizes):
-        raise InputError(f"{name} has {len(flags)} entries for {len(sizes)} clouds; give one for each cloud")
+    if not is_sized(flags) or len(flags) != len(sizes):
+        actual = f"has {len(flags)} entries" if is_sized(flags) else f"is a {type(flags).__name__}"
+        raise InputError(f"{name} {actual} for {len(sizes)} clouds; expected a list of one entry for each cloud")
     padded = np.zeros((len(sizes), n), bool)
     for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
         if values is not None:
@@ -154,6 +157,11 @@ def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
+def is_sized(value: Any) -> bool:
+    """Return whether a value has a length; an array without axes has none, although it has the method."""
+    return isinstance(value, Sized) and getattr(value, "ndim", 1) > 0
+
+
 def is_positive_integer(value: Any) -> bool:
     """Return whether a value is a positive integer of Python or NumPy; True is not."""
     return isinstance(value, int | np.integer) and value is not True and bool(value > 0)
@@ -170,6 +178,14 @@ def check_batch(clouds: PointClouds) -> None:
     if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
         actual = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
         raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
+
+
+def check_types(**arguments: object) -> None:
+    """Raise InputError unless each argument has the type that belongs to its name."""
+    for name, value in arguments.items():
+        expected = _TYPES[name]
+        if not isinstance(value, expected) and not (name == "parameters" and value is None):
+            raise InputError(f"{name} is a {type(value).__name__}; expected a {expected.__name__}")
 
 
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
@@ -210,7 +226,7 @@ def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[n
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Strips:
     """The extremes and the colour vector of every strip of aligned clouds, from which descriptors are computed.
 
@@ -230,7 +246,7 @@ class Strips:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Diagrams:
     """Finite H0 persistence pairs of every slice, padded to the number of strips.
 
@@ -253,7 +269,7 @@ def _interleave(images: jax.Array, embeddings: jax.Array) -> jax.Array:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Descriptors:
     """TOPS, TOPS2 and the colour embeddings (CE) of a batch of clouds.
 
@@ -288,7 +304,7 @@ class Descriptors:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Parameters:
     """Learnable parameters of a descriptor, which replace the same values of the network and the config.
 
@@ -309,9 +325,24 @@ class Parameters:
 
     @classmethod
     def of(cls, network: ColorNetwork, config: DescriptorConfig) -> "Parameters":
-        """Return the parameters that a network and a config contain."""
+        """Return the parameters that a network and a config contain.
+
+        Raises:
+            InputError: `network` or `config` is of another type.
+        """
+        check_types(network=network, config=config)
         # The arrays are concrete even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
             # NumPy converts the values, since JAX would compile a program for each conversion.
             return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))
+
+
+_TYPES = {
+    "network": ColorNetwork,
+    "config": DescriptorConfig,
+    "parameters": Parameters,
+    "strips": Strips,
+    "diagrams": Diagrams,
+}
+"""Types of the arguments that `check_types` checks."""

@@ -74,9 +74,30 @@ def test_object_unity(pipeline: Any, data: st.DataObject, m: int) -> None:
     laws.assert_object_unity(pipeline.describe_aligned, aligned, CONFIG, m)
 
 
-@given(frame=laws.frames(), seed=laws.seeds())
-def test_label_numbers_are_names(frame: RGBDFrame, seed: int) -> None:
-    laws.assert_labels_are_names(instance_clouds, frame, seed)
+def test_laws_take_clouds_on_the_host_and_their_rim() -> None:
+    config = thor2.DescriptorConfig(homology="closed_form")
+    xyz, rgb = np.random.default_rng(0).random((2, 100, 3), np.float32) * 0.5
+    clouds, others = (
+        thor2.PointClouds.pack([(xyz[::step], rgb[::step])], 512, rim=[rgb[::step, 0] > 0.2], on_host=True)
+        for step in (1, 2)
+    )
+
+    def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
+        """Return the descriptors of the points that are not in the rim."""
+        mask = np.asarray(clouds.mask) & ~np.asarray(clouds.rim)
+        return thor2.describe_aligned(dataclasses.replace(clouds, mask=mask), colornet.load_default(), config)
+
+    laws.assert_permutation_invariant(describe, clouds, 0, config)
+    laws.assert_padding_invariant(describe, clouds, 1024, config)
+    laws.assert_duplicates_count_twice(describe, clouds, config)
+    laws.assert_batch_size_invariant(describe, clouds, config)
+    laws.assert_company_invariant(describe, clouds, others)
+
+
+@given(frame=laws.frames(), seed=laws.seeds(), factor=st.sampled_from([1, 300]))
+def test_label_numbers_are_names(frame: RGBDFrame, seed: int, factor: int) -> None:
+    labels = frame.label_image.astype(np.int32) * factor
+    laws.assert_labels_are_names(instance_clouds, dataclasses.replace(frame, labels=labels), seed)
 
 
 @given(frame=laws.frames())

@@ -161,10 +161,22 @@ def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> 
         (np.zeros(3, np.float32), np.zeros(3, np.float32), "edges"),
         (np.zeros((2, 3), np.float32), np.zeros(2, np.float32), "edges"),
         (np.zeros(3, np.float32), np.zeros(2, np.int32), "edges"),
+        (None, None, "heights"),
+        ("high", None, "heights"),
+        ([[1.0, 2.0], [1.0]], None, "heights"),
+        (np.zeros(3, np.float32), [[1.0], [1.0, 2.0]], "edges"),
     ],
 )
 def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
     assert_refused(f"^{name} is [^\n]*$", persistence.sublevel_diagrams, heights, edges)
+
+
+def test_heights_of_the_other_byte_order() -> None:
+    heights = np.random.default_rng(0).random(20, np.float32)
+    edges = np.maximum(heights[1:], heights[:-1]) + np.float32(0.1)
+    expected = persistence.sublevel_diagrams(heights, edges)
+    swapped = persistence.sublevel_diagrams(heights.astype(">f4"), edges.astype(">f4"))
+    jax.tree.map(np.testing.assert_array_equal, swapped, expected)
 
 
 @pytest.mark.parametrize(
@@ -174,6 +186,16 @@ def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
         {"persistence_range": (0.0, math.inf)},
         {"pixels": (8, 0)},
         {"pixels": (8,)},
+        {"pixels": 8},
+        {"birth_range": 3.0},
+        {"birth_range": ("0", "1")},
+        {"persistence_range": (0.0, 1e39)},
+        {"persistence_range": (1.0, 1.0 + 1e-12)},
+        {"variance": "0.1"},
+        {"variance": None},
+        {"variance": True},
+        {"exponent": 1j},
+        {"diagrams": np.zeros((3, 2))},
         {"variance": 0},
         {"variance": np.float32(0)},
         {"variance": np.full(2, -1.0)},
@@ -182,8 +204,20 @@ def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
 )
 def test_bad_images(change: dict[str, Any]) -> None:
     diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
-    options = {**IMAGE, "variance": 0.1} | change
-    assert_refused(f"^{next(iter(change))} is [^\n]*$", persistence.images, diagrams, **options)
+    options: dict[str, Any] = {"diagrams": diagrams, **IMAGE, "variance": 0.1} | change
+    assert_refused(f"^{next(iter(change))} is [^\n]*$", persistence.images, **options)
+
+
+@pytest.mark.parametrize("births", [np.zeros(3, np.int32), [0.0, 1.0, 2.0]])
+def test_births_are_floating_arrays(births: Any) -> None:
+    diagrams = thor2.Diagrams(births, births, births)
+    assert_refused("diagrams has births .*floating", persistence.images, diagrams, **IMAGE, variance=0.1)
+
+
+def test_variance_and_exponent_may_be_integers() -> None:
+    diagrams = persistence.sublevel_diagrams(np.array([0, 2, 1, 3], np.float32))
+    images = [persistence.images(diagrams, **IMAGE, variance=kind(1), exponent=kind(2)) for kind in (int, float)]
+    np.testing.assert_array_equal(*images)
 
 
 def test_numbers_of_pixels_may_be_from_numpy() -> None:

@@ -136,3 +136,39 @@ def test_reliability_draws_accuracy_and_counts() -> None:
     assert [bar.get_height() for bar in lower.patches] == [0, 4]
     assert upper.patches[1].get_height() == 0.75 and upper.patches[1].get_x() == 0.5
     assert lower.get_xlabel() == "confidence" and not upper.get_xlabel()
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "match"),
+    [
+        (plot.cloud, ([[1.0, 2.0, 3.0], [1.0]], COLORS[:2]), "points is .*numbers"),
+        (plot.cloud, (POINTS, COLORS, ["red"] * len(POINTS)), "values is .*numbers"),
+        (plot.slices, (POINTS, COLORS, None), "config is a NoneType"),
+        (plot.persistence_diagram, (np.zeros((7, 2)), CONFIG), "diagrams is a ndarray"),
+        (plot.persistence_image, (np.zeros((32, 32)), NETWORK), "config is a ColorNetwork"),
+        (plot.color_matrix, (NETWORK, np.zeros((31, 22))), "network is a ndarray"),
+        (plot.color_vectors, ("red", NETWORK), "matrix is 'red'"),
+        (plot.color_network, (NETWORK, np.full(22, np.nan)), "weights is .nan"),
+        (plot.confusion, ([[1, 2], [3]], "ab"), "counts is .*numbers"),
+        (plot.reliability, ({"answers": [], "accuracy": []},), "bins is"),
+        (plot.reliability, ({"answers": [3, 5], "accuracy": [0.5]},), "bins is"),
+    ],
+)
+def test_input_that_cannot_be_drawn_is_refused(ax, function, arguments, match: str) -> None:
+    assert_refused(match, function, ax, *arguments)
+
+
+@pytest.mark.parametrize("region", [-1, NETWORK.n_regions])
+def test_regions_of_no_network_are_refused(ax, region: int) -> None:
+    assert_refused("regions is", plot.color_matrix, ax, np.zeros((31, NETWORK.n_regions)), NETWORK, regions=[region])
+
+
+def test_slices_leave_out_points_without_a_place(ax) -> None:
+    missing = np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS)
+    plot.slices(ax, missing, COLORS, CONFIG)
+    assert len(ax.texts) == CONFIG.n_slices
+
+
+def test_classes_may_be_numbers(ax) -> None:
+    plot.confusion(ax, np.eye(2), [4, 7])
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["4", "7"]

@@ -1,6 +1,7 @@
 """Recognition of frames by classifiers with random weights: everything except the accuracy is checked."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -81,11 +82,25 @@ def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: T
         else:
             assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
             assert dataclasses.replace(answer, name=named.name, reason=None) == named
-    for value in (-0.1, 1.5, float("nan"), "0.5"):
-        assert_refused(f"unknown_below is {value!r}", Recognizer, run, value)
+    for value in (-0.1, 1.5, float("nan"), "0.5", [0.5]):
+        assert_refused(re.escape(f"unknown_below is {value!r}"), Recognizer, run, value)
     assert Recognizer(run, jax.numpy.float32(0.5)).thresholds().tolist() == [0.5] * len(run.classes)
     for chunk in (0, 2.0, None):
         assert_refused(f"chunk is {chunk}", Recognizer, run, chunk=chunk)
+
+
+def test_arguments_that_are_no_frames_are_named(recognizer: Recognizer) -> None:
+    for function in (recognizer.recognize, recognizer.describe, recognizer.track().update):
+        assert_refused("frame is a str; expected an RGBDFrame", function, "frame.png")
+    assert_refused("frame is a NoneType", thor2.explain, recognizer, None, 1)
+    frame = tilted(patches())
+    assert_refused("frames is a RGBDFrame; expected a list", recognizer.enroll, "new", frame)
+    assert_refused("frames is a RGBDFrame; expected a list", recognizer.adapt, frame)
+    assert_refused(r"frames\[0\]: frame is a int", recognizer.enroll, "new", [(2, frame)])
+    assert_refused(r"frames\[0\]: frame is a tuple", recognizer.enroll, "new", [(frame, 2, 3)])
+    assert_refused(r"frames\[1\]: frame is a str", recognizer.adapt, [frame, "frame.png"])
+    assert_refused(r"frames\[0\]: instance is '2'", recognizer.enroll, "new", [(frame, "2")])
+    assert_refused("run is a str", Recognizer, "run")
 
 
 def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:

@@ -83,6 +83,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     [
         ({"clouds": []}, ["clouds is empty"]),
         ({"clouds": None}, ["clouds is a NoneType"]),
+        ({"clouds": np.array(1.0)}, ["clouds is a ndarray"]),
         ({"clouds": iter([(POINTS, COLORS)])}, ["clouds is a list_iterator"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
@@ -109,7 +110,9 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
         ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
+        ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
+        ({"rim": np.array(True)}, ["rim", "ndarray", "1 clouds"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
@@ -141,7 +144,10 @@ def test_records_are_frozen() -> None:
         assert record.__dataclass_params__.frozen, record
 
 
-@pytest.mark.parametrize("record", [PreparedInstance, thor2.RGBDFrame])
-def test_records_of_numpy_arrays_compare_by_identity(record: type) -> None:
+RECORDS_OF_JAX = [thor2.PointClouds, thor2.Strips, thor2.Diagrams, thor2.Descriptors, thor2.Parameters]
+
+
+@pytest.mark.parametrize("record", [PreparedInstance, thor2.RGBDFrame, *RECORDS_OF_JAX])
+def test_records_of_arrays_compare_by_identity(record: type) -> None:
     """Comparing their arrays would raise."""
     assert record.__eq__ is object.__eq__ and record.__hash__ is object.__hash__

@@ -26,8 +26,8 @@ from scipy.special import softmax
 from colornet.colors import LUMA
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, Gallery
@@ -179,6 +179,8 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
     instances: list[PreparedInstance] = []
     first = ""
     for number, frame in enumerate(frames):
+        with with_context(f"frames[{number}]"):
+            check_frame(frame)
         size = f"{frame.depth.shape[1]} x {frame.depth.shape[0]}"
         first = first or size
         if size != first:

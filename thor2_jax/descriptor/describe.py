@@ -35,7 +35,7 @@ from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_stri
 from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch
+from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch, check_types
 
 __all__ = [
     "BATCH_AXIS",
@@ -168,6 +168,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: settings of the descriptor. Static.
     """
     check_batch(aligned)
+    check_types(network=network, config=config)
     return strips_by_sets(aligned, region_sets(network), config)
 
 
@@ -175,12 +176,14 @@ def describe_strips(
     strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
     """Return the descriptors of `strips` (fields [B, S, J], scaled units); otherwise equal to `describe`."""
+    check_types(strips=strips, network=network, config=config, parameters=parameters)
     return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours are not used."""
     check_batch(aligned)
+    check_types(config=config)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
     return _diagrams(strips_by_sets(aligned, one_set, config), config)
 
@@ -227,9 +230,10 @@ def describe(
         descriptor of zeros.
 
     Raises:
-        InputError: `clouds` is not a batch of clouds.
+        InputError: `clouds` is not a batch of clouds, or another argument is of another type.
     """
     check_batch(clouds)
+    check_types(network=network, config=config, parameters=parameters)
     if len(clouds.mask) > chunk_size(clouds):
         return _describe_in_chunks(clouds, network, config, parameters)
     return describe_aligned(align(clouds, config, parameters), network, config, parameters)
@@ -334,8 +338,10 @@ def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: Descrip
         Descriptors sharded like the clouds; a process reads its own descriptors through `addressable_shards`.
 
     Raises:
-        InputError: `clouds` does not come from `shard_clouds`.
+        InputError: `clouds` does not come from `shard_clouds`, or another argument is of another type.
     """
+    check_batch(clouds)
+    check_types(network=network, config=config)
     sharding = getattr(clouds.points, "sharding", None)
     if not isinstance(sharding, NamedSharding) or sharding.mesh.axis_names != (BATCH_AXIS,):
         raise InputError(f"clouds has the sharding {sharding}; expected clouds from shard_clouds")

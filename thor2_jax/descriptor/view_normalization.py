@@ -28,7 +28,7 @@ from jax.typing import ArrayLike
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.types import Parameters, PointClouds, check_batch
+from thor2_jax.types import Parameters, PointClouds, check_batch, check_types
 
 __all__ = ["ROWS", "Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
 
@@ -217,6 +217,7 @@ OCCLUSION_BIN = 0.01
 
 
 def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) -> tuple[ArrayLike, ArrayLike]:
+    check_types(config=config, parameters=parameters)
     if parameters is None:
         return np.float32(config.sigma_s), np.float32(config.alpha)
     return parameters.sigma_s, parameters.alpha
@@ -310,7 +311,7 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
         Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
 
     Raises:
-        InputError: `clouds` is not a batch of clouds.
+        InputError: `clouds` is not a batch of clouds, or another argument is of another type.
     """
     sigma_s, _ = _sigma_s_and_alpha(config, parameters)
     return _normalized_and_turned(clouds, sigma_s, jnp.zeros_like(sigma_s))
@@ -342,7 +343,7 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
         Aligned clouds in scaled units, in the first octant.
 
     Raises:
-        InputError: `normal` is not a batch of clouds.
+        InputError: `normal` is not a batch of clouds, or another argument is of another type.
     """
     check_batch(normal)
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
@@ -391,7 +392,7 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
     Raises:
         InputError: `axes` has another letter.
     """
-    if not set(axes) <= set("xyz"):
+    if not isinstance(axes, str) or not set(axes) <= set("xyz"):
         raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
     flip = jnp.array([letter in axes for letter in "xyz"])
     high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)

@@ -30,6 +30,7 @@ __all__ = [
     "RGBDFrame",
     "RecordedFrame",
     "backproject",
+    "check_frame",
     "check_images",
     "check_size",
     "decode_image",
@@ -159,6 +160,12 @@ class RGBDFrame:
         The frame is that of `backproject`.
         """
         return pixel_rays(pixels, self.depth.shape[1], self.intrinsics) * self.depth_m.ravel()[pixels, None]
+
+
+def check_frame(frame: object) -> None:
+    """Raise InputError unless the value is a frame."""
+    if not isinstance(frame, RGBDFrame):
+        raise InputError(f"frame is a {type(frame).__name__}; expected an RGBDFrame, as read_frame returns it")
 
 
 def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, check_frame, pixel_rays
 from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, voxel_downsample
 from thor2_jax.printable import first_names
 
@@ -288,11 +288,13 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     Raises:
         InputError: the frame has no such instance, it has several and `label` is None, or the instance cannot be used.
     """
+    check_frame(frame)
     if label is None and len(frame.instances) != 1:
         raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
     if label is not None and label not in frame.instances:
         listed = first_names(list(map(str, frame.instances)), 10)
-        raise InputError(f"instance is {label}; expected {f'one of {listed}' if listed else 'a frame with instances'}")
+        expected = f"one of {listed}" if listed else "a frame with instances"
+        raise InputError(f"instance is {label!r}; expected {expected}")
     view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
     if view.reason is not None:
         raise InputError(f"instance {view.label} cannot be used: {view.reason}")

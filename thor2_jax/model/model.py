@@ -139,7 +139,7 @@ class Model:
         if self.rule not in FUSION_RULES:
             raise InputError(f"rule is {self.rule!r}; expected one of {', '.join(FUSION_RULES)}")
         below = self.unknown_below
-        if below is not None and (isinstance(below, str) or not 0 <= below <= 1):
+        if below is not None and (isinstance(below, str) or np.ndim(below) > 0 or not 0 <= below <= 1):
             raise InputError(f"unknown_below is {below!r}; expected a confidence from 0 to 1")
 
     @classmethod

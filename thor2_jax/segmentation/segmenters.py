@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, needs_extra, reason_of
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame, check_frame
 
 __all__ = ["ENTRY_POINTS", "MODEL", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
 
@@ -87,6 +87,7 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
     Raises:
         InputError: the segmenter is unknown, raises an exception, or does not return labels of the frame's size.
     """
+    check_frame(frame)
     function = load_segmenter(segmenter) if isinstance(segmenter, str) else segmenter
     name = segmenter if isinstance(segmenter, str) else getattr(segmenter, "__name__", type(segmenter).__name__)
     try:

@@ -9,6 +9,7 @@ order in u (Higham, Accuracy and Stability of Numerical Algorithms, chapter 4).
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -163,8 +164,11 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
 
 def map_points(function: Callable[..., jax.Array], *batches: PointClouds) -> PointClouds:
     """Return the first batch, with `function` of the batches' arrays for each field with an entry per point."""
-    names = ("points", "colors", "mask", "boundary")
-    return dataclasses.replace(batches[0], **{name: function(*(getattr(b, name) for b in batches)) for name in names})
+    fields: dict[str, Any] = {}
+    for name in ("points", "colors", "mask", "boundary", "rim"):
+        arrays = [getattr(batch, name) for batch in batches]
+        fields[name] = None if any(array is None for array in arrays) else function(*arrays)  # an unknown rim
+    return dataclasses.replace(batches[0], **fields)
 
 
 def joined(*batches: PointClouds) -> PointClouds:

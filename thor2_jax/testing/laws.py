@@ -110,7 +110,7 @@ def assert_company_invariant(describe: Describe, clouds: PointClouds, others: Po
     """
     expected = describe(clouds)
     for b in range(clouds.mask.shape[0]):
-        mixed = jax.tree.map(lambda one, other, b=b: other.at[b].set(one[b]), clouds, others)
+        mixed = jax.tree.map(lambda one, other, b=b: jnp.asarray(other).at[b].set(one[b]), clouds, others)
         assert_equal(*(jax.tree.map(lambda a, b=b: a[b], d) for d in (describe(mixed), expected)))
 
 
@@ -325,11 +325,14 @@ def assert_mirrored_strips(
 
 def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
     """Assert that other label numbers give the same clouds, bit by bit."""
-    numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
-    other = np.concatenate([[0], numbers]).astype(np.uint16)
-    clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=other[frame.label_image]))}
+    numbers = np.random.default_rng(seed).choice(np.arange(1, 2**16, dtype=np.uint16), len(frame.instances), False)
+    other = dict(zip(frame.instances, numbers.tolist(), strict=True))
+    labels = np.zeros(frame.label_image.shape, np.uint16)
+    for label, pixels in frame.instance_pixels.items():
+        labels.flat[pixels] = other[label]
+    clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=labels))}
     for cloud in instance_clouds(frame):
-        same = clouds.pop(int(other[cloud.label]))
+        same = clouds.pop(other[cloud.label])
         for name in ("kept_by_fallback", "reason", "points", "colors"):
             np.testing.assert_array_equal(getattr(same, name), getattr(cloud, name), err_msg=name)
     assert not clouds

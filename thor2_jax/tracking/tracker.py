@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import softmax
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, object_scores
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
@@ -242,6 +242,7 @@ class Tracker:
             InputError: the frame has another size than the first one, the pose is not a rigid motion, or only one of
                 this frame and the first frame has a pose. The tracks do not change.
         """
+        check_frame(frame)
         world = None if pose is None else check_pose(pose)
         if self._frame and frame.depth.shape != self._size:
             (height, width), (rows, columns) = frame.depth.shape, self._size

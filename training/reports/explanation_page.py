@@ -96,8 +96,8 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     check, is_odds = explanation.attributions.faithfulness, explanation.scores.unit == "log-odds"
     if is_odds:
         margin = (
-            f"The classifiers' log-odds of {explanation.name} are {check.margin:.1f}. Log-odds compare a class with the "
-            "others together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %. The "
+            f"The classifiers' log-odds of {explanation.name} are {check.margin:.1f}. Log-odds compare a class with "
+            "the others together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %. The "
             "attributions below explain this number."
         )
     else:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -78,6 +78,22 @@ def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
             assert_refused(words, function, clouds, NETWORK, CLOSED)
     for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
         assert_refused("clouds is list", without_network, [], CLOSED)
+
+
+@pytest.mark.parametrize("function", [thor2.describe, thor2.describe_aligned, thor2.strips, describe.describe_sharded])
+def test_exchanged_settings_are_named(function: Callable) -> None:
+    packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
+    assert_refused("network is a DescriptorConfig; expected a ColorNetwork", function, packed, CLOSED, NETWORK)
+    assert_refused("config is a NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
+
+
+def test_settings_of_another_type_are_named() -> None:
+    packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
+    for function in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
+        assert_refused("config is a ColorNetwork", function, packed, NETWORK)
+    assert_refused("strips is a PointClouds; expected a Strips", thor2.describe_strips, packed, NETWORK, CLOSED)
+    assert_refused("parameters is a dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
+    assert_refused("network is a DescriptorConfig", thor2.Parameters.of, CLOSED, NETWORK)
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:

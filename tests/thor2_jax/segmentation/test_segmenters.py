@@ -64,6 +64,11 @@ def test_an_entry_point_that_is_no_function(offer: Callable[[str, str], None], v
     assert_refused(rf"^segmenter is 'broken'; {value} ", load_segmenter, "broken")
 
 
+def test_only_frames_are_segmented() -> None:
+    assert_refused("^frame is a NoneType; expected an RGBDFrame", segment, None)
+    assert_refused("^frame is a str; expected an RGBDFrame", thor2.segmented, "frame.png", halves)
+
+
 def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(sys.modules):
         if name.startswith("thor2_jax.segmentation.") and "segmenters" not in name:
