@@ -36,6 +36,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.service.hosts import check_token
 from thor2_jax.types import Descriptors, check_cloud
 
 __all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]
@@ -129,7 +130,12 @@ class _Connection:
     """Address of a service, and options of its requests."""
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
-        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
+        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds.
+
+        Raises:
+            InputError: the token cannot be sent in a header.
+        """
+        check_token(token)
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._options: dict[str, Any] = {"base_url": url, "headers": headers, "timeout": timeout}

@@ -149,6 +149,8 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
         with pytest.raises(ConnectionError, match="gives no answer"):
             Client(wrong).model()
+    for token in ("", "é", "secret\n"):
+        assert_refused("token", Client, url, token)
     assert_refused("clouds", Client(url).describe, [])
     for labels in (np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)):
         assert_refused(
