@@ -26,6 +26,7 @@ import urllib.parse
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from zipfile import BadZipFile
 
 import httpx
 import numpy as np
@@ -149,6 +150,16 @@ class _Connection:
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
             raise kind(f"{self._url} gives no answer ({error or type(error).__name__})") from None
+
+    def _parsed(self, response: httpx.Response, parse: Callable[[bytes], T]) -> T:
+        """Return what `parse` makes of the body of a response."""
+        content = _content(response)
+        try:
+            return parse(content)
+        except (ValueError, LookupError, TypeError, AttributeError, BadZipFile):
+            raise ConnectionError(
+                f"{self._url} is another server: it does not answer as the service; check the URL"
+            ) from None
 
 
 class Client(_Connection):
@@ -278,7 +289,7 @@ class Client(_Connection):
         """Send a request with a body (content, files) and return what `parse` makes of the body of its answer."""
         with self._no_answer_named(), httpx.Client(**self._options) as http:
             response = http.request(method, path, **body)
-        return parse(_content(response))
+        return self._parsed(response, parse)
 
 
 def _coroutine(
@@ -304,7 +315,7 @@ class AsyncClient(_Connection):
         with self._no_answer_named():
             async with httpx.AsyncClient(**self._options) as http:
                 response = await http.request(method, path, **body)
-        return parse(_content(response))
+        return self._parsed(response, parse)
 
 
 def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, intrinsics: Any) -> dict[str, bytes]:

@@ -184,6 +184,15 @@ def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | No
     assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
 
 
+@pytest.mark.parametrize("content", [b"<html>", b"{}", b"[]", b"PK\3\4"])
+def test_the_answer_of_another_server_is_an_error(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: httpx.Response(200, content=content))
+    client = Client("http://robot.local")
+    for call in (client.model, client.objects, lambda: client.describe([(np.zeros((1, 3)), np.zeros((1, 3)))])):
+        with pytest.raises(ConnectionError, match="check the URL"):
+            call()
+
+
 def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:
     """This test comes last in the module: the requests above use all batch shapes."""
     for path in ("/v1/recognize", "/v1/explain"):
