@@ -80,7 +80,7 @@ class InstanceAnswer(BaseModel):
     label: int = Field(description="Number of the instance in the label image.")
     name: str | None = Field(description="Name of the object; null if it is unknown or cannot be recognized.")
     confidence: float | None = Field(
-        description="Fused probability of the most probable class, or the score of the gallery."
+        description="Confidence in the most probable name; null if the instance cannot be described."
     )
     classifier: str | None = Field(
         description="Classifier that gives this class the highest probability: tops, tops2 or embedding, or gallery."
@@ -143,7 +143,7 @@ class Details(BaseModel):
     colors: list[tuple[int, int, int]] = Field(description="sRGB colours of these points.")
     slice_borders: list[tuple[float, float]] = Field(description="Start and end of each slice along z.")
     calibrated_confidence: float | None = Field(
-        description="Confidence after temperature scaling; null if the model was trained without a held-out set."
+        description="Calibrated confidence; null with a gallery, and if the model was trained without a held-out set."
     )
     image_peak: float = Field(description="Maximum of the persistence images.")
     slices: list[SliceDetails]

@@ -51,7 +51,7 @@ function confidenceHelp(calibrated, sources) {
   if (!sources.length) return "No object is enrolled.";
   const gallery = "The score of the gallery is about 1 among the enrolled views of an object and about 0 far from all of them. ";
   if (sources.length === 1 && sources[0] === "gallery") return `${gallery}It is the confidence; it is not calibrated.`;
-  const both = "An object without training takes this score as its confidence, a trained class the geometric mean of its probabilities, and of its score if it has views, too. ";
+  const both = "An enrolled object is the answer if its score is high; otherwise the most probable trained class is, with the confidence that it has without the gallery. ";
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
   const known = "The embedding tells the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For objects that the model knows, it estimates the probability that the name is correct.";
