@@ -50,4 +50,5 @@ def objects(
             sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    finish(f"{model} knows {known.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)
+    knows = f"{gallery or model} knows {known.summary}"
+    finish(knows, "teach it", "enroll", "NAME", "FRAME", *options.model_arguments(model, gallery))
