@@ -179,7 +179,8 @@ class Client(_Connection):
                 message or `Intrinsics`; pixels.
 
         Raises:
-            InputError: `labels` is an array of another kind, or `intrinsics` is invalid.
+            InputError: an image is neither a path nor bytes, `labels` is an array of another kind, or `intrinsics` is
+                invalid.
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
@@ -319,17 +320,19 @@ class AsyncClient(_Connection):
 
 
 def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, intrinsics: Any) -> dict[str, bytes]:
-    files = {"color": _read(color), "depth": _read(depth)}
+    files = {"color": _read("color", color), "depth": _read("depth", depth)}
     if labels is not None:
-        files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
+        files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read("labels", labels)
     if not isinstance(intrinsics, File):
         values = dataclasses.asdict(Intrinsics.of(intrinsics))
         intrinsics = json.dumps(values, default=np.generic.item).encode()
-    files["intrinsics"] = _read(intrinsics)
+    files["intrinsics"] = _read("intrinsics", intrinsics)
     return files
 
 
-def _read(file: File) -> bytes:
+def _read(name: str, file: File) -> bytes:
+    if not isinstance(file, File):
+        raise InputError(f"{name} is of type {type(file).__name__}; expected a path, or the content of a file as bytes")
     return file if isinstance(file, bytes) else Path(file).read_bytes()
 
 

@@ -173,6 +173,8 @@ def test_the_client_sends_colours_and_intrinsics_of_any_type(monkeypatch: pytest
         client.recognize(color=b"", depth=b"", intrinsics=given)
         assert parse_intrinsics(sent["files"]["intrinsics"]) == expected
     assert_refused("intrinsics", client.recognize, color=b"", depth=b"", intrinsics={"fx": 1})
+    image = np.zeros((2, 2, 3), np.uint8)  # arrays are accepted for labels only
+    assert_refused("color is .* ndarray", client.recognize, color=image, depth=b"", intrinsics=b"")
 
 
 @pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
