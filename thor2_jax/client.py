@@ -26,6 +26,7 @@ import urllib.parse
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from zipfile import BadZipFile
 
 import httpx
 import numpy as np
@@ -36,6 +37,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.service.hosts import check_token
 from thor2_jax.types import Descriptors, check_cloud
 
 __all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]
@@ -129,7 +131,12 @@ class _Connection:
     """Address of a service, and options of its requests."""
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
-        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
+        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds.
+
+        Raises:
+            InputError: the token cannot be sent in a header.
+        """
+        check_token(token)
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._options: dict[str, Any] = {"base_url": url, "headers": headers, "timeout": timeout}
@@ -143,6 +150,16 @@ class _Connection:
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
             raise kind(f"{self._url} gives no answer ({error or type(error).__name__})") from None
+
+    def _parsed(self, response: httpx.Response, parse: Callable[[bytes], T]) -> T:
+        """Return what `parse` makes of the body of a response."""
+        content = _content(response)
+        try:
+            return parse(content)
+        except (ValueError, LookupError, TypeError, AttributeError, BadZipFile):
+            raise ConnectionError(
+                f"{self._url} is another server: it does not answer as the service; check the URL"
+            ) from None
 
 
 class Client(_Connection):
@@ -162,7 +179,8 @@ class Client(_Connection):
                 message or `Intrinsics`; pixels.
 
         Raises:
-            InputError: `labels` is an array of another kind, or `intrinsics` is invalid.
+            InputError: an image is neither a path nor bytes, `labels` is an array of another kind, or `intrinsics` is
+                invalid.
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
@@ -272,7 +290,7 @@ class Client(_Connection):
         """Send a request with a body (content, files) and return what `parse` makes of the body of its answer."""
         with self._no_answer_named(), httpx.Client(**self._options) as http:
             response = http.request(method, path, **body)
-        return parse(_content(response))
+        return self._parsed(response, parse)
 
 
 def _coroutine(
@@ -298,21 +316,23 @@ class AsyncClient(_Connection):
         with self._no_answer_named():
             async with httpx.AsyncClient(**self._options) as http:
                 response = await http.request(method, path, **body)
-        return parse(_content(response))
+        return self._parsed(response, parse)
 
 
 def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, intrinsics: Any) -> dict[str, bytes]:
-    files = {"color": _read(color), "depth": _read(depth)}
+    files = {"color": _read("color", color), "depth": _read("depth", depth)}
     if labels is not None:
-        files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
+        files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read("labels", labels)
     if not isinstance(intrinsics, File):
         values = dataclasses.asdict(Intrinsics.of(intrinsics))
         intrinsics = json.dumps(values, default=np.generic.item).encode()
-    files["intrinsics"] = _read(intrinsics)
+    files["intrinsics"] = _read("intrinsics", intrinsics)
     return files
 
 
-def _read(file: File) -> bytes:
+def _read(name: str, file: File) -> bytes:
+    if not isinstance(file, File):
+        raise InputError(f"{name} is of type {type(file).__name__}; expected a path, or the content of a file as bytes")
     return file if isinstance(file, bytes) else Path(file).read_bytes()
 
 

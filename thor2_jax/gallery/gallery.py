@@ -244,8 +244,9 @@ class Gallery:
         name = find_name(name, (*self.objects, *self.trained)) or name
         is_class = self._is_answered_class(name)
         if name not in self.objects and not is_class:
-            known = ", ".join(map(repr, self.names))
-            raise InputError(f"name: {name!r} is not enrolled; expected one of {known or 'none'}")
+            raise InputError(
+                f"name: {name!r} is unknown; expected the name of an object: this model knows {self.summary}"
+            )
         objects = {other: views for other, views in self.objects.items() if other != name}
         return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
 

@@ -1,4 +1,4 @@
-"""Listening sockets, allowed names of the host, and headers of pages, for the service and the live view.
+"""Listening sockets, allowed names of the host, tokens, and headers of pages, for the service and the live view.
 
 A web page can give its own name the address of a local server (DNS rebinding) and then has the same origin. Its
 requests still have that name in the header Host.
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 
 from thor2_jax.errors import InputError
 
-__all__ = ["check_host_names", "is_allowed_host", "listening", "page_headers"]
+__all__ = ["check_host_names", "check_token", "is_allowed_host", "listening", "page_headers"]
 
 BACKLOG = 2048
 """Largest number of connections that wait to be accepted."""
@@ -68,6 +68,15 @@ def check_host_names(names: Iterable[str]) -> None:
     for name in names:
         if not (_NAME.fullmatch(name) or _address(name)):
             raise InputError(f"allow_host is {name!r}; expected a host name or an address, without a port")
+
+
+def check_token(token: str | None) -> None:
+    """Raise InputError unless a token can be sent in a header; None is no token."""
+    if token is not None and not (token and token.isascii() and token.isprintable() and token == token.strip()):
+        raise InputError(
+            "token (--token or THOR2_TOKEN) is empty, or has other characters or blanks at its ends; expected "
+            "printable ASCII characters; leave both out for a service without a token"
+        )
 
 
 def is_allowed_host(header: str, address: str, names: Iterable[str]) -> bool:

@@ -55,7 +55,8 @@ class RequestError(Exception):
     def __init__(self, status: int, field: str | None = None, message: str | None = None, retry_after: int = 1) -> None:
         super().__init__(status, field, message)
         self.status, self.field, self.retry_after = status, field, retry_after
-        self.message = _DESCRIPTIONS[status] if message is None else escape_characters(message)
+        text = _DESCRIPTIONS[status] if message is None else escape_characters(message)
+        self.message = text[:-1] if text.endswith("....") else text  # the list of a message may end in three dots
         self.further: list[FieldError] = []
 
 

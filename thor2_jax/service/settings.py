@@ -7,7 +7,7 @@ from pathlib import Path
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-from thor2_jax.service.hosts import check_host_names
+from thor2_jax.service.hosts import check_host_names, check_token
 
 __all__ = ["Settings", "default_segmenter"]
 
@@ -70,8 +70,4 @@ class Settings:
             load_segmenter(self.segmenter)  # Its errors are reported here once, not by every process.
         if self.max_batch not in BATCH_BUCKETS:
             raise InputError(f"max_batch is {self.max_batch}; expected one of {', '.join(map(str, BATCH_BUCKETS))}")
-        if self.token is not None and not (self.token and self.token.isascii() and self.token.isprintable()):
-            raise InputError(
-                "token (--token or THOR2_TOKEN) is empty or has other characters; expected printable ASCII characters; "
-                "leave both out for a service without a token"
-            )
+        check_token(self.token)

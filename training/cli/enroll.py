@@ -94,7 +94,9 @@ def enroll(
     if known.weak_rejection:
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
     enrolled = f"enrolled in {gallery or model}, which recognizes {known.gallery.summary}"
-    finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
+    # `thor2 recognize` uses the gallery in the run directory.
+    then = ("serve the objects", "serve") if gallery else ("recognize a frame", "recognize", "FRAME")
+    finish(enrolled, *then, *options.model_arguments(model, gallery))
 
 
 @contextlib.contextmanager

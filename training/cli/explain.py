@@ -62,9 +62,10 @@ def explain(
             console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
+    same_model = options.model_arguments(model, gallery)
     if segment == MODEL:  # enrolling does not accept labels that depend on the model
-        finish(f"{explained} pages in {out}", "list the objects of the model", "objects", "--model", model)
+        finish(f"{explained} pages in {out}", "list the objects of the model", "objects", *same_model)
         return
     segmented = ["--segment", segment] if segment else []
-    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", last, "--model", model, "--extend"]
+    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", last, *same_model, "--extend"]
     finish(f"{explained} pages in {out}", "if a name is wrong, add this view of the object", *again)

@@ -36,6 +36,7 @@ __all__ = [
     "given_options",
     "given_values",
     "grouped_options",
+    "model_arguments",
     "recording_option",
     "split_names",
 ]
@@ -90,6 +91,11 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progre
 
 recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
 """Option for recordings; the help lists these in a panel of their own."""
+
+
+def model_arguments(model: Path, gallery: Path | None) -> list[object]:
+    """Return the arguments with which the next command uses the same run directory and gallery."""
+    return ["--model", model, *(["--gallery", gallery] if gallery else [])]
 
 
 def given_values(record: Any) -> dict[str, Any]:

@@ -149,6 +149,8 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
         with pytest.raises(ConnectionError, match="gives no answer"):
             Client(wrong).model()
+    for token in ("", "é", "secret\n"):
+        assert_refused("token", Client, url, token)
     assert_refused("clouds", Client(url).describe, [])
     for labels in (np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)):
         assert_refused(
@@ -171,6 +173,8 @@ def test_the_client_sends_colours_and_intrinsics_of_any_type(monkeypatch: pytest
         client.recognize(color=b"", depth=b"", intrinsics=given)
         assert parse_intrinsics(sent["files"]["intrinsics"]) == expected
     assert_refused("intrinsics", client.recognize, color=b"", depth=b"", intrinsics={"fx": 1})
+    image = np.zeros((2, 2, 3), np.uint8)  # arrays are accepted for labels only
+    assert_refused("color is .* ndarray", client.recognize, color=image, depth=b"", intrinsics=b"")
 
 
 @pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
@@ -180,6 +184,15 @@ def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | No
     with pytest.raises(ServiceError) as error:
         Client("http://robot.local").model()
     assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
+
+
+@pytest.mark.parametrize("content", [b"<html>", b"{}", b"[]", b"PK\3\4"])
+def test_the_answer_of_another_server_is_an_error(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: httpx.Response(200, content=content))
+    client = Client("http://robot.local")
+    for call in (client.model, client.objects, lambda: client.describe([(np.zeros((1, 3)), np.zeros((1, 3)))])):
+        with pytest.raises(ConnectionError, match="check the URL"):
+            call()
 
 
 def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:

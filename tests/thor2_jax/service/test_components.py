@@ -19,13 +19,14 @@ from fastapi import FastAPI
 from processes import HANG, finish_programs, start_program
 from service_requests import calls, check_refused
 
+from thor2_jax.errors import InputError
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds
-from thor2_jax.service.problem import RequestError
+from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
 
@@ -242,6 +243,12 @@ def test_pages_of_other_sites_do_not_adapt_the_service(
         for headers in ({"Sec-Fetch-Site": "cross-site"}, {"Origin": "http://other.example"}, {}):
             (response,) = calls(app, lambda c, n=name, h=headers: c.post(f"/v1/{n}", files=files, headers=h))
             assert response.status_code == (status if headers else 200)
+
+
+def test_a_list_at_the_end_of_a_message_has_three_dots() -> None:
+    with pytest.raises(RequestError) as raised, field_errors():
+        raise InputError("instance is 7; expected one of 1, 2, ...")
+    assert raised.value.message == "instance is 7; expected one of 1, 2, ..."
 
 
 def test_internal_error_hides_its_traceback(app: FastAPI, files: dict[str, bytes], recognize: AsyncMock) -> None:

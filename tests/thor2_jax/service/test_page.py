@@ -289,6 +289,16 @@ def test_page_asks_for_the_token(open_page: Open) -> None:
     choose_sample(page)
 
 
+def test_the_page_shows_that_a_ready_service_has_stopped(open_page: Open) -> None:
+    page = open_page()
+    expect(page.locator("#ready")).to_have_text("Ready")
+    stopping = {"field": None, "message": "The service is stopping."}
+    page.route("**/readyz", answered("/readyz", status=503, json=stopping))
+    expect(page.locator("#ready")).to_have_text("Stopping")
+    page.unroute("**/readyz")
+    expect(page.locator("#ready")).to_have_text("Ready")
+
+
 def test_error_responses_are_shown(open_page: Open) -> None:
     page = open_page()
     busy = {"field": None, "message": "Too many wait."}

@@ -61,7 +61,7 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
 
 def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty one does not switch authentication off."""
-    for token in ("", "é"):
+    for token in ("", "é", "a "):
         assert "--token" in serve("--model", run_dir, "--token", token)
     monkeypatch.setenv("THOR2_TOKEN", "")
     assert "THOR2_TOKEN" in serve("--model", run_dir)

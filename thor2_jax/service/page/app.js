@@ -11,6 +11,7 @@ import { connectWhy, showWhy } from "./why.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
 const RETRY_MS = 1000;
+const WATCH_MS = 10000; // While the service is ready.
 const byId = (id) => document.getElementById(id);
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
@@ -294,6 +295,7 @@ connectNaming(
 );
 
 async function watchReady() {
+  let again = RETRY_MS;
   const setState = (name, text) => {
     byId("ready").dataset.state = name;
     byId("ready").textContent = text;
@@ -301,11 +303,12 @@ async function watchReady() {
   try {
     await service.ready();
     setState("ready", "Ready");
+    again = WATCH_MS;
   } catch (problem) {
     if (problem.status === 503) setState("waiting", problem.message.replace(/^The service is (.)|\.$/g, (_, c) => c?.toUpperCase() ?? ""));
     else setState("failed", "Not reachable");
-    setTimeout(watchReady, RETRY_MS);
   }
+  setTimeout(watchReady, again);
 }
 
 /** Fold the details on a narrow screen; the user can unfold them. */
