@@ -10,9 +10,8 @@ rectangle of the projected cloud. The search alternates over the axes: it keeps 
 the minimum-area rectangle. It uses support points only (the vertices of the convex hull that are extreme in a fixed set
 of directions), so that its cost does not depend on the number of points. `turn` then prepares slicing.
 
-XLA keeps the order of a reduction of floats along the last axis, and therefore reduces one number at a time. `fold` and
-`argmax` combine rows of the axis elementwise, which uses vector registers and is several times as fast. They use
-functions of `jax.lax`, since indexing and `jnp.where` take a fifth longer to compile.
+XLA reduces floats along the last axis one at a time. `fold` and `argmax` combine rows of the axis elementwise, which is
+several times as fast. They use `jax.lax`, since indexing and `jnp.where` take a fifth longer to compile.
 """
 
 import dataclasses
