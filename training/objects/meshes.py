@@ -111,7 +111,7 @@ def _longest(mesh: TexturedMesh) -> float:
 def _check_extensions(path: Path) -> None:
     """Raise InputError if a GLB uses an extension of glTF that is not supported."""
     content = read_file(path) if path.suffix.lower() == ".glb" else b""
-    if not content.startswith(b"glTF"):  # trimesh says what is wrong
+    if not content.startswith(b"glTF"):  # trimesh refuses it
         return
     header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
