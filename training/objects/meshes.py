@@ -88,9 +88,9 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         check_size(image.width, image.height)  # before it is decoded
         is_simple = isinstance(material, SimpleMaterial)
         if visual.uv is None:
-            raise InputError("a texture, but no texture coordinates for it")
+            raise InputError("a texture, but no texture coordinates; export the mesh with them")
         if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
-            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel")
+            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
