@@ -56,7 +56,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
-        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
+        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that cannot be used.
         ValueError: the geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
