@@ -4,7 +4,7 @@ Every frame is recognized as it is and as seen by ten simulated cameras (`traini
 either those for choosing settings, or those for the final report. For one or several runs on the same classes, the
 file has the mean and the standard deviation over the runs of
 
-accuracy              mean over placements, for all frames and by group (directory) of frames
+accuracy              mean over placements, for all frames and by group (folder) of frames
 accuracy_of_instances
 steadiness            fraction of instances with the most frequent answer of their placement
 calibration_error     expected calibration error on known objects
@@ -80,17 +80,17 @@ Progress = Callable[[str, int, int], None]
 
 
 def labelled_frames(directories: Sequence[Path], ignore: Sequence[str] = ()) -> list[LabelledFrame]:
-    """Read frames; the frames in one directory are a group and a video.
+    """Read frames; the frames in one folder are a group and a video.
 
     Args:
-        directories: directories of frames, or directories of single frames, whose group is their parent directory.
+        directories: folders of frames, or folders of single frames, whose group is their parent folder.
         ignore: patterns of object names to leave out.
 
     Returns:
         Frames with identifiers GROUP/FRAME.
 
     Raises:
-        InputError: a frame cannot be read, or two directories have the same name.
+        InputError: a frame cannot be read, or two folders have the same name.
     """
     frames: dict[str, LabelledFrame] = {}
     for directory in directories:

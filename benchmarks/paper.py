@@ -172,7 +172,7 @@ def _datasets(options: argparse.Namespace) -> dict[str, Dataset]:
     if options.frames:
         folders: dict[str, LabelledFrames] = {path.resolve().name: FrameFolder(path) for path in options.frames}
         if len(folders) < len(options.frames):
-            raise InputError("frames has several directories of one name; expected different names")
+            raise InputError("frames has several folders of one name; expected different names")
         datasets["frames"] = Dataset("frames", folders)
     return datasets
 

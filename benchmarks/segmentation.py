@@ -1,6 +1,6 @@
 """Comparison of segmentation with true masks: `python -m benchmarks.segmentation GROUP... [--model RUN]`.
 
-A GROUP is a pattern of frame directories, such as "frames/kitchen/*". An instance is found if its intersection over
+A GROUP is a pattern of frame folders, such as "frames/kitchen/*". An instance is found if its intersection over
 union with a piece is above 0.75. It is over-segmented if two pieces lie in it and cover a tenth of it each. It is
 under-segmented if a piece covers half of it and a quarter of another instance. With --model, instances are recognized
 with the true and with the segmented masks.

@@ -191,7 +191,7 @@ def arguments() -> tuple[argparse.ArgumentParser, argparse.Namespace]:
     parser.add_argument(
         "--evaluate-uwis", type=Path, nargs="+", default=[], help="datasets in the layout of UW-IS Occluded"
     )
-    parser.add_argument("--evaluate-frames", type=Path, nargs="+", default=[], help="directories of labelled frames")
+    parser.add_argument("--evaluate-frames", type=Path, nargs="+", default=[], help="folders of labelled frames")
     options = parser.parse_args()
     if options.seeds < 1:
         parser.error(f"--seeds is {options.seeds}; expected at least 1")

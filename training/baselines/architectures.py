@@ -74,7 +74,7 @@ def weights_file(directory: Path, name: str) -> Path:
 
 
 def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> dict[str, str]:
-    """Replace the weights of backbones by weights from files in a directory, given without the suffix.
+    """Replace the weights of backbones by weights from files in a folder, given without the suffix.
 
     Returns:
         Name of each file -> its SHA-256.

@@ -275,8 +275,11 @@ def crop_size(names: Sequence[str], weights: bool) -> int | None:
 
 
 def check_backbone(names: Sequence[str], out: Path) -> None:
-    """Raise InputError if templates without pretrained weights have no backbone in `names` or in the runs in `out`."""
-    files = [baseline_file(Path(), name) for name in BACKBONES]
+    """Raise InputError if templates without pretrained weights have no backbone in `names` or in the runs in `out`.
+
+    Runs that have templates need none.
+    """
+    files = [baseline_file(Path(), name) for name in (*BACKBONES, TEMPLATES)]
     if TEMPLATES in names and not set(BACKBONES) & set(names) and not any(any(out.rglob(str(file))) for file in files):
         raise InputError(NO_BACKBONE)
 

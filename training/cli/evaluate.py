@@ -130,7 +130,7 @@ def _evaluate(
     result = "no report was written (--out)"
     if out is not None:
         result = f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}"
-    # The run itself, or the first fold, of the first sequence.
+    # A model may be a directory of folds or sequences; the command is for the first run in it.
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
     finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), "--model", run, "--out", "why")

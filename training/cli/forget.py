@@ -19,6 +19,6 @@ def forget(
 
     recognizer = Recognizer.load(model, gallery=gallery)
     recognizer.forget(name)
-    knows = f"{name} is forgotten; {gallery or model} recognizes {recognizer.gallery.summary}"
+    result = f"{name} is forgotten; {gallery or model} recognizes {recognizer.gallery.summary}"
     dashes = ["--"] if name.startswith("-") else []
-    finish(knows, "enroll it again", "enroll", *options.model_arguments(model, gallery), *dashes, name, "FRAME")
+    finish(result, "enroll it again", "enroll", *options.model_arguments(model, gallery), *dashes, name, "FRAME")

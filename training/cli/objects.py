@@ -49,5 +49,5 @@ def objects(
             sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    knows = f"{gallery or model} recognizes {known.summary}"
-    finish(knows, "enroll an object", "enroll", "NAME", "FRAME", *options.model_arguments(model, gallery))
+    result = f"{gallery or model} recognizes {known.summary}"
+    finish(result, "enroll an object", "enroll", "NAME", "FRAME", *options.model_arguments(model, gallery))

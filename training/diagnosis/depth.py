@@ -101,8 +101,9 @@ def check_depth(
     median = float(np.median(valid))
     if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, extents, mesh_sides, names):
         return
-    own_sides = [mesh_sides[name] for name in names.values() if name in mesh_sides] or list(mesh_sides.values())
-    if _check_unit(diagnosis, frame, median, list(extents.values()), own_sides):
+    own = {label: mesh_sides[name] for label, name in names.items() if label in extents and name in mesh_sides}
+    compared = [extents[label] for label in own or extents]
+    if _check_unit(diagnosis, frame, median, compared, list((own or mesh_sides).values())):
         return
     in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
     if in_range < MIN_IN_RANGE:

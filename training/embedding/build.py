@@ -3,7 +3,7 @@
 The packaged network was fitted with the default options and the weaker augmentations of an earlier version, since a
 gallery separates unknown objects less well with the present augmentations. Its principal components and reference views
 were computed later (benchmarks/notes/accuracy.md). The fit took 1,280 s on two cores shared with other jobs: 90 s for
-the views and 1,190 s for the fit itself. `--meshes` adds the objects of a directory. When the command is repeated, an
+the views and 1,190 s for the fit itself. `--meshes` adds the objects of a folder. When the command is repeated, an
 interrupted fit resumes from the directory FILE.checkpoints.
 """
 
@@ -38,7 +38,7 @@ def build_embedding(
     objects: Annotated[int, typer.Option(min=2, help="procedural objects")] = 3000,
     views: Annotated[int, typer.Option(min=1, help="views of each object; 6 times as many of a mesh")] = 16,
     epochs: Annotated[int, typer.Option(min=1, help="passes over the samples")] = 20,
-    meshes: Annotated[Path | None, typer.Option(help="directory of other objects (GLB, OBJ, PLY)")] = None,
+    meshes: Annotated[Path | None, typer.Option(help="folder of other objects (GLB, OBJ, PLY)")] = None,
     workers: Annotated[int, typer.Option(min=1, help="rendering processes; they do not affect the result")] = 2,
 ) -> None:
     """Fit an embedding and write it to a file; the error names a mesh or an output file that cannot be used."""

@@ -78,7 +78,7 @@ class Distractors:
         if shared:
             raise InputError(
                 f"distractors: {shared[0]!r} is also a class; expected other objects; remove its mesh from one of the "
-                "two directories"
+                "two folders"
             )
 
     @property

@@ -46,7 +46,7 @@ UNSUPPORTED_EXTENSIONS = {
     "KHR_texture_basisu",
     "KHR_texture_transform",
 }
-"""Extensions of glTF that trimesh ignores, and then reads other vertices or colours."""
+"""Extensions of glTF that trimesh ignores, so that it fails, or reads other vertices or colours."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -56,7 +56,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
-        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that is too large.
+        InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that cannot be used.
         ValueError: the geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
@@ -88,9 +88,9 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         check_size(image.width, image.height)  # before it is decoded
         is_simple = isinstance(material, SimpleMaterial)
         if visual.uv is None:
-            raise InputError("a texture, but no texture coordinates for it")
+            raise InputError("a texture, but no texture coordinates; export the mesh with them")
         if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
-            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel")
+            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
@@ -110,12 +110,13 @@ def _longest(mesh: TexturedMesh) -> float:
 
 def _check_extensions(path: Path) -> None:
     """Raise InputError if a GLB uses an extension of glTF that is not supported."""
-    if path.suffix.lower() != ".glb":
+    content = read_file(path) if path.suffix.lower() == ".glb" else b""
+    if not content.startswith(b"glTF"):  # trimesh refuses it
         return
-    content = read_file(path)
     header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
-        raise InputError(f"it uses {', '.join(sorted(unsupported))}; expected a GLB without it: export the mesh again")
+        uses = f"it uses {', '.join(sorted(unsupported))}"
+        raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -177,9 +178,9 @@ def _parsed(path: Path) -> TexturedMesh:
                 raise
 
     try:
+        _check_extensions(path)  # before trimesh fails with another message
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
-        _check_extensions(path)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
         parts = []

@@ -115,8 +115,7 @@ class LabelledFrames(abc.ABC):
     def names(self) -> Iterable[str] | None:
         """Return the names of all objects, if they can be read without the images; by default they are unknown.
 
-        Raises:
-            InputError: when a name is read, its file is missing or damaged.
+        The iteration may read files, and raises errors as indexing.
         """
         return None
 

@@ -19,8 +19,8 @@ from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import image_baselines
 from training.baselines.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
-from training.baselines.baseline import BaselineInputs, read_baseline
-from training.baselines.image_baselines import compare, crop_size, pretrained_files
+from training.baselines.baseline import BaselineInputs, baseline_file, read_baseline
+from training.baselines.image_baselines import check_backbone, compare, crop_size, pretrained_files
 from training.baselines.job import load_baselines, train_baselines
 from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.protocol import DEFAULT
@@ -183,6 +183,16 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
         damage()
         assert_refused(f"^weights: .*{message}", train_baselines, folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()
+
+
+def test_finished_templates_need_no_backbone(tmp_path: Path) -> None:
+    assert_refused("^baselines: templates needs a backbone", check_backbone, ["templates"], tmp_path)
+    check_backbone([SMALL, "templates"], tmp_path)
+    for name in (SMALL, "templates"):
+        file = baseline_file(tmp_path / name / "fold-0", name)
+        file.parent.mkdir(parents=True)
+        file.touch()
+        check_backbone(["templates"], tmp_path / name)
 
 
 def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:

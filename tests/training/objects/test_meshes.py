@@ -5,6 +5,7 @@ import json
 import logging
 import os
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -186,6 +187,15 @@ def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
     for name in ("KHR_texture_transform", "KHR_draco_mesh_compression"):
         quad.export(path, tree_postprocessor=functools.partial(dict.update, extensionsUsed=[name]))
         check_refused(path, f"it uses {name}")
+
+    def compress(tree: dict[str, Any]) -> None:
+        """Refer to a buffer without content, as the files of gltfpack do."""
+        tree["extensionsUsed"] = ["EXT_meshopt_compression"]
+        for view in tree["bufferViews"]:
+            view["buffer"] = 1
+
+    quad.export(path, tree_postprocessor=compress)
+    check_refused(path, "it uses EXT_meshopt_compression")
 
 
 def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
