@@ -391,7 +391,7 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
     Raises:
         InputError: `axes` has another letter.
     """
-    if not isinstance(axes, str) or not set(axes) <= set("xyz"):
+    if not set(axes) <= set("xyz"):
         raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
     flip = jnp.array([letter in axes for letter in "xyz"])
     high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)

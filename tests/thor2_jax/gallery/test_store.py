@@ -344,7 +344,7 @@ def test_a_killed_writer_leaves_the_gallery_before_or_after(directory: Path, tmp
         assert len(list((copy / "objects").iterdir())) == 2 + finished, step
 
 
-def test_a_killed_first_enrolment_leaves_an_empty_gallery(tmp_path: Path) -> None:
+def test_a_killed_first_enrollment_leaves_an_empty_gallery(tmp_path: Path) -> None:
     steps = {tmp_path / str(k): step for k, step in enumerate([("_write_durably", False), *STEPS])}
     exits = write_at_once(*((path, ["mug"], *step) for path, step in steps.items()))
     assert exits == [-signal.SIGKILL] * len(steps)
