@@ -1,9 +1,9 @@
-"""Time to search a gallery of 100,000 objects, and to enroll an object: `python -m benchmarks.gallery search|teach`.
+"""Time to search a gallery of 100,000 objects, and to enroll an object: `python -m benchmarks.gallery search|enroll`.
 
 search  synthetic embeddings: time of a query of 16 embeddings, memory, and recall of the index
-teach   enrolling one more object from a mesh and from five views in a warm process with 60 objects; forgetting it
+enroll  enrolling one more object from a mesh and from five views in a warm process with 60 objects; forgetting it
 
-The command prints a table and writes gallery-search.json or gallery-teach.json.
+The command prints a table and writes gallery-search.json or gallery-enroll.json.
 """
 
 import argparse
@@ -82,7 +82,7 @@ def measure_search(options: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
-def measure_teaching(options: argparse.Namespace) -> dict[str, Any]:
+def measure_enrolling(options: argparse.Namespace) -> dict[str, Any]:
     """Return the seconds to enroll an object from a mesh and from five views, and to forget it."""
     rng = np.random.default_rng(0)
     meshes = builtin_objects()
@@ -133,13 +133,13 @@ def _seconds(function: Callable[[], object]) -> float:
 def main() -> None:
     """Run one of the two measurements and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["search", "teach"])
+    parser.add_argument("what", choices=["search", "enroll"])
     parser.add_argument("--objects", type=int, default=100_000)
     parser.add_argument("--views", type=int, default=50, help="views of each object")
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
-    report = measure_search(options) if options.what == "search" else measure_teaching(options)
+    report = measure_search(options) if options.what == "search" else measure_enrolling(options)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / f"gallery-{options.what}.json").write_text(json.dumps(report, indent=1) + "\n")
 

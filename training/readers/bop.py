@@ -87,7 +87,7 @@ class BOP(LabelledFrames):
         return dataclasses.replace(frame, labels=labels), truth, {"scene": scene.name}
 
     def unlabelled(self, number: int) -> RGBDFrame:
-        """Read a frame without its masks; raises as `read`."""
+        """Read a frame without its masks; raise errors as `read`."""
         image = self.sources[number]
         with _entry(image, "camera") as entry:
             intrinsics = _intrinsics(entry)
