@@ -180,7 +180,7 @@ def _sweep(axes: jax.Array, support: jax.Array) -> jax.Array:
 
 
 def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the axes of an approximately minimal-volume oriented box, longest side first, and its extents.
+    """Return the axes of an approximately minimal-volume oriented box, longest side first, and its bounds.
 
     The search starts from the principal axes of all points and from those of the support points (the released code uses
     the vertices of the convex hull), and the smaller box is returned. No gradient flows through the axes.
