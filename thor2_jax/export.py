@@ -21,7 +21,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.types import PointClouds, is_positive_integer
+from thor2_jax.types import PointClouds
 
 __all__ = ["PLATFORMS", "export_recognizer"]
 
@@ -52,7 +52,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     if not isinstance(run, TrainedRun):
         raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun, as load_run returns it")
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
-        if not is_positive_integer(value) or value not in buckets:
+        if value not in buckets:
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, buckets))}")
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {tuple(platforms)!r}; expected some of {', '.join(PLATFORMS)}")

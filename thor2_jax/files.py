@@ -260,7 +260,7 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = read_header[version](stream)
-    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # also rejects values without bytes (type V0)
+    if math.prod(shape) * max(dtype.itemsize, 1) > max_bytes:  # also refuses values without bytes (type V0)
         raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)

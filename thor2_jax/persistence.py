@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, check_types, is_positive_integer, is_sized
+from thor2_jax.types import Diagrams, check_types, is_positive_integer
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -200,8 +200,8 @@ def images(
     for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
         numbers = _real_numbers(bounds, (2,), dtype)
         if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:
-            raise InputError(f"{name} is {bounds!r}; expected two finite numbers, the smaller one first, in {dtype}")
-    if not is_sized(pixels) or len(pixels) != 2 or not all(map(is_positive_integer, pixels)):
+            raise InputError(f"{name} is {bounds!r}; expected two finite {dtype} numbers, the smaller one first")
+    if np.shape(pixels) != (2,) or not all(map(is_positive_integer, pixels)):
         raise InputError(f"pixels is {pixels!r}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
         number = value if isinstance(value, jax.core.Tracer) else _real_numbers(value, (), dtype)
@@ -221,7 +221,7 @@ def _real_numbers(values: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
     kinds = (jnp.integer, jnp.floating)
     if numbers.shape != shape or not any(jnp.issubdtype(numbers.dtype, kind) for kind in kinds):
         return None
-    with np.errstate(over="ignore"):  # infinite numbers are rejected
+    with np.errstate(over="ignore"):  # infinite numbers are refused
         return numbers.astype(dtype)
 
 

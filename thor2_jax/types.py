@@ -36,7 +36,6 @@ __all__ = [
     "check_cloud",
     "check_types",
     "is_positive_integer",
-    "is_sized",
 ]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
@@ -93,8 +92,8 @@ class PointClouds:
                 integer; `camera` is not finite or has another shape; `boundary` or `rim` does not fit the clouds. The
                 message gives the index of the cloud.
         """
-        if not is_sized(clouds) or len(clouds) == 0:
-            actual = "empty" if is_sized(clouds) else f"a {type(clouds).__name__}"
+        if not isinstance(clouds, Sized) or len(clouds) == 0:
+            actual = "empty" if isinstance(clouds, Sized) else f"a {type(clouds).__name__}"
             raise InputError(f"clouds is {actual}; expected a list of at least one pair (xyz, rgb)")
         arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]
@@ -117,8 +116,8 @@ class PointClouds:
 
 
 def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int], n: int) -> NDArray[np.bool_]:
-    if not is_sized(flags) or len(flags) != len(sizes):
-        actual = f"has {len(flags)} entries" if is_sized(flags) else f"is a {type(flags).__name__}"
+    if not isinstance(flags, Sized) or len(flags) != len(sizes):
+        actual = f"has {len(flags)} entries" if isinstance(flags, Sized) else f"is a {type(flags).__name__}"
         raise InputError(f"{name} {actual} for {len(sizes)} clouds; expected a list of one entry for each cloud")
     padded = np.zeros((len(sizes), n), bool)
     for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
@@ -155,11 +154,6 @@ def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
     """Convert to float32. Values that are too large become infinite without a warning; the caller refuses them."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
-
-
-def is_sized(value: Any) -> bool:
-    """Return whether a value has a length; an array without axes has none, although it has the method."""
-    return isinstance(value, Sized) and getattr(value, "ndim", 1) > 0
 
 
 def is_positive_integer(value: Any) -> bool:

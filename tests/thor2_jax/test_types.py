@@ -83,7 +83,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     [
         ({"clouds": []}, ["clouds is empty"]),
         ({"clouds": None}, ["clouds is a NoneType"]),
-        ({"clouds": np.array(1.0)}, ["clouds is a ndarray"]),
         ({"clouds": iter([(POINTS, COLORS)])}, ["clouds is a list_iterator"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
@@ -112,7 +111,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
-        ({"rim": np.array(True)}, ["rim", "ndarray", "1 clouds"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:

@@ -180,7 +180,7 @@ def _sweep(axes: jax.Array, support: jax.Array) -> jax.Array:
 
 
 def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the axes of an approximately minimal-volume oriented box, longest side first, and its extents.
+    """Return the axes of an approximately minimal-volume oriented box, longest side first, and its bounds.
 
     The search starts from the principal axes of all points and from those of the support points (the released code uses
     the vertices of the convex hull), and the smaller box is returned. No gradient flows through the axes.
@@ -391,7 +391,7 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
     Raises:
         InputError: `axes` has another letter.
     """
-    if not isinstance(axes, str) or not set(axes) <= set("xyz"):
+    if not set(axes) <= set("xyz"):
         raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
     flip = jnp.array([letter in axes for letter in "xyz"])
     high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)

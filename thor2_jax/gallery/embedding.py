@@ -62,7 +62,7 @@ BACKGROUND = -1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class References:
-    """Reference views: embedded views of the classes of a run, and of the background, objects of none of them.
+    """Reference views: embedded views of the classes of a run, and of the background: objects of no class.
 
     The regression of a gallery includes them (`Gallery.scores`). So an enrolled object is recognized by its differences
     from the references, and even a gallery with a single object rejects unknown objects. With `EmbeddingSizes.views`,

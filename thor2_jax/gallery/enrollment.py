@@ -1,4 +1,4 @@
-"""Enrolment: augmentation and embedding of the views of an object, and a gallery that can be changed.
+"""Enrollment: augmentation and embedding of the views of an object, and a gallery that can be changed.
 
 Another camera may see an object differently than its views, whether these are a few frames or renderings of a mesh.
 Augmented copies of the views therefore have other light, sensor noise and cut masks; they are made without rendering.

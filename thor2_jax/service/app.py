@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
-from thor2_jax.service.decoding import parse_enrolment, parse_number, read_body, read_form
+from thor2_jax.service.decoding import parse_enrollment, parse_number, read_body, read_form
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
@@ -245,18 +245,18 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     @routes.post(
         "/v1/objects",
         responses=FRAME_ERRORS | GALLERY_ERRORS | error_responses(409),
-        openapi_extra={"requestBody": schemas.ENROLMENT_FORM},
+        openapi_extra={"requestBody": schemas.ENROLLMENT_FORM},
     )
-    async def enroll(request: Request) -> schemas.EnrolmentAnswer:
+    async def enroll(request: Request) -> schemas.EnrollmentAnswer:
         """Enroll an object from one instance of a frame; all processes recognize it from now on.
 
         For a name that exists, set extend or replace.
         """
-        async with service.admit(partial(read_form, request, schemas.ENROLMENT_FORM)) as (admitted, files):
-            name, label, flags = parse_enrolment(files)
+        async with service.admit(partial(read_form, request, schemas.ENROLLMENT_FORM)) as (admitted, files):
+            name, label, flags = parse_enrollment(files)
             known = await service.enroll(files, name, label, flags, admitted)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
-        return schemas.EnrolmentAnswer(
+        return schemas.EnrollmentAnswer(
             **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
         )
 

@@ -30,7 +30,7 @@ __all__ = [
     "decode_frame",
     "decode_json_clouds",
     "decode_npz_clouds",
-    "parse_enrolment",
+    "parse_enrollment",
     "parse_number",
     "read_body",
     "read_form",
@@ -105,7 +105,7 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
         await received.close()
 
 
-def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]]:
+def parse_enrollment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]]:
     """Remove the fields name, instance, extend and replace from a form and parse them; the last two are optional.
 
     Returns:

@@ -74,8 +74,8 @@ def check_token(token: str | None) -> None:
     """Raise InputError unless a token can be sent in a header; None is no token."""
     if token is not None and not (token and token.isascii() and token.isprintable() and token == token.strip()):
         raise InputError(
-            "token (--token or THOR2_TOKEN) is empty, or has other characters or blanks at its ends; expected "
-            "printable ASCII characters; leave both out for a service without a token"
+            "token (--token or THOR2_TOKEN) is empty, or is not printable ASCII without blanks at its ends; expected "
+            "such characters; leave it out for a service without a token"
         )
 
 

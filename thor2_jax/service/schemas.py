@@ -11,7 +11,7 @@ __all__ = [
     "CLOUDS_BODY",
     "FORM",
     "FRAME_FORM",
-    "ENROLMENT_FORM",
+    "ENROLLMENT_FORM",
     "MAX_CLOUDS",
     "MAX_CLOUD_COORDINATE",
     "MAX_EXPLAINED",
@@ -24,7 +24,7 @@ __all__ = [
     "ColorNetworkAnswer",
     "DescribeAnswer",
     "Details",
-    "EnrolmentAnswer",
+    "EnrollmentAnswer",
     "ExplainedFrame",
     "ExplainedInstance",
     "FrameAnswer",
@@ -267,7 +267,7 @@ class ChangeAnswer(BaseModel):
     generation: int = Field(description="Number of changes of the gallery; POST /v1/objects/undo undoes this change.")
 
 
-class EnrolmentAnswer(ObjectAnswer, ChangeAnswer):
+class EnrollmentAnswer(ObjectAnswer, ChangeAnswer):
     """The object after its enrollment."""
 
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, gallery, total.")
@@ -327,7 +327,7 @@ FRAME_FORM = _form(_FRAME, "labels")
 WHY_FORM = _form({**_FRAME, "instance": _INSTANCE})
 """OpenAPI schema of the body of /v1/why."""
 
-_ENROLMENT: dict[str, Any] = {
+_ENROLLMENT: dict[str, Any] = {
     **_FRAME,
     "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
     "instance": _INSTANCE,
@@ -335,7 +335,7 @@ _ENROLMENT: dict[str, Any] = {
     "replace": {"type": "boolean", "description": "Discard the views of an existing object."},
 }
 
-ENROLMENT_FORM = _form(_ENROLMENT, "extend", "replace")
+ENROLLMENT_FORM = _form(_ENROLLMENT, "extend", "replace")
 """OpenAPI schema of the body of POST /v1/objects."""
 
 UNDO_FORM = _form(

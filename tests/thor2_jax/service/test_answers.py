@@ -186,7 +186,7 @@ def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | No
     assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
 
 
-@pytest.mark.parametrize("content", [b"<html>", b"{}", b"[]", b"PK\3\4"])
+@pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"[]", b"PK\3\4"])
 def test_the_answer_of_another_server_is_an_error(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: httpx.Response(200, content=content))
     client = Client("http://robot.local")

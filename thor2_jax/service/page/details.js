@@ -51,7 +51,7 @@ function confidenceHelp(calibrated, sources) {
   if (!sources.length) return "No object is enrolled.";
   const gallery = "The score of the gallery is about 1 among the enrolled views of an object and about 0 far from all of them. ";
   if (sources.length === 1 && sources[0] === "gallery") return `${gallery}The confidence rises with it and is 50 % at a score of 0.2; it is not calibrated.`;
-  const both = "An enrolled object is the answer only if its score is high and no trained class is likely. A trained class that is the answer keeps its confidence. ";
+  const both = "An enrolled object is the answer if its score is high: the more likely a trained class is, the higher the score must be. A trained class that is the answer keeps its confidence. ";
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
   const known = "The embedding separates the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For known objects, it estimates the probability that the name is correct.";
