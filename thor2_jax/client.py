@@ -138,8 +138,7 @@ class _Connection:
         check_token(token)
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._options: dict[str, Any] = {"base_url": url, "headers": headers, "timeout": timeout}
-        self._options["follow_redirects"] = True
+        self._options: dict[str, Any] = dict(base_url=url, headers=headers, timeout=timeout, follow_redirects=True)
         self._options["verify"] = ssl.create_default_context()  # creating it takes longer than a request
 
     @contextlib.contextmanager

@@ -48,8 +48,7 @@ MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8)
-"""Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and OpenCV's
-rational model (ROS: rational_polynomial)."""
+"""Numbers of coefficients: none, OpenCV's polynomial (ROS: plumb_bob) without and with k3, and its rational model."""
 
 MAX_DISTORTION_ERROR = 0.5
 """Largest error of the inverse of a lens distortion, pixels."""
@@ -99,9 +98,8 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         for name in (*_PINHOLE, "depth_scale"):
-            value, least = getattr(self, name), 1 / LARGEST_INTRINSIC  # smaller positive numbers make points infinite
-            if name in ("cx", "cy"):
-                least = -LARGEST_INTRINSIC
+            # Smaller positive numbers would make points infinite.
+            value, least = getattr(self, name), -LARGEST_INTRINSIC if name in ("cx", "cy") else 1 / LARGEST_INTRINSIC
             if not _is_number(value) or value < least:
                 raise InputError(
                     f"intrinsics.{name} is {value!r}; expected a number from {least:.0e} to {LARGEST_INTRINSIC:.0e}"
@@ -114,9 +112,7 @@ class Intrinsics:
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """Create intrinsics from a mapping, a matrix or a ROS message in one of the formats of this module.
-
-        Other entries of a mapping are ignored.
+        """Create intrinsics from a mapping (other entries are ignored), a matrix or a ROS message in a format above.
 
         Raises:
             InputError: `values` is in none of the formats, lacks an entry, has an invalid entry, or has a lens
