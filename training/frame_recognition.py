@@ -171,4 +171,9 @@ def track_frames(
             continue
         final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
         # The frame is read a second time, since a long sequence of images does not fit into memory.
-        yield FrameAnswer(source.name, source.read(), final, seconds)
+        try:
+            frame = read_source(source)
+        except InputError as error:
+            yield FrameAnswer(source.name, error=str(error))
+        else:
+            yield FrameAnswer(source.name, frame, final, seconds)

@@ -20,6 +20,7 @@ from playwright.sync_api import Browser
 from processes import HANG
 
 from training.cli import app
+from training.readers.frames import read_names
 
 PLACEHOLDER = "..."
 COMMANDS = [(page, words) for page in PAGES for words in thor2_commands(page)]
@@ -43,6 +44,15 @@ def test_commands_parse() -> None:
             parse(words)
         except (KeyError, typer.TyperException) as error:
             pytest.fail(f"{page}: {' '.join(words)}: {error!r}")
+
+
+def test_documented_labels_json_is_read(tmp_path: Path) -> None:
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
+    contents = re.findall(r"`labels\.json`[^`]*`(\{[^`]*\})`", text)
+    assert len(contents) == 2
+    for content in contents:
+        (tmp_path / "labels.json").write_text(content)
+        assert read_names(tmp_path / "labels.json") == {3: "mug"}
 
 
 def test_every_documented_command_is_run_by_a_test() -> None:

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from thor2_jax.errors import InputError, decoding, needs_extra
 from thor2_jax.files import open_file, read_npy
@@ -236,7 +236,11 @@ def decode_image(
         ImageSizeError: the image has more than `max_pixels` pixels.
         Exception: of any type, if the image is damaged, not in `formats` or, with `lossless`, has JPEG compression.
     """
-    with Image.open(stream, formats=formats) as image:
+    try:
+        opened = Image.open(stream, formats=formats)
+    except UnidentifiedImageError:  # whose message contains the Python object of the stream
+        raise ValueError("the first bytes are not those of an image") from None
+    with opened as image:
         check_size(*image.size, max_pixels)
         if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
             raise ValueError("JPEG compression changes label numbers")

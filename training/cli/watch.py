@@ -46,9 +46,10 @@ def watch(
     """
     # `main` repeats a KeyboardInterrupt that was lost in a finalizer or in a callback of JAX.
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
-        from thor2_jax.frames.frames import RecordedFrame
+        from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+        from thor2_jax.segmentation.segmenters import segment as segment_frame
         from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
         from training.frame_recognition import RecognizerArguments, read_source
 
@@ -58,33 +59,46 @@ def watch(
             raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
         topics: dict[str, Any] = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic}
         options.check_belongs("--bag", bag, **topics)
-        segmenter = load_segmenter(segment or TABLE)
+        given_frames = options.FrameOptions(None if folder is None else [folder], bag=bag, **topics)
+        load = functools.cache(functools.partial(load_segmenter, segment or TABLE))
+        if folder is None or segment:
+            load()  # raises InputError if its package is missing, which frames with labels do not need
+        segments = ["--segment", segment] if segment else []
+
+        def segment_unlabelled(frame: RGBDFrame) -> Any:
+            segments[:] = "--segment", segment or TABLE
+            return segment_frame(frame, load())  # names the segmenter in its errors
+
         frames: Iterator[RecordedFrame]
         if folder is not None:
-            numbered = enumerate(options.FrameOptions([folder]).sources(segment))
+            numbered = enumerate(given_frames.sources(segment))
             frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in numbered)
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:
-            opened = stack.enter_context(options.FrameOptions(bag=bag, **topics).open_bag())
+            opened = stack.enter_context(given_frames.open_bag())
             for note in opened.notes:
                 print_note(f"note: {note}")
             frames = paced(opened.frames())
-        recognizer = RecognizerArguments(model, unknown_below, answer_by).load()
+        arguments = RecognizerArguments(model, unknown_below, answer_by)
+        recognizer = arguments.load()
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
         print_note(f"watch at {url}")
-        view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
+        view = LiveView(recognizer.track().update if track else recognizer.recognize, segment_unlabelled, broadcast)
+        n_shown = 0
         try:
             for recorded in frames:
                 view.show(recorded)
+                n_shown += 1
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)
             raise
-        view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
-        shown = f"no more frames, {view.n_frames} were recognized; Ctrl-C ends"
-        source = [folder or "FRAME"] if bag is None else ["--bag", bag]
-        finish(shown, "store the answers", "recognize", *source, "--model", model, "--out", "answers", file=sys.stderr)
+        recognized = f"{view.n_frames} of {n_shown} were recognized"
+        recognize = *(given_frames.arguments or ["FRAME"]), *segments, *options.given_options(arguments)
+        shown = f"no more frames, {recognized}; Ctrl-C ends"
+        finish(shown, "store the answers", "recognize", *recognize, "--out", "answers", file=sys.stderr)
+        view.publish_state("ended", f"There are no more frames; {recognized}.")
         while True:
             time.sleep(60)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -235,3 +236,10 @@ def test_label_files_of_16_bit_and_of_indexed_colors(tmp_path: Path) -> None:
     assert image.mode == "P"
     image.save(tmp_path / "l.png")
     np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), indices)
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged"])
+def test_refusal_of_no_image_names_the_file_only(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "color.png"
+    path.write_bytes(content)
+    assert_refused(rf"^color: {re.escape(str(path))} is damaged or no image \([^<>]*\); expected PNG", read_color, path)

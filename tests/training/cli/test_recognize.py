@@ -15,8 +15,11 @@ from PIL import Image
 from recording_files import table_frame
 from written_files import files_of
 
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
 from training.cli import recognize as recognize_command
+from training.frame_recognition import read_source
+from training.readers.frames import FrameSource
 
 
 def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
@@ -212,6 +215,25 @@ def test_a_damaged_frame_does_not_end_a_sequence(
     answers = json_lines(out)
     assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 3)] == [[2, 2]] * 2
     assert "depth" in answers[1]["error"] and "labels" in answers[2]["error"] and "2 of 4 frames" in err
+
+
+def test_a_frame_that_is_removed_does_not_end_a_sequence(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
+
+    def read_and_remove(source: FrameSource) -> RGBDFrame:
+        frame = read_source(source)
+        if source.name == "2":
+            (frames[1] / "depth.png").unlink(missing_ok=True)
+        return frame
+
+    monkeypatch.setattr("training.frame_recognition.read_source", read_and_remove)
+    assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
+    out, err = capfd.readouterr()
+    answers = json_lines(out)
+    assert ["instances" in answer for answer in answers] == [True, False, True]
+    assert "No such file" in answers[1]["error"] and "1 of 3 frames" in err
 
 
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:

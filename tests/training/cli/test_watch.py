@@ -1,5 +1,6 @@
 """`thor2 watch`; the run's weights are random."""
 
+import dataclasses
 import signal
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from commands import Command, run_thor2
 from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
+from thor2_jax.segmentation.table import segment_table
 from thor2_jax.watch.live import LiveView
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
@@ -28,11 +30,26 @@ def test_frames_of_a_folder(
     model: Path, folder: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0
-    assert "watch at http://127.0.0.1:" in capfd.readouterr().err
+    err = capfd.readouterr().err
+    assert "watch at http://127.0.0.1:" in err and "2 of 3 were recognized" in err
+    assert f"thor2 recognize {folder} --segment table --model {model} --out answers" in err
     assert [one["state"] for one in messages] == ["waiting", "live", "live", "live", "ended"]
     assert [one.get("frame") for one in messages] == [None, "0", "1", "2", "2"]
     assert [len(one["objects"]) for one in messages[1:4]] == [2, 2, 0] and "depth" in messages[3]["error"]
     assert messages[-1]["number"] == 2
+
+
+def test_frames_with_labels_do_not_need_opencv(
+    model: Path, tmp_path: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, refused: Command
+) -> None:
+    frame = FRAMES[0]
+    write_frame_files(tmp_path / "frames" / "0", dataclasses.replace(frame, labels=segment_table(frame)))
+    monkeypatch.delitem(sys.modules, "thor2_jax.segmentation.table")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    command = "watch", "--model", model, "--folder", tmp_path / "frames", "--port", 0
+    assert run_thor2(*command) == 0
+    assert messages[-1]["number"] == 1
+    assert "needs OpenCV" in refused(*command, "--segment", "table")
 
 
 def test_ctrl_c_ends_the_command(
