@@ -48,7 +48,11 @@ def test_every_view_is_used_mirrored_in_four_ways(
         points = np.add.reduceat(samples.color, np.cumsum(samples.colors) - samples.colors)
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
         assert samples.color.dtype == samples.length.dtype == np.float32
-    descriptors = describe_batch(samples.take(np.arange(16), NETWORK, config), NETWORK, config)
+    batch = samples.take(np.arange(16), NETWORK, config)
+    lowest = samples.take(np.arange(16), NETWORK, dataclasses.replace(config, n_slices=1))  # as THOR takes them
+    np.testing.assert_array_equal(lowest.length, batch.length[:, :1])
+    np.testing.assert_array_equal(lowest.color, batch.color[:, :1])
+    descriptors = describe_batch(batch, NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))
