@@ -58,22 +58,23 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     import colornet
     from thor2_jax import DescriptorConfig
     from thor2_jax.networks import HIDDEN, MLP
-    from training.fitting.fit import FitContext, describe_batch, initial_state, shard_batch, train_step
-    from training.fitting.samples import build_samples
+    from training.fitting.fit import FitContext, initial_state, shard_batch, train_step
+    from training.fitting.samples import describe_batch, sample_views
     from training.objects.builtin_objects import builtin_objects
     from training.views.mesh_views import render_views
     from training.views.normalized_views import MemoryViews
 
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
-    samples = build_samples(MemoryViews(render_views(builtin_objects(), *steps), config), network, config)
+    source = MemoryViews(render_views(builtin_objects(), *steps), config)
+    samples, _ = sample_views(source, network, config)
     context = FitContext("tops2", network, config)
     rows = np.arange(len(samples) // BATCH * BATCH)
-    chunks = [samples.take(rows[first : first + BATCH]) for first in range(0, len(rows), BATCH)]
+    chunks = [samples.take(rows[first : first + BATCH], network, config) for first in range(0, len(rows), BATCH)]
     describe = jax.jit(lambda batch: describe_batch(batch, network, config).tops2)
     x = np.concatenate([describe(chunk) for chunk in chunks])
     for name, array in {"x": x, "y": samples.label[: len(rows)].astype(np.int64), "hidden": np.array(HIDDEN)}.items():
         np.save(folder / f"{name}.npy", array)
-    model = MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0))
+    model = MLP(x.shape[1], len(source.classes), rngs=nnx.Rngs(0))
     graph, state = initial_state(model, optax.adam(0.0))
     rng = np.random.default_rng(0)
 
@@ -81,7 +82,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
         nonlocal state
         order = rng.permutation(rows)
         for number, first in enumerate(range(0, len(order), BATCH)):
-            batch = shard_batch(samples.take(order[first : first + BATCH]))
+            batch = shard_batch(samples.take(order[first : first + BATCH], network, config))
             state, _ = train_step(context, graph, state, batch, np.float32(RATE), np.uint32(0), np.uint32(number))
         jax.block_until_ready(state)
 

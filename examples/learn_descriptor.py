@@ -31,7 +31,6 @@ from matplotlib.figure import Figure
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.files import check_output_directory
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.networks import MLP, feature_of, input_size
@@ -42,7 +41,7 @@ from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
 from training.fitting.fit import scale_inputs
 from training.fitting.loop import FitOptions
-from training.fitting.samples import Batch, Samples, build_samples, expand
+from training.fitting.samples import Batch, Samples, describe_batch, sample_views
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder
@@ -108,8 +107,7 @@ class State(NamedTuple):
 
 def described(batch: Batch, free: LearnedValues) -> thor2.Descriptors:
     """Return the descriptors of a batch of samples."""
-    strips = expand(batch, region_sets(NETWORK).weights, CONFIG)
-    return thor2.describe_strips(strips, NETWORK, CONFIG, free.parameters())
+    return describe_batch(batch, NETWORK, CONFIG, free.parameters())
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -135,15 +133,15 @@ def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], 
     return State(weights, rest, free, optimizer)
 
 
-def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
+def train(samples: Samples, classes: tuple[str, ...], options: FitOptions, learn: bool) -> TrainedRun:
     """Train both classifiers and, with `learn`, the descriptor."""
     graphs: list[Any] = []
     weights: dict[str, Any] = {}
     rest: dict[str, Any] = {}
-    sample = samples.take(np.arange(0, len(samples), max(1, len(samples) // 1024)))
+    sample = samples.take(np.arange(0, len(samples), max(1, len(samples) // 1024)), NETWORK, CONFIG)
     for name in THOR2:
         n_inputs = input_size(name, CONFIG, NETWORK.n_regions)
-        model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
+        model = MLP(n_inputs, len(classes), rngs=nnx.Rngs(options.seed))
         model.input_scale[...] = scale_inputs(sample, name, NETWORK, CONFIG)
         split: Any = nnx.split(model, nnx.Param, ...)
         graph, weights[name], rest[name] = split
@@ -159,7 +157,7 @@ def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
         rate = options.learning_rates[epoch >= (options.epochs + 1) // 2]
         order = rng.permutation(len(samples))
         for number in range(n_steps):
-            batch = samples.take(order[number * batch_size :][:batch_size])
+            batch = samples.take(order[number * batch_size :][:batch_size], NETWORK, CONFIG)
             step = epoch * n_steps + number
             state = train_step(tuple(graphs), state, batch, (rate, decay(step)), jax.random.fold_in(key, step))
 
@@ -173,7 +171,7 @@ def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
     network = dataclasses.replace(NETWORK, similarity=np.asarray(parameters.similarity, np.float64))
     classifiers = {name: nnx.merge(graph, state.weights[name], state.rest[name]) for name, graph in graphs}
     record = {"epochs": options.epochs, "seed": options.seed, "learned": learn}
-    return TrainedRun(config, network, samples.classes, classifiers, record)
+    return TrainedRun(config, network, classes, classifiers, record)
 
 
 def arguments() -> tuple[argparse.ArgumentParser, argparse.Namespace]:
@@ -234,7 +232,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
         if not any(name in objects for item in frames for name in item.truth.values()):
             raise thor2.InputError(f"{title} contains none of the objects to train on; expected at least one")
     source = MemoryViews(render_views(objects, options.azimuth_step, options.polar_step), CONFIG)
-    samples = build_samples(source, NETWORK, CONFIG)
+    samples, _ = sample_views(source, NETWORK, CONFIG)
     print(f"{len(samples)} samples of {len(objects)} objects, {time.perf_counter() - start:.0f} s", flush=True)
 
     runs: dict[str, list[TrainedRun]] = {"THOR2": [], "THOR2-L": []}
@@ -242,7 +240,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
     accuracy: dict[str, dict[str, list[list[float]]]] = {title: {name: [] for name in runs} for title in sets}
     for fit in fits:
         for name, trained in runs.items():
-            trained.append(train(samples, fit, learn=name == "THOR2-L"))
+            trained.append(train(samples, source.classes, fit, learn=name == "THOR2-L"))
             for title, frames in sets.items():
                 run = Run(name, "", thor2.Recognizer(trained[-1]))
                 results = compute_results("frames", [run], [answers for _, answers in answer_frames([run], frames)])
@@ -257,7 +255,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
 
     report(names, accuracy, runs["THOR2-L"])
     print(f"{time.perf_counter() - start:.0f} s")
-    batch = samples.take(np.array([np.argmax(np.diff(samples.strip_start))]))
+    batch = samples.take(np.array([np.argmax(samples.lengths)]), NETWORK, CONFIG)
     draw(batch, runs["THOR2-L"][0], accuracy, names.index("THOR2"), options.out / "learn_descriptor.png")
     print(f"picture: {options.out / 'learn_descriptor.png'}; run: {options.out / 'thor2-l'}")
 
@@ -316,8 +314,7 @@ def draw(batch: Batch, learned: TrainedRun, accuracy: Mapping[str, Mapping[str, 
     bars.set_xticks(range(len(accuracy)), [Path(title).name for title in accuracy])
     bars.set(ylim=(0, 1), title="accuracy: mean, deviation and each seed")
     bars.legend(loc="lower right", fontsize=8)
-    strips = expand(batch, region_sets(NETWORK).weights, CONFIG)
-    images = [np.asarray(thor2.describe_strips(strips, *run).images[0]) for run in tables.values()]
+    images = [np.asarray(describe_batch(batch, *run).images[0]) for run in tables.values()]
     fullest = images[0].sum(axis=(1, 2)).argmax()
     for axes, name, image in zip(pictures, tables, images, strict=True):
         axes.imshow(image[fullest].T, origin="lower", cmap="magma")

@@ -19,7 +19,7 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.networks import FEATURES
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
-from training.embedding.samples import AUGMENTATIONS
+from training.embedding.distractors import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.job import answer_frames
 from training.evaluation.results import compute_results, fuse_answers

@@ -9,8 +9,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.networks import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
-from training.embedding.distractors import Distractors
-from training.embedding.samples import AUGMENTATIONS
+from training.embedding.distractors import AUGMENTATIONS, Distractors
 from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 from training.objects.mesh import TexturedMesh

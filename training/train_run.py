@@ -38,7 +38,6 @@ from training.embedding.distractors import (
     with_fitted_distractors,
 )
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
-from training.embedding.samples import sample_views
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
@@ -52,7 +51,7 @@ from training.fitting.loop import (
     read_metrics,
     wait_for_all,
 )
-from training.fitting.samples import Samples, build_samples
+from training.fitting.samples import OF_EMBEDDING, Form, Samples, sample_views
 from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
@@ -143,15 +142,16 @@ def train_run(
             locks.enter_context(locked(out / CHECKPOINTS))
         samples: Samples | _Views
         if settings.classifiers:
-            copies = settings.mirrors, settings.orientation_copies, settings.fit.seed
-            show = of_stage(progress, DESCRIBE, "views")
-            samples = build_samples(source, settings.network, settings.config, show, *copies)
+            _check_classes(source)
+            form, show = Form(settings.mirrors, settings.orientation_copies), of_stage(progress, DESCRIBE, "views")
+            samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
         else:  # only the distribution of the views among the folds is needed here
             samples = _labelled_views(source)
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
-        parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
-        fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, settings.fit.seed)
+        n_classes = len(source.classes)
+        parts = _held_out_parts(samples, n_classes) if folds == 1 and is_held_out else folds
+        fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:
             if not resumed:
@@ -175,18 +175,26 @@ class _Views(NamedTuple):
 
     label: NDArray[np.integer[Any]]
     view: NDArray[np.integer[Any]]
-    classes: tuple[str, ...]
 
 
 def _labelled_views(source: ViewSource) -> _Views:
     views = [source.read(index).view for index in range(len(source.shards))]
     labels = np.repeat([shard.label for shard in source.shards], [len(view) for view in views])
-    return _Views(labels, np.concatenate(views), tuple(source.classes))
+    return _Views(labels, np.concatenate(views))
 
 
-def _held_out_parts(samples: Samples | _Views) -> int:
+def _check_classes(source: ViewSource) -> None:
+    """Raise InputError if there are fewer than two classes, or a class has no views."""
+    if len(source.classes) < 2:
+        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
+    for label, name in enumerate(source.classes):
+        if not any(shard.label == label and shard.views for shard in source.shards):
+            raise InputError(f"class {name!r} has no views; render more views or leave it out")
+
+
+def _held_out_parts(samples: Samples | _Views, n_classes: int) -> int:
     """Return into how many parts the views are split to hold out one part; fewer if a class has few views."""
-    fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(len(samples.classes)))
+    fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(n_classes))
     return max(2, min(HELD_OUT, fewest))
 
 
@@ -244,7 +252,7 @@ class _Fold(NamedTuple):
     ) -> TrainedRun:
         """Return the run: classifiers, the embedding if there are distractors, calibrated confidence and record."""
         settings = self.settings
-        run = TrainedRun(settings.config, settings.network, self.samples.classes, classifiers, {})
+        run = TrainedRun(settings.config, settings.network, self.source.classes, classifiers, {})
         accuracy, confidence = {}, {}
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
@@ -271,15 +279,15 @@ class _Fold(NamedTuple):
             held-out set. Labels of distractors start at the number of classes.
         """
         settings, views, held_out, checkpoints = self.settings, self.samples, self.held_out, self.checkpoints(EMBEDDING)
-        network, seed, n_classes = settings.network, settings.fit.seed, len(views.classes)
+        network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
         scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
         others = distractor_samples(distractors, scratch, network, config, shown)
-        kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(n_classes)}
+        kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(len(classes))}
         shown = of_stage(self.report, DESCRIBE_EMBEDDED)
-        samples, known = sample_views(self.source, kept, network, config, seed, shown)
-        unknown = held_out_clouds(distractors, n_classes)
-        samples = with_fitted_distractors(samples, others, n_classes)
+        samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
+        unknown = held_out_clouds(distractors, len(classes))
+        samples = with_fitted_distractors(samples, others, len(classes))
         del others  # needs as much memory as the samples
         embedding = fit_embedding(
             samples,
@@ -289,7 +297,7 @@ class _Fold(NamedTuple):
             checkpoints,
             RUN_SIZES,
             fit_progress(self.report, FIT_NETWORKS, distractors.epochs),
-            views.classes,
+            classes,
             networks=distractors.networks,
             seed=seed,
         )

@@ -50,13 +50,13 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
         _, checkpoints, held_out, _ = others
         checkpoints.log(metrics(held_out_accuracy=None if held_out is None else 0.5))
         inputs = input_size(context.feature, context.config, context.network.n_regions)
-        return random_classifier(inputs, len(samples.classes), 0), 1
+        return random_classifier(inputs, int(samples.label.max()) + 1, 0), 1
 
     def fit_embedding(fold: Any, distractors: Any) -> tuple[Embedding, list[Any]]:
         for stage in (RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS):
             fold.report(stage, 1, 1)
         fold.checkpoints("embedding").log(metrics())
-        settings, classes = fold.settings, fold.samples.classes
+        settings, classes = fold.settings, fold.source.classes
         created = Embedding.create(
             settings.config, settings.network, train_run.RUN_SIZES, classes=classes, distractors=9
         )

@@ -19,9 +19,8 @@ from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module
-from training.embedding import fit, samples
-from training.embedding.distractors import Distractors
-from training.embedding.samples import render_clouds
+from training.embedding import distractors, fit
+from training.embedding.distractors import Distractors, render_clouds
 from training.fitting.calibration import fit_calibration
 from training.fitting.loop import Checkpoints, FitOptions, read_metrics
 from training.protocol import Protocol
@@ -110,9 +109,9 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     """Without a cache, the samples of the distractors are those in the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
     out = tmp_path / "run"
-    render = mock.Mock(wraps=samples.render_clouds)
-    monkeypatch.setattr(samples, "render_clouds", render)
-    for stage, step in (("render distractors", 10), ("describe for the embedding", 1), ("fit networks", 2)):
+    sample = mock.Mock(wraps=distractors.sample_normalized)
+    monkeypatch.setattr(distractors, "sample_normalized", sample)
+    for stage, step in (("render distractors", 10), ("describe for the embedding", 8), ("fit networks", 2)):
         with pytest.raises(Interrupted):
             train(out, progress=stop_when(stage, step))
         assert_refused(r"run\.json", load_run, out)
@@ -122,7 +121,7 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     other = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3))
     assert_refused("networks", train, out, other)
     (run,) = train(out)
-    assert render.call_count == 1
+    assert sample.call_count == 1
     assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()
     assert run.record == whole[1].record and rows(out) == rows(whole[0])
     assert not (out / "checkpoints").exists()
@@ -149,8 +148,8 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
 
 def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("THOR2_CACHE", "off")
-    render = mock.Mock(wraps=samples.render_clouds)
-    monkeypatch.setattr(samples, "render_clouds", render)
+    sample = mock.Mock(wraps=distractors.sample_normalized)
+    monkeypatch.setattr(distractors, "sample_normalized", sample)
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
     train(tmp_path / "run", short)
-    assert render.call_count == 1
+    assert sample.call_count == 1

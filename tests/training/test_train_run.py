@@ -25,7 +25,7 @@ from training.fitting import loop
 from training.fitting.calibration import fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, find_run_directories
-from training.fitting.samples import build_samples
+from training.fitting.samples import sample_views
 from training.protocol import Protocol
 from training.train_run import train_run
 from training.views.normalized_views import MemoryViews, fold_of_views
@@ -98,7 +98,7 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
 
 
 def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "build_samples", lambda *_, **__: pytest.fail("the training started"))
+    monkeypatch.setattr(module, "sample_views", lambda *_, **__: pytest.fail("the training started"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("x")
     assert_refused(f"out: {tmp_path / 'run'} already contains kept", train, tmp_path / "run")
@@ -253,8 +253,8 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {name for name in names(out) if name[0] != "."} == finished
     assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]
     same_weights(runs[0], first)
-    samples = build_samples(source(), runs[0].network, CONFIG)
-    fold_of = fold_of_views(samples.label, samples.view, samples.classes, 3, OPTIONS.seed)
+    samples, _ = sample_views(source(), runs[0].network, CONFIG)
+    fold_of = fold_of_views(samples.label, samples.view, source().classes, 3, OPTIONS.seed)
     for fold, one in enumerate(load_runs([out])):
         rows, context = np.flatnonzero(fold_of == fold), FitContext("tops", runs[fold].network, CONFIG)
         probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)

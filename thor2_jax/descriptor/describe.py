@@ -51,7 +51,6 @@ __all__ = [
     "map_large_chunks",
     "shard_clouds",
     "strips",
-    "strips_by_sets",
 ]
 
 T = TypeVar("T")
@@ -139,7 +138,7 @@ def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, co
     return jax.vmap(one)(planes, aligned.colors, aligned.mask, region_set)
 
 
-def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
+def _strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
     """Return `strips` with the given region sets instead of those of a network."""
     return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
@@ -169,7 +168,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
     """
     check_batch(aligned)
     check_types(network=network, config=config)
-    return strips_by_sets(aligned, region_sets(network), config)
+    return _strips_by_sets(aligned, region_sets(network), config)
 
 
 def describe_strips(
@@ -185,7 +184,7 @@ def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     check_batch(aligned)
     check_types(config=config)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
-    return _diagrams(strips_by_sets(aligned, one_set, config), config)
+    return _diagrams(_strips_by_sets(aligned, one_set, config), config)
 
 
 def describe_aligned(

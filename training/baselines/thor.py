@@ -32,7 +32,7 @@ from training.baselines.baseline import BaselineInputs, FitTask, Predictor, Stor
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
-from training.fitting.samples import build_samples
+from training.fitting.samples import sample_views
 from training.rendering.camera import view_angles
 
 __all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
@@ -168,9 +168,9 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # by view number
     config = task.run.config
-    samples = build_samples(task.source, task.run.network, config)
+    samples, _ = sample_views(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
-    best = np.zeros((len(samples), len(samples.classes)), np.float32)
+    best = np.zeros((len(samples), len(task.run.classes)), np.float32)
     library: dict[tuple[ViewType, int], MLP] = {}
 
     def fit_classifier(name: ViewType, rows: NDArray[np.intp], k: int) -> MLP:

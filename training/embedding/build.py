@@ -20,8 +20,8 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
+from training.embedding.distractors import ObjectSource, sample_objects, samples_record
 from training.embedding.fit import fit_embedding, reference_views
-from training.embedding.samples import ObjectSource, build_samples, samples_record
 from training.fitting.loop import Checkpoints, fit_progress
 from training.objects.meshes import find_meshes
 from training.storage.jobs import begin_job, locked, of_stage
@@ -56,7 +56,7 @@ def build_embedding(
     rendered, fitted = of_stage(show, "render", "objects"), fit_progress(show, "fit", epochs)
     with locked(directory):
         begin_job(directory, job)
-        samples = build_samples(*arguments, local_workers(workers), rendered, directory=directory / "samples")
+        samples = sample_objects(*arguments, local_workers(workers), rendered, directory=directory / "samples")
         checkpoints = Checkpoints(directory / "networks")
         embedding = fit_embedding(samples, network, config, epochs, checkpoints, progress=fitted)
         embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))

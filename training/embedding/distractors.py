@@ -1,4 +1,9 @@
-"""Distractors: objects outside the classes of a run, and their samples in the user's cache.
+"""Distractors: objects outside the classes of a run, the samples of their views, and the user's cache of these samples.
+
+    samples = sample_objects(range(400), network, config, views=16, pool=local_workers(2), directory=Path("chunks"))
+
+Views of objects are rendered from random cameras. Their augmentation is stronger than for classifiers, since an
+embedding is used for new objects, while a classifier is fitted on its own objects.
 
 Distractors are procedural objects, or meshes of other objects. An embedding is fitted on them, too, so that it rejects
 unknown objects. A tenth of them is held out, to calibrate the confidence on unknown objects that no network has seen.
@@ -9,6 +14,7 @@ holds the samples for one record of everything that determines them, and its nam
 
 import contextlib
 import dataclasses
+import functools
 import logging
 import os
 import re
@@ -16,23 +22,171 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
+import thor2_jax
+import training
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.files import json_digest
+from thor2_jax.files import content_digest, json_digest
 from thor2_jax.types import Cloud
-from training.embedding.samples import ObjectSource, Samples, build_samples, render_clouds, samples_record
-from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, save_arrays
-from training.storage.workers import local_workers
+from training.augmentation.augmentations import KINDS, Augmentations, augment
+from training.fitting.samples import OF_EMBEDDING, Samples, sample_normalized
+from training.objects.meshes import load_mesh
+from training.objects.procedural import procedural_object
+from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
+from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, processor, save_arrays
+from training.storage.workers import IN_PROCESS, WorkerPool, local_workers
+from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
+from training.views.normalized_views import padded_batches
 
 __all__ = [
+    "AUGMENTATIONS",
     "Distractors",
+    "ObjectSource",
     "distractor_samples",
     "held_out_clouds",
+    "render_clouds",
+    "sample_objects",
+    "samples_record",
     "with_fitted_distractors",
 ]
+
+OBJECTS_PER_TASK = 32
+
+SEED = 0
+"""Seed of the views of objects and of their orientations: all runs share the distractors in the user's cache."""
+
+AUGMENTATIONS = Augmentations.of_names(KINDS)
+
+UNCHANGED = 0.2
+"""Fraction of the views without augmentation."""
+
+CAMERA = Camera.from_field_of_view(540, 405, 40.0)
+"""Camera with half the pixels of the training camera, which is still two pixels per voxel of a cloud."""
+
+ObjectSource = int | Path
+"""The seed of a procedural object, or a mesh file."""
+
+
+def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple[int, Cloud]]:
+    """Return the object's index and the cloud of each view with at least `MIN_VIEW_POINTS` points.
+
+    Args:
+        objects: index -> object.
+        views: number of views of each object.
+
+    Raises:
+        InputError: a mesh is unreadable.
+    """
+    clouds = []
+    for index, source in objects.items():
+        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+        caster = RayCaster([mesh])
+        rng = np.random.default_rng([SEED, index])
+        for _ in range(views):
+            view = render_view(caster, camera_pose(*random_angles(rng), mesh.centre), CAMERA)
+            cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
+            if len(cloud[0]) >= MIN_VIEW_POINTS:
+                clouds.append((index, cloud))
+    return clouds
+
+
+CODE = ("augmentation", "embedding", "fitting", "objects", "rendering", "views")
+"""Packages of training whose code determines the samples."""
+
+LIBRARY_CODE = (".", "descriptor", "frames")
+"""Packages of the library whose code determines the samples."""
+
+
+def samples_record(
+    sources: Sequence[ObjectSource], network: ColorNetwork, config: DescriptorConfig, views: int
+) -> dict[str, Any]:
+    """Return everything that determines the result of `sample_objects` with these arguments, in JSON types.
+
+    This includes a digest of the code, since code may change within a version in a checkout.
+    """
+    digests = {each: load_mesh(each).digest if isinstance(each, Path) else each for each in dict.fromkeys(sources)}
+    root = Path(training.__file__).parent
+    folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
+    files = (file for folder in folders for file in sorted(folder.glob("*.py")))
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "objects": [digests[each] for each in sources],
+        "views": views,
+        "copies": OF_EMBEDDING.orientations,
+        "seed": SEED,
+        "augmentations": AUGMENTATIONS.record(),
+        "version": thor2_jax.__version__,
+        "code": content_digest(file.read_bytes() for file in files),
+        "platform": f"{jax.default_backend()} {processor()}",
+    }
+
+
+def sample_objects(
+    sources: Sequence[ObjectSource],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    views: int,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    *,
+    directory: Path,
+) -> Samples:
+    """Render views of objects and sample them.
+
+    Args:
+        sources: objects; labels are indices into this sequence. An object that occurs n times gets n times as many
+            views, all with the label of its first occurrence.
+        network: colour network.
+        config: descriptor. Static.
+        views: number of views of each object.
+        pool: worker processes that render; they do not affect the result.
+        progress: called with (objects done, number of objects) at the start and after each task of a worker.
+        directory: directory for these samples only, created if it is missing. The samples of each task are stored
+            there, so that an interrupted call resumes.
+
+    Raises:
+        InputError: a mesh is unreadable or is visible in none of its views.
+        OSError: the directory cannot be written.
+    """
+    numbered = list(enumerate(sources))
+    label_of = {source: index for index, source in reversed(numbered)}
+    tasks = {
+        directory / f"{first:06d}.safetensors": dict(numbered[first : first + OBJECTS_PER_TASK])
+        for first in range(0, len(sources), OBJECTS_PER_TASK)
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    chunks: dict[Path, Samples] = {}
+    for file in tasks:
+        with contextlib.suppress(ValueError, TypeError):  # the file is missing or damaged
+            chunks[file] = Samples(**load_arrays(file))
+    missing = {file: task for file, task in tasks.items() if file not in chunks}
+    done = sum(len(tasks[file]) for file in chunks)
+    progress(done, len(sources))
+    render = functools.partial(render_clouds, views=views)
+    with contextlib.closing(pool(render, missing.values())) as results:
+        for (file, task), rendered in zip(missing.items(), results, strict=True):
+            invisible = task.keys() - {index for index, _ in rendered}
+            if invisible:
+                raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
+            rng = np.random.default_rng([SEED, len(sources), min(task)])
+            rendered = sorted(rendered, key=lambda view: len(view[1][0]))  # for batches with little padding
+            label = np.array([label_of[sources[index]] for index, _ in rendered], np.int32)
+            batches = padded_batches([cloud for _, cloud in rendered])
+            normal = ((count, view_normalize(clouds, config)) for count, clouds in batches)
+            view = np.zeros_like(label)
+            chunks[file] = sample_normalized(normal, label, view, network, config, rng, OF_EMBEDDING)
+            save_arrays(file, chunks[file].arrays(), {})
+            done += len(task)
+            progress(done, len(sources))
+    return Samples.concatenated([chunks[file] for file in tasks])
+
 
 ONE_HELD_OUT_OF = 10
 """One in this many distractors is held out."""
@@ -118,7 +272,7 @@ def distractor_samples(
     samples = None if file is None else _read_stored(file)
     if samples is None:
         pool = local_workers(distractors.workers)
-        samples = build_samples(*arguments, pool, progress, directory=directory / name)
+        samples = sample_objects(*arguments, pool, progress, directory=directory / name)
         if file is not None:
             _store(samples, file)
     progress(len(sources), len(sources))

@@ -22,17 +22,15 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, is_color
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks import EmbeddingSizes, class_cosines, projected_features
-from thor2_jax.types import Descriptors, Strips
-from training.embedding.samples import Batch, Samples
 from training.fitting.fit import FitState, initial_state, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
+from training.fitting.samples import Batch, Samples, describe_batch
 
-__all__ = ["RUN_SIZES", "describe_batch", "fit_embedding", "reference_views"]
+__all__ = ["RUN_SIZES", "fit_embedding", "reference_views"]
 
 RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
 """Sizes of each network of a run; several small networks give steadier answers than fewer large networks."""
@@ -49,14 +47,6 @@ RATE = 2e-3
 
 MARGIN = 0.12
 """Subtracted from the cosine between a view and its own proxy."""
-
-
-def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """Return the descriptors of the samples of a batch."""
-    length, color = jnp.asarray(batch.length, jnp.float32), jnp.asarray(batch.color, jnp.float32)
-    occupied = length > 0  # the pair of a strip with one point has no persistence and adds nothing to the image
-    strips = Strips(jnp.zeros_like(length), length, occupied, color, jnp.zeros(len(length), jnp.int32))
-    return describe_strips(strips, network, config)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
@@ -78,7 +68,7 @@ def _color_basis(
 ) -> NDArray[np.float32]:
     """Return the principal components [F, C] of the projected features, without centring, to preserve cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
-    batches = samples.batches(rows, BATCH_SIZE, config)
+    batches = samples.batches(rows, BATCH_SIZE, network, config)
     features = np.concatenate([_projected_features(sizes.version, network, config, batch) for batch in batches])
     variances, vectors = np.linalg.eigh(features @ features.T)
     size = sizes.color
@@ -175,7 +165,8 @@ def fit_embedding(
     def train_epoch(number: int, states: tuple[FitState, ...]) -> Iterator[tuple[tuple[FitState, ...], jax.Array]]:
         # Order and dropout depend only on seed and step, so that a resumed fit needs no generator state.
         order = np.random.default_rng([seed, number]).permutation(len(samples))[: n_steps * BATCH_SIZE]
-        for step, batch in enumerate(samples.batches(order, BATCH_SIZE, config), (number - 1) * n_steps + 1):
+        batches = samples.batches(order, BATCH_SIZE, network, config)
+        for step, batch in enumerate(batches, (number - 1) * n_steps + 1):
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), step), networks)
             states, computed = _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
             yield states, computed
@@ -212,8 +203,8 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
     per_class = min(VIEWS_OF_CLASS, CLASS_VIEWS // max(n_classes, 1))
     chosen = [_choose(samples.label == label, per_class, rng) for label in range(n_classes)]
     rows = np.concatenate([*chosen, _choose(samples.label >= n_classes, BACKGROUND_VIEWS, rng)])
-    config = embedding.config
-    looks = (batch_looks(batch, embedding.network, config) for batch in samples.batches(rows, BATCH_SIZE, config))
+    described_by = embedding.network, embedding.config
+    looks = (batch_looks(batch, *described_by) for batch in samples.batches(rows, BATCH_SIZE, *described_by))
     chunks = [embedding.embed_oriented(batch)[:, 0] for batch in looks]
     label = samples.label[rows]
     embedded, shown = np.concatenate(chunks)[: len(rows)], np.where(label < n_classes, label, BACKGROUND)

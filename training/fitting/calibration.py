@@ -20,8 +20,8 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import EMBEDDING, MLP, feature_of
 from thor2_jax.types import Cloud
-from training.fitting.fit import FitContext, describe_batch
-from training.fitting.samples import Batch, Samples
+from training.fitting.fit import FitContext
+from training.fitting.samples import Batch, Samples, describe_batch
 from training.views.normalized_views import padded_batches
 
 __all__ = [
@@ -46,12 +46,9 @@ def sample_probabilities(
 ) -> NDArray[np.float32]:
     """Return the class probabilities [len(rows), C] of samples; `context` is the context of the fit."""
     graph, state = nnx.split(model)
-    chunks = [np.zeros((0, len(samples.classes)), np.float32)]
-    for first in range(0, len(rows), SAMPLES_PER_BATCH):
-        chunk = rows[first : first + SAMPLES_PER_BATCH]
-        batch = samples.take(np.resize(chunk, SAMPLES_PER_BATCH))
-        chunks.append(np.asarray(_probabilities(context, graph, state, batch))[: len(chunk)])
-    return np.concatenate(chunks)
+    batches = samples.batches(rows, SAMPLES_PER_BATCH, context.network, context.config)
+    chunks = [np.asarray(_probabilities(context, graph, state, batch)) for batch in batches]
+    return np.concatenate([np.zeros((0, int(samples.label.max()) + 1), np.float32), *chunks])[: len(rows)]
 
 
 def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.integer[Any]]) -> float:

@@ -25,19 +25,16 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import BATCH_AXIS, batch_mesh, describe_strips
-from thor2_jax.descriptor.slicing import region_sets
+from thor2_jax.descriptor.describe import BATCH_AXIS, batch_mesh
 from thor2_jax.errors import InputError
 from thor2_jax.networks import MLP, Feature, feature_of, input_size
-from thor2_jax.types import Descriptors
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
-from training.fitting.samples import Batch, Samples, expand
+from training.fitting.samples import Batch, Samples, describe_batch
 
 __all__ = [
     "FitContext",
     "FitState",
     "count_correct",
-    "describe_batch",
     "fit",
     "initial_state",
     "network_step",
@@ -94,11 +91,6 @@ def shard_batch(batch: Batch) -> Batch:
 def _to_devices(tree: Any, spec: PartitionSpec) -> Any:
     sharding = NamedSharding(batch_mesh(), spec)
     return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), tree)
-
-
-def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """Return the descriptors of the samples of a batch."""
-    return describe_strips(expand(batch, region_sets(network).weights, config), network, config)
 
 
 def _replicated(tree: Any) -> Any:
@@ -205,7 +197,7 @@ def fit(
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, or resume from the last checkpoint.
 
-    Samples are expanded to descriptors on the devices, one batch at a time.
+    The descriptors of the samples are computed on the devices, one batch at a time.
 
     Args:
         samples: training samples and held-out set; the same in all processes.
@@ -225,6 +217,7 @@ def fit(
         OSError: a checkpoint cannot be written. The last complete one is kept.
     """
     n_devices, rows = jax.device_count(), np.arange(len(samples)) if rows is None else rows
+    network, config = context.network, context.config
     is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
     train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]
     least = max(2, n_devices)
@@ -234,17 +227,17 @@ def fit(
         )
     batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
     steps = Steps(options.epochs, len(train_rows) // batch_size, batch_size)
-    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
-    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
-    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
-    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
+    n_inputs = input_size(context.feature, config, network.n_regions)
+    model = MLP(n_inputs, int(samples.label.max()) + 1, rngs=nnx.Rngs(options.seed))
+    chosen = train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES]
+    model.input_scale[...] = scale_inputs(samples.take(chosen, network, config), context.feature, network, config)
     graph, initial = initial_state(model, optax.adam(0.0))
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""
         chunk = batch_size // jax.process_count()
         for first in range(jax.process_index() * chunk, len(rows), batch_size):
-            yield shard_batch(samples.take(rows[first : first + chunk]))
+            yield shard_batch(samples.take(rows[first : first + chunk], network, config))
 
     def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, tuple[jax.Array, jax.Array]]]:
         # The order depends only on seed and epoch, so that a resumed fit needs no generator state.

@@ -1,34 +1,43 @@
-"""Training samples: normalized views, mirrored and cut into strips (paper, section "Training").
+"""Training samples: clouds, mirrored or in random orientations, and cut into strips (paper, section "Training").
 
-    samples = build_samples(ViewDataset.open("views"), network, config)
-    batch = samples.take(np.arange(256))                                  # padded host arrays
-    strips = expand(batch, region_sets(network).weights, config)          # on the device, under jit
+    samples, _ = sample_views(ViewDataset.open("views"), network, config)
+    batch = samples.take(np.arange(256), network, config)                    # padded host arrays
+    descriptors = describe_batch(batch, network, config)                     # on the device, under jit
 
-A sample stores the data for computing its descriptor: the length of each occupied strip, and the number of its points
-for each set of colour regions. This takes some hundred bytes instead of 48 kB for TOPS2.
+A sample stores only what is not zero in the strips of its cloud: a kilobyte instead of 48 kB for TOPS2.
 """
 
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import strips_by_sets
-from thor2_jax.descriptor.slicing import RegionSets, region_sets
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.view_normalization import mirror, turn
-from thor2_jax.errors import InputError
-from thor2_jax.types import Strips
+from thor2_jax.types import Cloud, Descriptors, Parameters, PointClouds, Strips
 from training.views.normalized_views import ViewSource, padded_batches, reorient
 
-__all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand"]
+__all__ = [
+    "MIRRORS",
+    "OF_CLASSIFIERS",
+    "OF_EMBEDDING",
+    "PAPER_MIRRORS",
+    "Batch",
+    "Form",
+    "Samples",
+    "describe_batch",
+    "sample_normalized",
+    "sample_views",
+]
 
 MIRRORS = ("", "x")
 """Mirrors of a normalized view that change its descriptor. A mirror in y changes no strip length and no count."""
@@ -36,176 +45,225 @@ MIRRORS = ("", "x")
 PAPER_MIRRORS = ("", "x", "y", "xy")
 """The four mirrors of the paper."""
 
-PADDING = np.iinfo(np.uint16).max
-"""Strip index of padding."""
+
+class Form(NamedTuple):
+    """Copies of each cloud, one sample each, and what is stored of them.
+
+    Attributes:
+        mirrors: axes of each mirrored copy, such as "xy".
+        orientations: number of copies in random orientations.
+        of_embedding: whether an embedding is fitted on the samples. They have statistics then, and are stored in
+            float16; otherwise, their strips are stored exactly.
+    """
+
+    mirrors: Sequence[str] = MIRRORS
+    orientations: int = 0
+    of_embedding: bool = False
+
+
+OF_CLASSIFIERS = Form()
+OF_EMBEDDING = Form((), orientations=2, of_embedding=True)
 
 
 class Batch(NamedTuple):
-    """B samples, padded to E strips and C colour counts; `expand` turns them into strips.
+    """B samples as host arrays, from which `describe_batch` computes the descriptors.
 
     Attributes:
-        strip: [B, E] uint16, slice x n_strips + strip; PADDING after the sample's last strip.
-        length: [B, E] float32, largest minus smallest y of the strip, scaled units.
-        color_strip: [B, C] uint16, strip of a colour count; PADDING after the sample's last count.
-        color_set: [B, C] uint16, set of colour regions that is counted.
-        color_count: [B, C] float32, number of points of the strip with this set (weights for a relaxed descriptor).
+        length: [B, S, J], largest minus smallest y of each strip, scaled units; 0 for an empty strip.
+        color: [B, S, J, R], colour vectors of the strips.
+        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics` and `balanced_histogram`; [B, 0] unless
+            the samples are of an embedding.
         label: [B] int32.
     """
 
-    strip: Any
     length: Any
-    color_strip: Any
-    color_set: Any
-    color_count: Any
+    color: Any
+    statistics: Any
     label: Any
 
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """Training samples in compact form, as host arrays: the fields of `Batch` for one sample after the other.
+    """Samples in compact form, one after the other: the values of `length` and `color` in a batch that are not zero.
 
     Attributes:
-        strip_start: [M + 1] int64, index of each sample's first entry in `strip` and `length`; the last one is T.
-        color_start: [M + 1] int64, index of each sample's first colour count; the last one is U.
-        strip: [T] uint16.
-        length: [T] float32.
-        color_strip: [U] uint16.
-        color_set: [U] uint16.
-        color_count: [U] float32.
-        label: [M] int32, index into `classes`.
-        view: [M] int32, index of the view among the views of its object; mirrored and augmented copies share it.
-        classes: class names.
+        lengths: [M] int64, number of lengths of each sample.
+        strip: [T] uint32, index of each length among the strips of its sample, slice x J + strip.
+        length: [T] float32, or float16 for an embedding.
+        colors: [M] int64, number of colour values of each sample.
+        cell: [U] uint32, index of each colour value in its sample, strip x R + region.
+        color: [U] float32, or float16 for an embedding.
+        statistics: as in a batch, [M, ...].
+        label: [M] int32.
+        view: [M] int32, index of the view among the views of its object; all copies of a view share it.
     """
 
-    strip_start: NDArray[np.int64]
-    color_start: NDArray[np.int64]
-    strip: NDArray[np.uint16]
-    length: NDArray[np.float32]
-    color_strip: NDArray[np.uint16]
-    color_set: NDArray[np.uint16]
-    color_count: NDArray[np.float32]
+    lengths: NDArray[np.int64]
+    strip: NDArray[np.uint32]
+    length: NDArray[np.floating[Any]]
+    colors: NDArray[np.int64]
+    cell: NDArray[np.uint32]
+    color: NDArray[np.floating[Any]]
+    statistics: NDArray[np.float32]
     label: NDArray[np.int32]
     view: NDArray[np.int32]
-    classes: tuple[str, ...]
+
+    @classmethod
+    def concatenated(cls, chunks: Sequence["Samples"]) -> "Samples":
+        """Return the samples of all chunks, of which there must be at least one."""
+        return cls(**{name: np.concatenate([chunk.arrays()[name] for chunk in chunks]) for name in chunks[0].arrays()})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return field name -> array."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def __len__(self) -> int:
         return len(self.label)
 
     @functools.cached_property
-    def _most(self) -> tuple[int, int]:
-        return int(np.diff(self.strip_start).max()), int(np.diff(self.color_start).max())
+    def _ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.cumsum(self.lengths), np.cumsum(self.colors)
 
-    def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
-        """Return the samples with the given indices, padded to the largest size of all samples."""
-        strips, in_strips = _entries(self.strip_start, rows, self._most[0])
-        colors, in_colors = _entries(self.color_start, rows, self._most[1])
-        strip = np.where(in_strips, self.strip[strips], PADDING)
-        color_strip = np.where(in_colors, self.color_strip[colors], PADDING)
-        counts = self.color_set[colors], self.color_count[colors]
-        return Batch(strip, self.length[strips], color_strip, *counts, self.label[rows])
+    def select(self, rows: NDArray[np.integer[Any]]) -> "Samples":
+        """Return the samples with the given indices."""
+        lengths, colors = self.lengths[rows], self.colors[rows]
+        of_length, of_color = (
+            np.arange(counts.sum()) + np.repeat(ends[rows] - np.cumsum(counts), counts)
+            for counts, ends in zip((lengths, colors), self._ends, strict=True)
+        )
+        return Samples(
+            *(lengths, self.strip[of_length], self.length[of_length]),
+            *(colors, self.cell[of_color], self.color[of_color]),
+            *(self.statistics[rows], self.label[rows], self.view[rows]),
+        )
+
+    def take(self, rows: NDArray[np.integer[Any]], network: ColorNetwork, config: DescriptorConfig) -> Batch:
+        """Return the samples with the given indices as a batch.
+
+        Args:
+            rows: the indices.
+            network: colour network of the samples.
+            config: descriptor of the samples, or one with fewer slices, to which the batch is cut.
+        """
+        chosen, grid = self.select(rows), (config.n_slices, config.n_strips)
+        length = _dense(chosen.lengths, chosen.strip, chosen.length, grid)
+        color = _dense(chosen.colors, chosen.cell, chosen.color, (*grid, network.n_regions))
+        return Batch(length, color, chosen.statistics, chosen.label)
+
+    def batches(
+        self, rows: NDArray[np.integer[Any]], size: int, network: ColorNetwork, config: DescriptorConfig
+    ) -> Iterator[Batch]:
+        """Yield the samples with the given indices in batches of one size; the last one is filled with the first."""
+        for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
+            yield self.take(chunk, network, config)
 
 
-def _entries(
-    start: NDArray[np.int64], rows: NDArray[np.integer[Any]], most: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices [B, most] of the rows' entries, and a mask of those that are not padding."""
-    index = start[rows, None] + np.arange(most)
-    inside = index < start[rows + 1, None]
-    return np.where(inside, index, 0), inside
+def _sparse(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return the values [n, ...] of samples that are not zero: the number of each sample, their indices and values."""
+    flat = values.reshape(len(values), -1)
+    sample, index = np.nonzero(flat)
+    return np.bincount(sample, minlength=len(flat)), index.astype(np.uint32), flat[sample, index]
 
 
-def build_samples(
+def _dense(
+    counts: NDArray[np.int64], index: NDArray[np.uint32], value: NDArray[Any], shape: tuple[int, ...]
+) -> NDArray[Any]:
+    """Return the values [n, *shape] of samples, the inverse of `_sparse`; indices past the shape are left out."""
+    dense = np.zeros((len(counts), math.prod(shape)), value.dtype)
+    sample, inside = np.repeat(np.arange(len(counts)), counts), index < dense.shape[1]
+    dense[sample[inside], index[inside]] = value[inside]
+    return dense.reshape(-1, *shape)
+
+
+def describe_batch(
+    batch: Batch, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
+) -> Descriptors:
+    """Return the descriptors of the samples of a batch; the arguments are those of `describe_strips`."""
+    length, color = jnp.asarray(batch.length, jnp.float32), jnp.asarray(batch.color, jnp.float32)
+    occupied = length > 0  # the pair of a strip with one point has no persistence and adds nothing to the image
+    strips = Strips(jnp.zeros_like(length), length, occupied, color, jnp.zeros(len(length), jnp.int32))
+    return describe_strips(strips, network, config, parameters)
+
+
+def sample_normalized(
+    batches: Iterable[tuple[int, PointClouds]],
+    label: NDArray[np.int32],
+    view: NDArray[np.int32],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    rng: np.random.Generator,
+    form: Form,
+) -> Samples:
+    """Return the samples of normalized clouds.
+
+    Args:
+        batches: at least one number of clouds and batch of normalized clouds, as from `padded_batches`.
+        label: [M], label of each cloud.
+        view: [M], index of each view among the views of its object.
+        network: colour network.
+        config: descriptor. Static.
+        rng: generator of the orientations.
+        form: form of the samples.
+    """
+    chunks: list[Samples] = []
+    done = 0
+    for count, normal in batches:
+        named = label[done : done + count], view[done : done + count]
+        if form.of_embedding:
+            sides, balanced = jnp.max(normal.points, axis=1), balanced_histogram(normal.colors, normal.mask)
+        mirrored = (mirror(normal, axes) for axes in form.mirrors)
+        for copy in itertools.chain(mirrored, (reorient(normal, rng) for _ in range(form.orientations))):
+            cut = strips(turn(copy, config), network, config)
+            length = np.where(cut.occupied, cut.high - cut.low, 0)[:count]
+            color, statistics = np.asarray(cut.color)[:count], np.zeros((count, 0), np.float32)
+            if form.of_embedding:
+                length, color = length.astype(np.float16), color.astype(np.float16)
+                statistics = np.hstack([cloud_statistics(sides, normal, cut), balanced])[:count]
+            chunks.append(Samples(*_sparse(length), *_sparse(color), statistics, *named))
+        done += count
+    return Samples.concatenated(chunks)
+
+
+def sample_views(
     source: ViewSource,
     network: ColorNetwork,
     config: DescriptorConfig,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-    mirrors: Sequence[str] = MIRRORS,
-    orientations: int = 0,
+    form: Form = OF_CLASSIFIERS,
     seed: int = 0,
-) -> Samples:
-    """Mirror every view and compute its strips, reading one shard of views at a time.
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    held_out: Mapping[int, NDArray[np.integer[Any]]] = {},
+) -> tuple[Samples, list[tuple[int, Cloud]]]:
+    """Sample normalized views, except those of the held-out set, reading one shard of views at a time.
 
     Args:
         source: normalized views.
-        network: colour network that defines the regions.
+        network: colour network.
         config: descriptor. Static.
-        progress: called with (views done, number of views).
-        mirrors: axes of each mirror, such as "xy"; each mirror gives one sample.
-        orientations: number of additional samples of each view, in random orientations.
+        form: form of the samples; by default for classifiers.
         seed: seed for the orientations.
-
-    Raises:
-        InputError: there are fewer than two classes, a class has no views, or the source is unreadable.
-    """
-    if len(source.classes) < 2:
-        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
-    for label, name in enumerate(source.classes):
-        if not any(shard.label == label and shard.views for shard in source.shards):
-            raise InputError(f"class {name!r} has no views; render more views or leave it out")
-    sets = region_sets(network)
-    # With one "region" per set, colour vectors count the sets, so they are sparse with integer values.
-    counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
-    chunks: list[dict[str, NDArray[Any]]] = []
-    all_done, total = 0, sum(shard.views for shard in source.shards)
-    for index, shard in enumerate(source.shards):
-        views, rng = source.read(index), np.random.default_rng([seed, index])
-        done = 0
-        for count, normal in padded_batches(views.clouds()):
-            copies = (mirror(normal, axes) for axes in mirrors)
-            for copy in itertools.chain(copies, (reorient(normal, rng) for _ in range(orientations))):
-                strips = strips_by_sets(turn(copy, config), counting, config)
-                compact = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], strips))  # noqa: B023
-                compact["label"] = np.full(count, shard.label, np.int32)
-                chunks.append(compact | {"view": views.view[done : done + count]})
-            done += count
-            progress(all_done + done, total)
-        all_done += done
-    fields = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
-    for name in ("strip", "color"):
-        fields[f"{name}_start"] = np.concatenate([[0], np.cumsum(fields.pop(f"{name}_entries"), dtype=np.int64)])
-    return Samples(classes=tuple(source.classes), **fields)
-
-
-def _compact(strips: Strips) -> dict[str, NDArray[Any]]:
-    n_samples = len(strips.low)
-    occupied = np.asarray(strips.occupied).reshape(n_samples, -1)
-    counts = np.asarray(strips.color).reshape(*occupied.shape, -1)
-    sample, strip = np.nonzero(occupied)
-    # Only a tenth of the strips is occupied.
-    entry, color_set = np.nonzero(counts[sample, strip])
-    return {
-        "strip": strip.astype(np.uint16),
-        "length": (strips.high - strips.low).reshape(n_samples, -1)[sample, strip],
-        "strip_entries": occupied.sum(axis=1),
-        "color_strip": strip[entry].astype(np.uint16),
-        "color_set": color_set.astype(np.uint16),
-        "color_count": counts[sample[entry], strip[entry], color_set],
-        "color_entries": np.bincount(sample[entry], minlength=n_samples),
-    }
-
-
-def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> Strips:
-    """Return the strips of a batch, fields [B, S, J] and [B, S, J, R], for `describe_strips`; call it under jit.
-
-    Args:
-        batch: batch from `Samples.take`.
-        set_weights: [K, R], region weights of each set of regions (`RegionSets.weights`).
-        config: descriptor. Static.
+        progress: called with (views done, number of views).
+        held_out: label -> indices of the views of the held-out set; by default there is none.
 
     Returns:
-        The strips. `low` is 0 and `high` is the length of a strip, since descriptors depend on the length only.
-        `overflow` is 0.
+        The samples, and the label and the cloud (in metres) of each view of the held-out set. The clouds have no rim
+        and no boundary.
+
+    Raises:
+        InputError: the source is unreadable.
     """
-    shape = config.n_slices, config.n_strips
-    n_strips, n_regions = shape[0] * shape[1], set_weights.shape[1]
-
-    def one(sample: Batch) -> Strips:
-        # Indices out of range, such as padding, are dropped.
-        high = jnp.zeros(n_strips, jnp.float32).at[sample.strip].set(sample.length, mode="drop")
-        occupied = jnp.zeros(n_strips, bool).at[sample.strip].set(True, mode="drop")
-        weights = sample.color_count[:, None] * set_weights[sample.color_set]
-        color = jnp.zeros((n_strips, n_regions), jnp.float32).at[sample.color_strip].add(weights, mode="drop")
-        low, overflow = jnp.zeros(shape, jnp.float32), jnp.zeros((), jnp.int32)
-        return Strips(low, high.reshape(shape), occupied.reshape(shape), color.reshape(*shape, n_regions), overflow)
-
-    return jax.vmap(one)(batch)
+    chunks: list[Samples] = []
+    kept: list[tuple[int, Cloud]] = []
+    done, total = 0, sum(shard.views for shard in source.shards)
+    for index, shard in enumerate(source.shards):
+        views, rng = source.read(index), np.random.default_rng([seed, index])
+        is_kept = np.isin(views.view, held_out.get(shard.label, []))
+        clouds, view = list(itertools.compress(views.clouds(), ~is_kept)), views.view[~is_kept]
+        if clouds:
+            label = np.full(len(clouds), shard.label, np.int32)
+            chunks.append(sample_normalized(padded_batches(clouds), label, view, network, config, rng, form))
+        for xyz, rgb in itertools.compress(views.clouds(), is_kept):
+            # The slice is copied, since it would keep all views of the shard in memory.
+            kept.append((shard.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
+        done += len(views)
+        progress(done, total)
+    return Samples.concatenated(chunks), kept

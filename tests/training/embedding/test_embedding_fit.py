@@ -21,11 +21,12 @@ from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.networks import EmbeddingSizes, model_arrays
 from training.embedding import build, fit
-from training.embedding import samples as module
+from training.embedding import distractors as module
 from training.embedding.build import build_embedding
+from training.embedding.distractors import render_clouds, sample_objects
 from training.embedding.fit import fit_embedding
-from training.embedding.samples import Samples, build_samples, render_clouds, sample_clouds
 from training.fitting.loop import Checkpoints
+from training.fitting.samples import OF_EMBEDDING, Samples, describe_batch
 from training.views import normalized_views
 
 NETWORK = colornet.load_default()
@@ -48,7 +49,7 @@ def small_batches() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
-    return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, views=6, directory=tmp_path_factory.mktemp("samples"))
+    return sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, views=6, directory=tmp_path_factory.mktemp("samples"))
 
 
 def test_views_depend_on_their_object_only() -> None:
@@ -60,26 +61,25 @@ def test_views_depend_on_their_object_only() -> None:
 
 def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
-    monkeypatch.setattr(module, "COPIES", 1)
-    repeated = build_samples([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, directory=tmp_path)
+    monkeypatch.setattr(module, "OF_EMBEDDING", OF_EMBEDDING._replace(orientations=1))
+    repeated = sample_objects([5, 10, 5], NETWORK, SMALL_CONFIG, views=2, directory=tmp_path)
     assert sorted(repeated.label) == [0, 0, 0, 0, 1, 1]
     first = repeated.statistics[repeated.label == 0]
     assert len(np.unique(first, axis=0)) == 4
 
 
-def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(
         normalized_views, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
     )
     rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
-    rng = np.random.default_rng(0)
-    samples = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, rng)
+    samples = sample_objects([0, 10], NETWORK, SMALL_CONFIG, 3, directory=tmp_path)
     rows = np.array([5, 0, 5, 1, 2])
-    batch = samples.take(rows, SMALL_CONFIG)
+    batch = samples.take(rows, NETWORK, SMALL_CONFIG)
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     normal = thor2.view_normalize(thor2.PointClouds.pack([rendered[k][1] for k in order[rows]]), SMALL_CONFIG)
-    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
+    descriptors = describe_batch(batch, NETWORK, embedding.config)
     actual = whole_embedding(nnx.merge(*embedding._embedder), descriptors, batch.statistics)
     similarity = []
     for mirror in ("", "x"):
@@ -96,19 +96,20 @@ def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.M
     done = []
     pool = lambda function, tasks: (function(t) for t in tasks)  # noqa: E731
     show = lambda *numbers: done.append(numbers)  # noqa: E731
-    pooled = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=pool, directory=tmp_path / "pooled")
-    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show, directory=tmp_path / "whole")
+    pooled = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=pool, directory=tmp_path / "pooled")
+    whole = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show, directory=tmp_path / "whole")
     assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
     np.testing.assert_equal(vars(pooled), vars(whole))
     rows = np.array([5, 0, 5])
-    chosen, batch = whole.select(rows), whole.take(rows, SMALL_CONFIG)
-    np.testing.assert_equal(chosen.take(np.arange(3), SMALL_CONFIG), batch)
-    np.testing.assert_array_equal((batch.color != 0).any(axis=-1).sum(axis=(1, 2)), chosen.strips)
+    chosen, batch = whole.select(rows), whole.take(rows, NETWORK, SMALL_CONFIG)
+    np.testing.assert_equal(chosen.take(np.arange(3), NETWORK, SMALL_CONFIG), batch)
+    np.testing.assert_array_equal((batch.length != 0).sum(axis=(1, 2)), chosen.lengths)
+    np.testing.assert_array_equal((batch.color != 0).sum(axis=(1, 2, 3)), chosen.colors)
 
 
 def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
-    whole = build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, directory=tmp_path / "whole")
+    whole = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, directory=tmp_path / "whole")
     rendered: list[int] = []
     done: list[Any] = []
 
@@ -121,7 +122,7 @@ def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.M
 
     def render() -> Samples:
         show = lambda *numbers: done.append(numbers)  # noqa: E731
-        return build_samples(OBJECTS, NETWORK, SMALL_CONFIG, 2, stopped, show, directory=tmp_path / "samples")
+        return sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, stopped, show, directory=tmp_path / "samples")
 
     with pytest.raises(Interrupted):
         render()
@@ -146,8 +147,8 @@ def fitted(views: Samples, tmp_path_factory: pytest.TempPathFactory) -> tuple[Em
 def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
     embedding, losses = fitted
     assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
-    batch = views.take(np.arange(len(views)), SMALL_CONFIG)
-    descriptors = fit.describe_batch(batch, NETWORK, embedding.config)
+    batch = views.take(np.arange(len(views)), NETWORK, SMALL_CONFIG)
+    descriptors = describe_batch(batch, NETWORK, embedding.config)
     same = batch.label[:, None] == batch.label
     gaps = []
     for one in (Embedding.create(SMALL_CONFIG, sizes=SIZES), embedding):
@@ -181,7 +182,7 @@ def test_too_few_samples_and_invisible_objects_are_refused(
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
     assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1, Checkpoints(tmp_path))
     monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
-    assert_refused("object 3 has no view", build_samples, [3], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
+    assert_refused("object 3 has no view", sample_objects, [3], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
 
 
 def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:

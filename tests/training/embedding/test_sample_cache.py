@@ -16,19 +16,22 @@ import colornet
 import thor2_jax as thor2
 import training
 from training.embedding import distractors as module
-from training.embedding.distractors import Distractors, distractor_samples
-from training.embedding.samples import Samples, samples_record
+from training.embedding.distractors import Distractors, distractor_samples, samples_record
+from training.fitting.samples import Samples
 from training.storage.jobs import locked
 
 NETWORK = colornet.load_default()
 
 SAMPLES = Samples(
-    strips=np.array([2, 1]),
-    strip=np.array([1, 4, 2], np.uint16),
+    lengths=np.array([2, 1]),
+    strip=np.array([1, 4, 2], np.uint32),
     length=np.array([0.1, 0.2, 0.3], np.float16),
-    color=np.arange(6, dtype=np.float16).reshape(3, 2),
+    colors=np.array([1, 3]),
+    cell=np.array([1, 2, 4, 5], np.uint32),
+    color=np.arange(4, dtype=np.float16),
     statistics=np.ones((2, 14), np.float32),
     label=np.array([0, 1], np.int32),
+    view=np.zeros(2, np.int32),
 )
 
 
@@ -46,10 +49,10 @@ def counted(tmp_path: Path) -> Callable[..., int]:
 
     def get(number: int = 0) -> int:
         distractors = Distractors(procedural=10 + number)
-        with mock.patch.object(module, "build_samples", return_value=SAMPLES) as build:
+        with mock.patch.object(module, "sample_objects", return_value=SAMPLES) as build:
             samples = distractor_samples(distractors, tmp_path / "new", NETWORK, SMALL_CONFIG, lambda *values: None)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
-        assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint16)
+        assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint32)
         return build.call_count
 
     return get
@@ -103,7 +106,7 @@ def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callab
     [
         lambda content: content[:-5],
         lambda content: content[:-1] + bytes([content[-1] ^ 1]),
-        lambda content: content.replace(b'"strips"', b'"strip_"'),
+        lambda content: content.replace(b'"lengths"', b'"length_"'),
         lambda content: b"a user's",
     ],
 )

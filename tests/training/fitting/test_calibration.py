@@ -21,7 +21,7 @@ from thor2_jax.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.fit import FitContext
-from training.fitting.samples import MIRRORS, build_samples
+from training.fitting.samples import MIRRORS, sample_views
 from training.views.normalized_views import MemoryViews, padded_batches
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -38,7 +38,7 @@ def source(views: int) -> MemoryViews:
 def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
     views = source(2)
-    samples = build_samples(views, NETWORK, CONFIG)
+    samples, _ = sample_views(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     rows = np.array([7, 0, 7, 3, 5])
     monkeypatch.setitem(sys.modules, "gudhi", None)  # a fit does not need it, whatever the descriptor of the run

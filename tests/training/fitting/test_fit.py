@@ -15,12 +15,11 @@ from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.networks import MLP, model_arrays
 from training.fitting import loop
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
-from training.fitting.samples import Batch, Samples, build_samples, expand
+from training.fitting.samples import Samples, describe_batch, sample_views
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -40,7 +39,7 @@ BOXES = {"long": ((0.2, 0.05, 0.05), 0), "short": ((0.06, 0.05, 0.05), 0), "whit
 def separable() -> Samples:
     """Return 48 samples of three classes, which differ in shape or colour."""
     views = {name: random_clouds(k, [200] * 8, *box) for k, (name, box) in enumerate(BOXES.items())}
-    return build_samples(MemoryViews(views, CONFIG), NETWORK, CONFIG)
+    return sample_views(MemoryViews(views, CONFIG), NETWORK, CONFIG)[0]
 
 
 @pytest.fixture
@@ -56,13 +55,13 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     return run
 
 
-@jax.jit
-def describe_batch(batch: Batch) -> thor2.Descriptors:
-    return thor2.describe_strips(expand(batch, region_sets(NETWORK).weights, CONFIG), NETWORK, CONFIG)
+def descriptors(samples: Samples) -> np.ndarray:
+    batch = samples.take(np.arange(len(samples)), NETWORK, CONFIG)
+    return np.asarray(describe_batch(batch, NETWORK, TOPS2.config).tops2)
 
 
 def answers(model: MLP, samples: Samples) -> np.ndarray:
-    return np.asarray(jax.jit(model)(describe_batch(samples.take(np.arange(len(samples)))).tops2).argmax(axis=1))
+    return np.asarray(jax.jit(model)(descriptors(samples)).argmax(axis=1))
 
 
 def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
@@ -113,7 +112,7 @@ def test_the_second_half_of_a_fit_has_the_second_learning_rate(fitted: Fit) -> N
 
 def test_inputs_are_scaled_per_block_to_unit_root_mean_square(separable: Samples, fitted: Fit) -> None:
     model, _ = fitted(options=FitOptions(epochs=1))
-    blocks = np.asarray(model.input_scale[...]) * np.asarray(describe_batch(separable.take(np.arange(48))).tops2)
+    blocks = np.asarray(model.input_scale[...]) * descriptors(separable)
     for block in np.split(blocks.reshape(48, 2, 144 + 110), [144], axis=2):
         assert np.sqrt((block.astype(np.float64) ** 2).mean()) == pytest.approx(1, rel=1e-4)
 
@@ -130,7 +129,7 @@ def test_few_samples_make_one_batch_and_one_is_refused(separable: Samples, fitte
 
 
 def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Samples, tmp_path: Path) -> None:
-    broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
+    broken = dataclasses.replace(separable, color=separable.color * np.nan)
     fit(separable, TOPS2, dataclasses.replace(QUICK, epochs=2), Checkpoints(tmp_path / "c"))
     assert_refused("loss of tops2 is nan .*3", fit, broken, TOPS2, QUICK, Checkpoints(tmp_path / "c"))
     assert Checkpoints(tmp_path / "c").last_epoch == 2

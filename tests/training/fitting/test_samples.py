@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from refusals import assert_refused
@@ -13,17 +12,13 @@ from small_clouds import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import region_sets
 from thor2_jax.types import Cloud
-from training.fitting.samples import PAPER_MIRRORS, build_samples, expand
+from training.fitting.samples import PAPER_MIRRORS, Form, describe_batch, sample_views
 from training.views import normalized_views
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
-
-
-expand_batch = jax.jit(lambda batch, config: expand(batch, region_sets(NETWORK).weights, config), static_argnums=1)
 
 
 @pytest.mark.parametrize(
@@ -43,16 +38,21 @@ def test_every_view_is_used_mirrored_in_four_ways(
     monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []
-    samples = build_samples(source, NETWORK, config, lambda *done: progress.append(done), PAPER_MIRRORS)
-    assert samples.classes == ("mug", "box") and len(samples) == 16
-    assert progress == [(2, 4), (3, 4), (4, 4)]
+    show = lambda *done: progress.append(done)  # noqa: E731
+    samples, kept = sample_views(source, NETWORK, config, Form(PAPER_MIRRORS), progress=show)
+    assert len(samples) == 16 and kept == []
+    assert progress == [(3, 4), (4, 4)]
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
     assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
     if config is CONFIG:
-        points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
+        points = np.add.reduceat(samples.color, np.cumsum(samples.colors) - samples.colors)
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
-        assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
-    descriptors = thor2.describe_strips(expand_batch(samples.take(np.arange(16)), config), NETWORK, config)
+        assert samples.color.dtype == samples.length.dtype == np.float32
+    batch = samples.take(np.arange(16), NETWORK, config)
+    lowest = samples.take(np.arange(16), NETWORK, dataclasses.replace(config, n_slices=1))  # as THOR takes them
+    np.testing.assert_array_equal(lowest.length, batch.length[:, :1])
+    np.testing.assert_array_equal(lowest.color, batch.color[:, :1])
+    descriptors = describe_batch(batch, NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))
@@ -76,14 +76,14 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     chunks = [first, second, whole.read(1)]
     shards = [SourceShard(each.label, len(each)) for each in chunks]
     source: Any = SimpleNamespace(classes=whole.classes, shards=shards, read=chunks.__getitem__)
-    samples = build_samples(source, NETWORK, CONFIG)
+    samples, _ = sample_views(source, NETWORK, CONFIG)
     keys = zip(samples.label.tolist(), samples.view.tolist(), strict=True)
     assert sorted(keys) == sorted([(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2)
-    expected = build_samples(whole, NETWORK, CONFIG)
-    np.testing.assert_array_equal(np.sort(samples.color_count), np.sort(expected.color_count))
+    expected, _ = sample_views(whole, NETWORK, CONFIG)
+    np.testing.assert_array_equal(np.sort(samples.color), np.sort(expected.color))
     np.testing.assert_allclose(np.sort(samples.length), np.sort(expected.length), atol=1e-6)
-    fields = [getattr(samples, f.name) for f in dataclasses.fields(samples) if f.name != "classes"]
-    assert sum(a.nbytes for a in fields) / len(samples) < 4 * 11942 / 15  # a fifteenth of the TOPS2 descriptor
+    size = sum(array.nbytes for array in samples.arrays().values())
+    assert size / len(samples) < 4 * 11942 / 15  # a fifteenth of the TOPS2 descriptor
 
 
 def test_the_digest_is_that_of_the_views() -> None:
