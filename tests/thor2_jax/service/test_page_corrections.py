@@ -149,7 +149,7 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
     expect(chosen).to_have_attribute("data-label", "200")
     expect(page.locator("#details-title")).to_have_text("blue teapot")
     expect(page.locator("#notice-text")).to_contain_text("“blue teapot” is enrolled")
-    expect(page.locator("#confidence-help")).to_contain_text("enrolled object is the answer only if its score is high")
+    expect(page.locator("#confidence-help")).to_contain_text("enrolled object is the answer if its score is high")
     expect(page.locator("#name-label")).to_have_text("Correct the name")
     expect(page.locator("#classes li").last).to_have_text("blue teapot")
 
