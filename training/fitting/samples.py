@@ -23,6 +23,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.view_normalization import mirror, turn
+from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud, Descriptors, Parameters, PointClouds, Strips
 from training.views.normalized_views import ViewSource, padded_batches, reorient
 
@@ -34,6 +35,7 @@ __all__ = [
     "Batch",
     "Form",
     "Samples",
+    "check_classes",
     "describe_batch",
     "sample_normalized",
     "sample_views",
@@ -222,6 +224,15 @@ def sample_normalized(
             chunks.append(Samples(*_sparse(length), *_sparse(color), statistics, *named))
         done += count
     return Samples.concatenated(chunks)
+
+
+def check_classes(source: ViewSource) -> None:
+    """Raise InputError if there are fewer than two classes, or a class has no views."""
+    if len(source.classes) < 2:
+        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
+    for label, name in enumerate(source.classes):
+        if not any(shard.label == label and shard.views for shard in source.shards):
+            raise InputError(f"class {name!r} has no views; render more views or leave it out")
 
 
 def sample_views(
