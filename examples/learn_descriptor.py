@@ -41,7 +41,7 @@ from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
 from training.fitting.fit import scale_inputs
 from training.fitting.loop import FitOptions
-from training.fitting.samples import Batch, Samples, describe_batch, sample_views
+from training.fitting.samples import Batch, Samples, check_classes, describe_batch, sample_views
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder
@@ -232,6 +232,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
         if not any(name in objects for item in frames for name in item.truth.values()):
             raise thor2.InputError(f"{title} contains none of the objects to train on; expected at least one")
     source = MemoryViews(render_views(objects, options.azimuth_step, options.polar_step), CONFIG)
+    check_classes(source)
     samples, _ = sample_views(source, NETWORK, CONFIG)
     print(f"{len(samples)} samples of {len(objects)} objects, {time.perf_counter() - start:.0f} s", flush=True)
 

@@ -51,7 +51,7 @@ from training.fitting.loop import (
     read_metrics,
     wait_for_all,
 )
-from training.fitting.samples import OF_EMBEDDING, Form, Samples, sample_views
+from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
 from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
@@ -142,7 +142,7 @@ def train_run(
             locks.enter_context(locked(out / CHECKPOINTS))
         samples: Samples | _Views
         if settings.classifiers:
-            _check_classes(source)
+            check_classes(source)
             form, show = Form(settings.mirrors, settings.orientation_copies), of_stage(progress, DESCRIBE, "views")
             samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
         else:  # only the distribution of the views among the folds is needed here
@@ -181,15 +181,6 @@ def _labelled_views(source: ViewSource) -> _Views:
     views = [source.read(index).view for index in range(len(source.shards))]
     labels = np.repeat([shard.label for shard in source.shards], [len(view) for view in views])
     return _Views(labels, np.concatenate(views))
-
-
-def _check_classes(source: ViewSource) -> None:
-    """Raise InputError if there are fewer than two classes, or a class has no views."""
-    if len(source.classes) < 2:
-        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
-    for label, name in enumerate(source.classes):
-        if not any(shard.label == label and shard.views for shard in source.shards):
-            raise InputError(f"class {name!r} has no views; render more views or leave it out")
 
 
 def _held_out_parts(samples: Samples | _Views, n_classes: int) -> int:

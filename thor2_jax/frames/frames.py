@@ -239,7 +239,7 @@ def decode_image(
     try:
         opened = Image.open(stream, formats=formats)
     except UnidentifiedImageError:  # whose message contains the Python object of the stream
-        raise ValueError("the first bytes are not those of an image") from None
+        raise ValueError("its first bytes are not those of an expected format") from None
     with opened as image:
         check_size(*image.size, max_pixels)
         if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):

@@ -64,10 +64,16 @@ def watch(
         if folder is None or segment:
             load()  # raises InputError if its package is missing, which frames with labels do not need
         segments = ["--segment", segment] if segment else []
+        not_loaded: list[InputError] = []
 
         def segment_unlabelled(frame: RGBDFrame) -> Any:
             segments[:] = "--segment", segment or TABLE
-            return segment_frame(frame, load())  # names the segmenter in its errors
+            try:
+                segmenter = load()
+            except InputError as error:
+                not_loaded.append(error)
+                raise
+            return segment_frame(frame, segmenter)  # names the segmenter in its errors
 
         frames: Iterator[RecordedFrame]
         if folder is not None:
@@ -91,6 +97,8 @@ def watch(
             for recorded in frames:
                 view.show(recorded)
                 n_shown += 1
+                if not_loaded:  # no other frame without labels could be segmented
+                    raise not_loaded[0]
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)

@@ -48,7 +48,7 @@ def sample_probabilities(
     graph, state = nnx.split(model)
     batches = samples.batches(rows, SAMPLES_PER_BATCH, context.network, context.config)
     chunks = [np.asarray(_probabilities(context, graph, state, batch)) for batch in batches]
-    return np.concatenate([np.zeros((0, int(samples.label.max()) + 1), np.float32), *chunks])[: len(rows)]
+    return np.concatenate([np.zeros((0, model.head.out_features), np.float32), *chunks])[: len(rows)]
 
 
 def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.integer[Any]]) -> float:

@@ -200,7 +200,7 @@ def fit(
     The descriptors of the samples are computed on the devices, one batch at a time.
 
     Args:
-        samples: training samples and held-out set; the same in all processes.
+        samples: training samples and held-out set, with samples of every class; the same in all processes.
         context: feature, colour network and descriptor.
         options: epochs, learning rates, seed and batch size, a multiple of the number of devices.
         checkpoints: checkpoints of this fit only, written after each epoch.

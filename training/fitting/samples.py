@@ -4,7 +4,7 @@
     batch = samples.take(np.arange(256), network, config)                    # padded host arrays
     descriptors = describe_batch(batch, network, config)                     # on the device, under jit
 
-A sample stores only what is not zero in the strips of its cloud: a kilobyte instead of 48 kB for TOPS2.
+A sample stores only the nonzero lengths and colours of its strips: about a kilobyte instead of 48 kB for TOPS2.
 """
 
 import dataclasses
@@ -23,6 +23,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.view_normalization import mirror, turn
+from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud, Descriptors, Parameters, PointClouds, Strips
 from training.views.normalized_views import ViewSource, padded_batches, reorient
 
@@ -34,6 +35,7 @@ __all__ = [
     "Batch",
     "Form",
     "Samples",
+    "check_classes",
     "describe_batch",
     "sample_normalized",
     "sample_views",
@@ -47,13 +49,13 @@ PAPER_MIRRORS = ("", "x", "y", "xy")
 
 
 class Form(NamedTuple):
-    """Copies of each cloud, one sample each, and what is stored of them.
+    """The copies of each cloud, of which each gives one sample, and the values that a sample stores.
 
     Attributes:
         mirrors: axes of each mirrored copy, such as "xy".
         orientations: number of copies in random orientations.
-        of_embedding: whether an embedding is fitted on the samples. They have statistics then, and are stored in
-            float16; otherwise, their strips are stored exactly.
+        of_embedding: whether the samples are for an embedding, which needs their statistics. Their strips are then
+            stored in float16, otherwise exactly.
     """
 
     mirrors: Sequence[str] = MIRRORS
@@ -71,8 +73,8 @@ class Batch(NamedTuple):
     Attributes:
         length: [B, S, J], largest minus smallest y of each strip, scaled units; 0 for an empty strip.
         color: [B, S, J, R], colour vectors of the strips.
-        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics` and `balanced_histogram`; [B, 0] unless
-            the samples are of an embedding.
+        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics` and `balanced_histogram`; [B, 0] for
+            classifiers.
         label: [B] int32.
     """
 
@@ -84,7 +86,7 @@ class Batch(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """Samples in compact form, one after the other: the values of `length` and `color` in a batch that are not zero.
+    """Samples in compact form: the nonzero values of `length` and `color` in a batch, one sample after the other.
 
     Attributes:
         lengths: [M] int64, number of lengths of each sample.
@@ -159,7 +161,7 @@ class Samples:
 
 
 def _sparse(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the values [n, ...] of samples that are not zero: the number of each sample, their indices and values."""
+    """Return the number of nonzero values of each sample [n, ...], their indices in the sample, and the values."""
     flat = values.reshape(len(values), -1)
     sample, index = np.nonzero(flat)
     return np.bincount(sample, minlength=len(flat)), index.astype(np.uint32), flat[sample, index]
@@ -197,9 +199,9 @@ def sample_normalized(
     """Return the samples of normalized clouds.
 
     Args:
-        batches: at least one number of clouds and batch of normalized clouds, as from `padded_batches`.
-        label: [M], label of each cloud.
-        view: [M], index of each view among the views of its object.
+        batches: number of clouds and batch of normalized clouds, as `padded_batches` yields them; at least one batch.
+        label: [M] int32, label of each cloud.
+        view: [M] int32, index of each view among the views of its object.
         network: colour network.
         config: descriptor. Static.
         rng: generator of the orientations.
@@ -224,6 +226,15 @@ def sample_normalized(
     return Samples.concatenated(chunks)
 
 
+def check_classes(source: ViewSource) -> None:
+    """Raise InputError if there are fewer than two classes, or a class has no views."""
+    if len(source.classes) < 2:
+        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
+    for label, name in enumerate(source.classes):
+        if not any(shard.label == label and shard.views for shard in source.shards):
+            raise InputError(f"class {name!r} has no views; render more views or leave it out")
+
+
 def sample_views(
     source: ViewSource,
     network: ColorNetwork,
@@ -231,12 +242,12 @@ def sample_views(
     form: Form = OF_CLASSIFIERS,
     seed: int = 0,
     progress: Callable[[int, int], object] = lambda done, total: None,
-    held_out: Mapping[int, NDArray[np.integer[Any]]] = {},
+    held_out: Mapping[int, NDArray[np.integer[Any]]] | None = None,
 ) -> tuple[Samples, list[tuple[int, Cloud]]]:
     """Sample normalized views, except those of the held-out set, reading one shard of views at a time.
 
     Args:
-        source: normalized views.
+        source: normalized views, of which at least one is not in the held-out set.
         network: colour network.
         config: descriptor. Static.
         form: form of the samples; by default for classifiers.
@@ -256,7 +267,7 @@ def sample_views(
     done, total = 0, sum(shard.views for shard in source.shards)
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
-        is_kept = np.isin(views.view, held_out.get(shard.label, []))
+        is_kept = np.isin(views.view, (held_out or {}).get(shard.label, []))
         clouds, view = list(itertools.compress(views.clouds(), ~is_kept)), views.view[~is_kept]
         if clouds:
             label = np.full(len(clouds), shard.label, np.int32)

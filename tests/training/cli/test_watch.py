@@ -52,6 +52,16 @@ def test_frames_with_labels_do_not_need_opencv(
     assert "needs OpenCV" in refused(*command, "--segment", "table")
 
 
+def test_a_frame_without_labels_needs_opencv(
+    model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "thor2_jax.segmentation.table", raising=False)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 2
+    assert [(one["state"], one.get("frame")) for one in messages][1:] == [("live", "0"), ("failed", "0")]
+    assert "needs OpenCV" in messages[-1]["message"]
+
+
 def test_ctrl_c_ends_the_command(
     model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,7 +39,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
     views = source(2)
     samples, _ = sample_views(views, NETWORK, CONFIG)
-    model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
+    model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 3, rngs=nnx.Rngs(0))  # the third class has no samples
     rows = np.array([7, 0, 7, 3, 5])
     monkeypatch.setitem(sys.modules, "gudhi", None)  # a fit does not need it, whatever the descriptor of the run
     context = FitContext(feature, NETWORK, dataclasses.replace(CONFIG, homology="gudhi"))
@@ -53,7 +53,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
             described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
             expected.append(np.asarray(probabilities_of(described))[:2])
     np.testing.assert_allclose(probabilities, np.concatenate(expected)[rows], atol=1e-5)
-    assert calibration.sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
+    assert calibration.sample_probabilities(model, samples, rows[:0], context).shape == (0, 3)
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])

@@ -85,6 +85,14 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     size = sum(array.nbytes for array in samples.arrays().values())
     assert size / len(samples) < 4 * 11942 / 15  # a fifteenth of the TOPS2 descriptor
 
+    held_out = {0: np.array([9]), 1: np.array([7])}  # the box has no view 7
+    fitted, kept = sample_views(source, NETWORK, CONFIG, held_out=held_out)
+    rest = samples.select(np.flatnonzero((samples.label == 1) | (samples.view == 7)))
+    np.testing.assert_equal(fitted.arrays(), rest.arrays())
+    ((label, (xyz, rgb)),) = kept
+    assert label == 0 and np.array_equal(rgb, second.rgb)
+    np.testing.assert_allclose(xyz * CONFIG.sigma_s, second.xyz, atol=1e-6)
+
 
 def test_the_digest_is_that_of_the_views() -> None:
     def digest(**clouds: list[Cloud]) -> str:

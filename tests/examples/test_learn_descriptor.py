@@ -1,0 +1,21 @@
+"""The example that learns parameters of the descriptor."""
+
+import runpy
+from argparse import Namespace
+from pathlib import Path
+
+from refusals import assert_refused
+
+from training.objects.builtin_objects import builtin_objects
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_one_object_is_refused(tmp_path: Path) -> None:
+    example = runpy.run_path(str(ROOT / "examples" / "learn_descriptor.py"))
+    name, mesh = next(iter(builtin_objects().items()))
+    compare = example["compare"]
+    compare.__globals__["load_sets"] = lambda options: ({name: mesh}, {})
+    options = Namespace(azimuth_step=180.0, polar_step=90.0, out=tmp_path)
+    assert_refused("views of 1 classes; expected at least two", compare, options, [])
+    assert not list(tmp_path.iterdir())
