@@ -194,8 +194,7 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
         f"Trained on {n_views:,} synthetic views of {n_objects} objects, evaluated on {N_SCENES} cluttered scenes "
         "as ten simulated cameras see them: with other light and colours, colour shifted against depth, noise and "
         "holes in depth, and masks that are too small or too large. "
-        f"The command took {summary.seconds:.0f} s, without earlier calls that were interrupted, and "
-        f"{summary.peak_gib:.1f} GiB of memory."
+        f"This call of the command took {summary.seconds:.0f} s and {summary.peak_gib:.1f} GiB of memory."
     )
     accuracy = (
         "Fraction of the instances that are recognized correctly. CE uses colour only, TOPS shape only, TOPS2 "

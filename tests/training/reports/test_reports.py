@@ -139,7 +139,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     printed = capsys.readouterr().out
     assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
     assert stages == {"stage 6 of 7: compose scenes": (6, 6), "stage 7 of 7: recognize scenes": (6, 6)}
-    assert "without earlier calls" in (tmp_path / "report.html").read_text()
+    assert "This call of the command took" in (tmp_path / "report.html").read_text()
     assert_refused("^out: ", run_demo, tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
     subsets = {name: count for name, count in summary.instances.items() if name != "all"}
