@@ -204,8 +204,10 @@ def images(
     if np.shape(pixels) != (2,) or not all(map(is_positive_integer, pixels)):
         raise InputError(f"pixels is {pixels!r}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
-        number = value if isinstance(value, jax.core.Tracer) else _real_numbers(value, (), dtype)
-        if number is None or (number is not value and not 0 < number < math.inf):
+        if isinstance(value, jax.core.Tracer):
+            continue
+        number = _real_numbers(value, (), dtype)
+        if number is None or not 0 < number < math.inf:
             raise InputError(f"{name} is {value!r}; expected a positive number")
     ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
     edges = (jnp.linspace(*bounds, n + 1, dtype=dtype) for bounds, n in ends)

@@ -178,8 +178,8 @@ def check_types(**arguments: object) -> None:
     """Raise InputError unless each argument has the type that belongs to its name."""
     for name, value in arguments.items():
         expected = _TYPES[name]
-        if not isinstance(value, expected) and not (name == "parameters" and value is None):
-            raise InputError(f"{name} is a {type(value).__name__}; expected a {expected.__name__}")
+        if not isinstance(value, expected):
+            raise InputError(f"{name} is a {type(value).__name__}; expected a {expected[0].__name__}")
 
 
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
@@ -333,10 +333,10 @@ class Parameters:
 
 
 _TYPES = {
-    "network": ColorNetwork,
-    "config": DescriptorConfig,
-    "parameters": Parameters,
-    "strips": Strips,
-    "diagrams": Diagrams,
+    "network": (ColorNetwork,),
+    "config": (DescriptorConfig,),
+    "parameters": (Parameters, type(None)),
+    "strips": (Strips,),
+    "diagrams": (Diagrams,),
 }
 """Types of the arguments that `check_types` checks."""

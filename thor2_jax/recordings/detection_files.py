@@ -8,7 +8,6 @@ with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) a
 import contextlib
 import io
 import os
-import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -69,6 +68,8 @@ def _check_folder(path: Path) -> None:
 @contextlib.contextmanager
 def _bag_errors(path: Path) -> Iterator[None]:
     """Turn errors of the files and the database of a bag into an OSError that names `path`."""
+    import sqlite3
+
     with errors_name(path):
         try:
             yield
