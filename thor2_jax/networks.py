@@ -21,7 +21,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import N_BALANCED, N_SCALARS, LookDescriptors
 from thor2_jax.descriptor.slicing import square_root
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors
+from thor2_jax.types import HIGHEST, Descriptors, matmul
 
 __all__ = [
     "EMBEDDING",
@@ -85,6 +85,8 @@ def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> in
 
 HIDDEN = (512, 256, 128, 64)
 
+Linear = partial(nnx.Linear, precision=HIGHEST)
+
 SPARSE_BATCH = 16
 """Largest batch whose first layer uses `_sparse_matmul`. Small batches take as long as reading the weights, about four
 fifths of which belong to inputs that are zero in every cloud of a frame."""
@@ -103,17 +105,17 @@ def _sparse_matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
     def gathered(capacity: int) -> jax.Array:
         row = jnp.nonzero(needed, size=capacity, fill_value=len(needed))[0]
         entries = x.at[:, row].get(mode="fill", fill_value=0)
-        return jnp.matmul(entries, kernel.at[row].get(mode="clip"))
+        return matmul(entries, kernel.at[row].get(mode="clip"))
 
     too_small = (needed.sum() > jnp.array(capacities)).sum()
-    return jax.lax.switch(too_small, [*[partial(gathered, n) for n in capacities], lambda: jnp.matmul(x, kernel)])
+    return jax.lax.switch(too_small, [*[partial(gathered, n) for n in capacities], lambda: matmul(x, kernel)])
 
 
 @_sparse_matmul.defjvp
 def _sparse_matmul_jvp(primals: Any, tangents: Any) -> Any:
     # A zero entry adds nothing to the product, but its derivative is not zero.
     (x, kernel), (x_dot, kernel_dot) = primals, tangents
-    return _sparse_matmul(x, kernel), jnp.matmul(x_dot, kernel) + jnp.matmul(x, kernel_dot)
+    return _sparse_matmul(x, kernel), matmul(x_dot, kernel) + matmul(x, kernel_dot)
 
 
 class MLP(nnx.Module):
@@ -128,10 +130,10 @@ class MLP(nnx.Module):
         """Initialize the weights for inputs [B, n_inputs] and logits [B, n_classes]."""
         sizes = (n_inputs, *HIDDEN)
         self.input_scale = nnx.BatchStat(jnp.ones(n_inputs))
-        self.layers = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
+        self.layers = nnx.List([Linear(a, b, rngs=rngs) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in HIDDEN])
         self.dropout = nnx.Dropout(dropout)
-        self.head = nnx.Linear(HIDDEN[-1], n_classes, rngs=rngs)
+        self.head = Linear(HIDDEN[-1], n_classes, rngs=rngs)
 
     def __call__(self, x: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None) -> jax.Array:
         """Return the logits [B, n_classes] of descriptors [B, n_inputs].
@@ -215,12 +217,12 @@ class EmbeddingNetwork(nnx.Module):
         n_cells = config.n_slices * self.positions
         widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
         he = nnx.initializers.he_normal()
-        self.cell = nnx.Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
-        layers = [nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs) for a, b in itertools.pairwise(widths)]
+        self.cell = Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
+        layers = [Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs) for a, b in itertools.pairwise(widths)]
         self.layers = nnx.List(layers)
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
         self.dropout = nnx.Dropout(0.15)
-        self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
+        self.head = Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
         n_strips, cells = n_regions * config.n_strips, -(-config.image_size // 2)
         n_features = config.n_slices * n_strips, N_BALANCED, config.n_slices * cells**2  # each version adds one
         self.color_basis = nnx.BatchStat(jnp.zeros((sum(n_features[: sizes.version + 1]), sizes.color)))
@@ -263,7 +265,7 @@ class EmbeddingNetwork(nnx.Module):
         The arguments are those of `learned`; with balanced colours, the last statistics are `balanced_histogram`.
         """
         features = projected_features(descriptors, statistics, self.version)
-        blocks = [self.learned(descriptors, statistics), to_unit_length(features @ self.color_basis[...])]
+        blocks = [self.learned(descriptors, statistics), to_unit_length(matmul(features, self.color_basis[...]))]
         if self.version == 0:
             blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
         weights = jnp.sqrt(self.block_weights[...])
@@ -272,7 +274,7 @@ class EmbeddingNetwork(nnx.Module):
 
 def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
     """Return the cosines [B, n] of unit vectors [B, learned] with proxies [learned, n]."""
-    return learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
+    return matmul(learned, proxies / jnp.linalg.norm(proxies, axis=0))
 
 
 def projected_features(descriptors: Descriptors, statistics: jax.Array, version: int) -> jax.Array:

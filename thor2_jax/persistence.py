@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, check_types, is_positive_integer
+from thor2_jax.types import Diagrams, check_types, is_positive_integer, matmul
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -236,4 +236,4 @@ def _images(
     by_birth = jnp.diff(cumulative_at_edges(births, variance, birth_edges), axis=-2)
     by_persistence = jnp.diff(cumulative_at_edges(persistence, variance, persistence_edges), axis=-2)
     weighted = by_persistence * persistence_power(persistence, exponent)[..., None, :]
-    return jnp.matmul(by_birth, jnp.swapaxes(weighted, -1, -2), precision=jax.lax.Precision.HIGHEST) / 4
+    return matmul(by_birth, jnp.swapaxes(weighted, -1, -2)) / 4

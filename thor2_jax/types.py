@@ -11,6 +11,7 @@ cause a compilation:
 
 import dataclasses
 from collections.abc import Sequence, Sized
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 
 __all__ = [
+    "HIGHEST",
     "Cloud",
     "Descriptors",
     "Diagrams",
@@ -36,7 +38,13 @@ __all__ = [
     "check_cloud",
     "check_types",
     "is_positive_integer",
+    "matmul",
 ]
+
+HIGHEST = jax.lax.Precision.HIGHEST
+"""Precision of all products; TF32, the default of recent GPUs, would lose three digits."""
+
+matmul = partial(jnp.matmul, precision=HIGHEST)
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 """One point cloud of any size: xyz [n, 3] and sRGB [n, 3]."""

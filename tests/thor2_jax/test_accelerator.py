@@ -3,20 +3,26 @@
 import dataclasses
 import json
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from flax import nnx
 from scipy.spatial.transform import Rotation
+from small_runs import untrained_embedding_run
 
 import colornet
 import thor2_jax as thor2
 from benchmarks import run_gpu
 from benchmarks.timing import time_calls
-from thor2_jax.networks import MLP
+from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.model.inference import infer
+from thor2_jax.model.model import Model
+from thor2_jax.networks import FEATURES, MLP
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64
@@ -91,7 +97,6 @@ def test_gradients_are_those_of_a_cpu(homology: str, accelerator: jax.Device, cl
 
 @pytest.mark.gpu
 def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2.PointClouds) -> None:
-    """The tolerance is that of TF32 products, which accelerators use in the classifiers."""
     described = thor2.describe(clouds, NETWORK, thor2.DescriptorConfig(homology="closed_form"))
     model = MLP(described.tops2.shape[1], 17, rngs=nnx.Rngs(0))
     graph, state = nnx.split(model)
@@ -100,7 +105,28 @@ def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2
         np.asarray(forward(*jax.device_put((state, described), device)))
         for device in (accelerator, jax.devices("cpu")[0])
     )
-    np.testing.assert_allclose(probabilities, expected, atol=0.02)
+    np.testing.assert_allclose(probabilities, expected, atol=1e-5)
+
+
+def products(traced: Any) -> Iterator[Any]:
+    """Yield the precision of each product of a traced function and of the functions that it calls."""
+    for equation in traced.eqns:
+        if equation.primitive.name in ("dot_general", "conv_general_dilated"):
+            yield equation.params["precision"]
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda value: hasattr(value, "eqns")):
+            if hasattr(inner, "eqns"):
+                yield from products(inner)
+
+
+def test_products_of_recognition_are_float32_on_every_device(clouds: thor2.PointClouds) -> None:
+    """TF32, the default of recent GPUs, changes confidences in the third digit."""
+    model = Model.of_run(untrained_embedding_run("abc", FEATURES))
+
+    def inferred(clouds: thor2.PointClouds) -> Any:
+        return infer(model, describe_looks(clouds, NETWORK, model.run.config, 4), clouds)
+
+    precisions = set(products(jax.make_jaxpr(inferred)(clouds)))
+    assert precisions == {(jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)}
 
 
 @pytest.mark.parametrize("describes", [False, pytest.param(True, marks=pytest.mark.slow)])

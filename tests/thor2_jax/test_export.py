@@ -74,6 +74,7 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
     points = np.random.default_rng(0).uniform(0, (0.2, 0.1, 0.06), (300, 3))
     packed = thor2.PointClouds.pack([(points, points / 0.2)], 512, rim=[points[:, 0] < 0.05])
+    packed = jax.device_put(packed, jax.devices("cpu")[0])
     outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
     assert set(outputs) == {"tops", "overflow"}
     described = describe_looks(packed, run.network, run.config)

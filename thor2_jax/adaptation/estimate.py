@@ -35,7 +35,7 @@ from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.networks import EMBEDDING, Classifier
-from thor2_jax.types import PointClouds
+from thor2_jax.types import PointClouds, matmul
 
 __all__ = [
     "Adaptation",
@@ -244,7 +244,7 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     def classify(oriented: LookDescriptors) -> jax.Array:
         # `adaptation_criterion` has already added the balanced colours.
         embedded = embedding.embed_oriented(oriented)
-        scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
+        scores = jnp.clip(matmul(jnp.exp(GAMMA * (matmul(embedded, fixed.T) - 1)), duals), 0, 1)
         mean = scores.mean(axis=1)
         return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
 

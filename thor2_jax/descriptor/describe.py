@@ -35,7 +35,7 @@ from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_stri
 from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch, check_types
+from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch, check_types, matmul
 
 __all__ = [
     "BATCH_AXIS",
@@ -150,7 +150,7 @@ _diagrams = jax.jit(diagrams_of_strips, static_argnums=1)
 def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorConfig) -> Descriptors:
     diagrams = diagrams_of_strips(strips, config)
     # E^i = (C^i Delta)^T
-    embeddings = jnp.matmul(strips.color, parameters.similarity, precision=jax.lax.Precision.HIGHEST)
+    embeddings = matmul(strips.color, parameters.similarity)
     return Descriptors(
         images=persistence_images(diagrams, config, parameters.image_variance, parameters.persistence_weight),
         embeddings=jnp.swapaxes(embeddings, -1, -2),

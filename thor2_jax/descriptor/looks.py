@@ -28,7 +28,7 @@ from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large
 from thor2_jax.descriptor.slicing import square_root, to_lab
 from thor2_jax.descriptor.view_normalization import align, normalization_of, place_aligned
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, PointClouds, Strips
+from thor2_jax.types import HIGHEST, Descriptors, PointClouds, Strips
 
 __all__ = [
     "N_BALANCED",
@@ -120,7 +120,7 @@ class LookDescriptors:
 
 @partial(jax.jit, static_argnums=3)
 def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> PointClouds:
-    half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
+    half_turn = jnp.array([[-1], [-1], [1]], jnp.float32)
     warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
 
     def placed(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
@@ -128,7 +128,7 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
         normalization = normalization_of(cloud, sigma_s)
         rotation = normalization.rotation
         # If the occlusion boundary decides which end comes first, there is no half turn.
-        both = jnp.stack([rotation, jnp.where(normalization.end_is_occluded, rotation, half_turn @ rotation)])
+        both = jnp.stack([rotation, jnp.where(normalization.end_is_occluded, rotation, half_turn * rotation)])
         return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
     masks, colors = [clouds.mask], clouds.colors
@@ -293,5 +293,5 @@ def balanced_histogram(colors: jax.Array, mask: jax.Array) -> jax.Array:
         jnp.maximum(0, 1 - jnp.abs(place[..., k, None] * (n - 1) - jnp.arange(n, dtype=jnp.float32)))
         for k, n in enumerate(_BINS)
     ]
-    joint = jnp.einsum("bnl,bna,bnc->blac", shares[0] * weight, *shares[1:])
+    joint = jnp.einsum("bnl,bna,bnc->blac", shares[0] * weight, *shares[1:], precision=HIGHEST)
     return square_root(joint.reshape(len(colors), -1))

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.slicing import strip_births
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, Strips
+from thor2_jax.types import Diagrams, Strips, matmul
 
 __all__ = ["count_past_window", "cumulative_at_edges", "diagrams_of_strips", "persistence_images", "persistence_power"]
 
@@ -136,7 +136,7 @@ def persistence_images(
     by_persistence = cumulative_at_edges(persistence, variance, edges) * weight[..., None, :]
     by_birth = jnp.diff(cumulative_at_edges(births, variance, edges), axis=-2)
     # Take differences along persistence after the product; before it, XLA would evaluate each edge's `erf` twice.
-    images = jnp.diff(jnp.matmul(by_persistence, by_birth.T, precision=jax.lax.Precision.HIGHEST), axis=-2) / 4
+    images = jnp.diff(matmul(by_persistence, by_birth.T), axis=-2) / 4
     return jnp.swapaxes(images, -1, -2)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from colornet import ColorNetwork
 from colornet.colors import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.types import Strips
+from thor2_jax.types import Strips, matmul
 
 __all__ = [
     "RegionSets",
@@ -189,7 +189,7 @@ def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, 
     n_sets = sets.weights.shape[0]
     cell = segment * n_sets + region_set
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
-    return jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
+    return matmul(counts.reshape(n_segments, n_sets), sets.weights)
 
 
 def _released_values(strips: Strips) -> Strips:
@@ -307,7 +307,7 @@ def relaxed_strips(
         above = weight * (y[:, None] - mean)
         low = mean - _rise(weight, -above, relaxation.extremum)
         high = mean + _rise(weight, above, relaxation.extremum)
-        return low, high, (weight > 0).any(axis=0), jnp.matmul(weight.T, regions, precision=jax.lax.Precision.HIGHEST)
+        return low, high, (weight > 0).any(axis=0), matmul(weight.T, regions)
 
     low, high, occupied, color = jax.lax.map(one_slice, log_slice.T)
     return Strips(low, high, occupied, color, jnp.zeros((), jnp.int32))
@@ -330,9 +330,7 @@ def to_lab(colors: jax.Array) -> jax.Array:
     """Convert sRGB colours in [0, 1] to CIELAB (D65): [..., 3] to [..., 3], L* in 0..100."""
     dark = colors <= 0.04045
     linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
-    xyz = jnp.matmul(
-        linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=jax.lax.Precision.HIGHEST
-    )
+    xyz = matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype))
     small = xyz <= (6 / 29) ** 3
     root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.cbrt(jnp.where(small, 1, xyz)))
     fx, fy, fz = root[..., 0], root[..., 1], root[..., 2]
@@ -386,4 +384,4 @@ def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax
     # Weights are summed by region set first: [N, 62] instead of [N, 27, 22].
     by_set = jnp.zeros((len(colors), sets.weights.shape[0]), share.dtype)
     by_set = by_set.at[jnp.arange(len(colors))[:, None], sets.of_color[row]].add(share)
-    return jnp.matmul(by_set, sets.weights, precision=jax.lax.Precision.HIGHEST)
+    return matmul(by_set, sets.weights)

@@ -27,12 +27,9 @@ from jax.typing import ArrayLike
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.types import Parameters, PointClouds, check_batch, check_types
+from thor2_jax.types import Parameters, PointClouds, check_batch, check_types, matmul
 
 __all__ = ["ROWS", "Normalization", "align", "mirror", "normalization_of", "place_aligned", "turn", "view_normalize"]
-
-HIGHEST = jax.lax.Precision.HIGHEST
-"""Precision of all products; TF32, the default of recent GPUs, would lose three digits of a coordinate."""
 
 ROWS = 16
 """Number of rows into which the last axis is folded; its length must be a multiple of this number."""
@@ -197,7 +194,7 @@ def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     principal = rotate(frame, points)
     support = support_points(principal)
     centred = support - support.mean(axis=1, keepdims=True)
-    support_axes = _eigenvectors(jnp.matmul(centred, centred.T, precision=HIGHEST))
+    support_axes = _eigenvectors(matmul(centred, centred.T))
     support = jnp.pad(support, ((0, 0), (0, -support.shape[1] % LANES)), mode="edge")
     starts = jnp.stack([jnp.eye(3, dtype=points.dtype), support_axes])
     # With the loop inside `vmap`, it would be traced twice.
@@ -208,7 +205,7 @@ def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     rotated = rotate(axes, principal)
     low, high = rotated.min(axis=1), rotated.max(axis=1)
     order = jnp.argsort(low - high)
-    return jnp.matmul(axes[order], frame, precision=HIGHEST), low[order], high[order]
+    return matmul(axes[order], frame), low[order], high[order]
 
 
 OCCLUSION_BIN = 0.01
@@ -233,7 +230,7 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
     points = rotate(rotation, points)
     low = jnp.where(mask, points, jnp.inf).min(axis=1)
     low = jnp.where(jnp.isfinite(low), low, 0)
-    return jnp.where(mask, points - low[:, None], 0), jnp.matmul(rotation, camera, precision=HIGHEST) - low
+    return jnp.where(mask, points - low[:, None], 0), matmul(rotation, camera) - low
 
 
 class Normalization(NamedTuple):
@@ -268,7 +265,7 @@ def normalization_of(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
     # The mean is the origin, so a positive middle means that the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
     # A half turn about x moves a camera from +z to -z.
-    camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
+    camera_z = matmul(axes[2], camera) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
@@ -351,7 +348,7 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Rotate one cloud, also by alpha, and translate it to the first octant; return points [M, 3] and camera [3]."""
     # One rotation suffices, since the translation between the two rotations would cancel.
-    turned = jnp.matmul(_about_y(alpha), rotation, precision=HIGHEST)
+    turned = matmul(_about_y(alpha), rotation)
     points, camera = _place(turned, normalization.points, normalization.mask, normalization.camera)
     return points.T, camera
 

@@ -19,7 +19,7 @@ from thor2_jax.descriptor.looks import aligned_looks
 from thor2_jax.descriptor.view_normalization import normalization_of
 from thor2_jax.explanation.class_scores import ClassScores, packed
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.types import PointClouds
+from thor2_jax.types import PointClouds, matmul
 
 __all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "smallest_change"]
 
@@ -74,8 +74,8 @@ def _changed(clouds: PointClouds, axes: jax.Array, parameters: jax.Array, kind: 
         return dataclasses.replace(clouds, colors=jnp.clip(clouds.colors + parameters, 0, 1))
     count = jnp.maximum(clouds.mask.sum(axis=1), 1)[:, None, None]
     centre = jnp.where(clouds.mask[..., None], clouds.points, 0).sum(axis=1, keepdims=True) / count
-    stretch = axes.T @ (jnp.exp(parameters)[:, None] * axes)
-    moved = centre + jnp.matmul(clouds.points - centre, stretch.T, precision=jax.lax.Precision.HIGHEST)
+    stretch = matmul(axes.T, jnp.exp(parameters)[:, None] * axes)
+    moved = centre + matmul(clouds.points - centre, stretch.T)
     return dataclasses.replace(clouds, points=jnp.where(clouds.mask[..., None], moved, 0))
 
 

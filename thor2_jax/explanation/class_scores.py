@@ -26,7 +26,7 @@ from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.networks import EMBEDDING
-from thor2_jax.types import PointClouds, Strips
+from thor2_jax.types import PointClouds, Strips, matmul
 
 __all__ = ["ClassScores", "Unit", "classifier_scores", "gallery_scores"]
 
@@ -169,7 +169,7 @@ def gallery_scores(model: Model) -> ClassScores:
 
     def of_descriptors(oriented: LookDescriptors) -> jax.Array:
         first: LookDescriptors = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
-        cosines = jnp.split(embedding.embed_oriented(first) @ views.T, ends[:-1], axis=-1)
+        cosines = jnp.split(matmul(embedding.embed_oriented(first), views.T), ends[:-1], axis=-1)
         nearest = jnp.stack([of_object.max(axis=-1) for of_object in cosines], axis=-1)
         return nearest.mean(axis=1)
 

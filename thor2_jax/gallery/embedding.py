@@ -38,7 +38,7 @@ from thor2_jax.networks import (
     model_from_arrays,
     to_unit_length,
 )
-from thor2_jax.types import PointClouds
+from thor2_jax.types import HIGHEST, PointClouds
 
 __all__ = ["BACKGROUND", "REFERENCES_FILE", "Embedding", "References", "load_default"]
 
@@ -128,7 +128,7 @@ class _ClassViews(nnx.Module):
 
     def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
         """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
-        return jnp.einsum("bkl,bnl->bkn", learned, self.learned[...][label]).max(axis=-1, initial=-1)
+        return jnp.einsum("bkl,bnl->bkn", learned, self.learned[...][label], precision=HIGHEST).max(axis=-1, initial=-1)
 
 
 def _class_probabilities(

@@ -21,7 +21,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import model_arrays, model_from_arrays
+from thor2_jax.networks import Linear, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds, Strips
 from training.baselines.baseline import (
     BaselineInputs,
@@ -164,9 +164,9 @@ class PointNet(nnx.Module):
     def __init__(self, n_classes: int, *, rngs: nnx.Rngs) -> None:
         """Initialize the weights."""
         sizes = (6, *SHARED)
-        self.shared = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
-        self.hidden = nnx.Linear(SHARED[-1], HEAD, rngs=rngs)
-        self.head = nnx.Linear(HEAD, n_classes, rngs=rngs)
+        self.shared = nnx.List([Linear(a, b, rngs=rngs) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
+        self.hidden = Linear(SHARED[-1], HEAD, rngs=rngs)
+        self.head = Linear(HEAD, n_classes, rngs=rngs)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Return logits [B, C] for `point_features` [B, P, 6]."""

@@ -26,7 +26,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
-from thor2_jax.types import Cloud, PointClouds
+from thor2_jax.types import Cloud, PointClouds, matmul
 from training.views.crops import ViewCrops
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH
 
@@ -191,7 +191,7 @@ def _reoriented(normal: PointClouds, axes: jax.Array, mirrored: jax.Array) -> Po
     def one(cloud: PointClouds, axes: jax.Array, mirrored: jax.Array) -> PointClouds:
         inside = cloud.mask[:, None]
         middle = cloud.points.max(axis=0) / 2
-        points, camera = (jnp.matmul(a - middle, axes.T) for a in (cloud.points, cloud.camera))
+        points, camera = (matmul(a - middle, axes.T) for a in (cloud.points, cloud.camera))
         low = jnp.where(inside, points, jnp.inf).min(axis=0)
         high = jnp.where(inside, points, -jnp.inf).max(axis=0)
         signs = jnp.stack([mirrored, jnp.zeros_like(mirrored), camera[2] > (low[2] + high[2]) / 2])

@@ -129,13 +129,15 @@ def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
 def test_chunks_have_few_points_except_on_accelerators(
     capacity: int, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert describe.chunk_size(clouds_of(2, capacity)) == size
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert describe.chunk_size(clouds_of(300, 1)) == 300
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 63, 64, 65, 127, 128, 150])
-def test_results_of_chunks_are_those_of_the_whole_batch(count: int) -> None:
+def test_results_of_chunks_are_those_of_the_whole_batch(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     sizes: list[int] = []
 
     def mean_x(chunk: thor2.PointClouds) -> dict[str, jax.Array]:

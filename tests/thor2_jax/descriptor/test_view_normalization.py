@@ -18,6 +18,7 @@ from small_clouds import DEGENERATE
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.view_normalization import _minimum_area_angle, argmax, minimal_box, support_points
+from thor2_jax.types import matmul
 
 CONFIG = thor2.DescriptorConfig()
 COLOR = np.float32(0.5)
@@ -129,7 +130,7 @@ def test_large_batches_of_small_rotations_are_exact() -> None:
     """Jax 0.10.2, which is excluded, miscompiles this kernel beyond 32,768 rows on CPUs (jax issue 39103)."""
     matrix = jnp.asarray(Rotation.from_euler("z", 0.0).as_matrix(), jnp.float32)
     rows = jnp.zeros((40_000, 3)).at[:, 0].set(jnp.arange(40_000.0))
-    kernel = jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2))
+    kernel = jax.vmap(lambda row: jnp.sum(matmul(matrix, row) ** 2))
     expected = np.arange(40_000, dtype=np.float64) ** 2
     np.testing.assert_allclose(jax.jit(kernel)(rows), expected, rtol=1e-6)
     np.testing.assert_allclose(jax.jit(kernel)(rows[:32_769])[-1], 32_768.0**2, rtol=0)

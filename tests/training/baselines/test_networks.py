@@ -2,9 +2,11 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +20,14 @@ from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TIN
 GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
 from network_weights import random_images, random_tensor, random_tensors, sampled  # noqa: E402
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _float32_products() -> Iterator[None]:
+    """Recent GPUs would compute them in TF32."""
+    with jax.default_matmul_precision("highest"):
+        yield
+
 
 OUTPUTS = json.loads((GOLDEN / "networks" / "outputs.json").read_text())["outputs"]
 
