@@ -16,7 +16,7 @@ import thor2_jax as thor2
 from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
 
-LIMITS = {"NVIDIA H200": (4.8e12, 67e12)}
+LIMITS = {"NVIDIA H100 80GB HBM3": (3.35e12, 67e12), "NVIDIA H200": (4.8e12, 67e12)}
 """Device -> memory bandwidth in bytes/s, and float32 operations/s without tensor cores, from its data sheet."""
 
 BATCH, N_POINTS = 4096, 2048
