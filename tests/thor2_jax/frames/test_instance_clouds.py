@@ -59,20 +59,6 @@ def only(frame: RGBDFrame) -> PreparedInstance:
 # Which pixels become points
 
 
-def test_one_cloud_per_instance_in_the_order_of_labels() -> None:
-    assert instance_clouds(frame_of(flat(), patch())) == []
-    labels = patch((7, 20, 60, 30, 90), (300, 100, 160, 200, 260), (2, 180, 200, 30, 80), kind=np.uint16)
-    frame = frame_of(flat(), labels)
-    clouds = instance_clouds(frame)
-    assert tuple(cloud.label for cloud in clouds) == frame.instances == (2, 7, 300)
-    for cloud in clouds:
-        assert cloud.reason is None and not cloud.kept_by_fallback
-        assert cloud.points.dtype == np.float32 and cloud.points.shape == (len(cloud.points), 3)
-        assert cloud.colors.dtype == np.uint8 and cloud.colors.shape == cloud.points.shape
-        nearest = np.rint(pixels_of(cloud.points)).astype(int)
-        assert (labels[nearest[:, 0], nearest[:, 1]] == cloud.label).all()
-
-
 def test_intrinsics_with_which_points_are_too_far_apart() -> None:
     frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
     with pytest.raises(InputError, match="^intrinsics place the points of an instance too far apart"):

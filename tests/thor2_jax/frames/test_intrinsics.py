@@ -127,13 +127,6 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
     assert read_intrinsics(tmp_path / "k.yml") == SIZED
 
 
-def test_a_file_of_open3d(tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", reason="needs open3d (extra benchmark)", exc_type=ImportError)
-    camera = open3d.camera.PinholeCameraIntrinsic(640, 480, 615.5, 616.75, 318.25, 241.5)
-    open3d.io.write_pinhole_camera_intrinsic(str(tmp_path / "k.json"), camera)
-    assert read_intrinsics(tmp_path / "k.json") == SIZED
-
-
 @pytest.mark.parametrize("names", ["KD", "kd"])
 def test_a_ros_message(names: str) -> None:
     """Bags hold messages whose arrays are NumPy's."""

@@ -36,16 +36,6 @@ def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndar
 # Scenes with known boundaries
 
 
-def test_only_the_farther_block_is_occluded_along_the_common_edge() -> None:
-    answers = occlusions(*scene())
-    cloud = answers[BACK]
-    assert cloud.occluded and cloud.boundary.shape == (len(cloud.points),)
-    marked = cloud.points[cloud.boundary]
-    assert (marked[:, 0] / marked[:, 2] * CAMERA.fx + CAMERA.cx).min() > 76
-    assert 35 <= len(marked) <= 50  # 50 pixels of 2.7 mm on a grid of 3 mm
-    assert not answers[FRONT].occluded and not answers[FRONT].boundary.any()
-
-
 @pytest.mark.parametrize(("touching", "front", "occluded"), [(9, 789, False), (10, 791, False), (10, 789, True)])
 def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front: int, occluded: bool) -> None:
     """The contour of the narrowed block is 200 pixels long, of which 5 % are 10; by 1 cm, depth differs as noise."""
