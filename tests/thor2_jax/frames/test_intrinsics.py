@@ -1,6 +1,5 @@
 """Intrinsics: each format as other software writes it, sizes, lens distortion, and invalid files."""
 
-import dataclasses
 import io
 import json
 import re
@@ -69,9 +68,11 @@ def as_npy(array: np.ndarray, **options: Any) -> bytes:
 
 
 BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
-REALSENSE = {"width": 640, "height": 480, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
-OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": [615.5, 0, 0, 0, 616.75, 0, 318.25, 241.5, 1]}
-SIZED = Intrinsics(**PINHOLE, width=640, height=480)
+SIZE = {"width": 640, "height": 480}
+REALSENSE = {**SIZE, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
+OPEN3D = {**SIZE, "intrinsic_matrix": [615.5, 0, 0, 0, 616.75, 0, 318.25, 241.5, 1]}
+WITH_SIZE = PINHOLE | SIZE
+SIZED = Intrinsics(**WITH_SIZE)
 
 
 def as_json(values: object) -> bytes:
@@ -80,7 +81,7 @@ def as_json(values: object) -> bytes:
 
 FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "THOR2": (as_json({**PINHOLE, "depth_scale": 5000.0}), Intrinsics(**PINHOLE, depth_scale=5000.0)),
-    "THOR2 with a size": (as_json({**PINHOLE, "width": 640, "height": 480}), SIZED),
+    "THOR2 with a size": (as_json(WITH_SIZE), SIZED),
     "THOR2 in YAML": (yaml.safe_dump(PINHOLE).encode(), Intrinsics(**PINHOLE)),
     "ROS 1 calibration": (ROS1_YAML.encode(), SIZED),
     "ROS 1 message": (ROS1_ECHO.encode(), SIZED),
@@ -96,14 +97,11 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "matrix in NPY": (as_npy(np.asfortranarray(MATRIX.astype(np.float32))), Intrinsics(**PINHOLE)),
     "BOP entry": (as_json(BOP_ENTRY), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP scene": (as_json({"7": BOP_ENTRY}), Intrinsics(**PINHOLE, depth_scale=10_000)),
-    "BOP camera.json": (
-        as_json({**PINHOLE, "width": 640, "height": 480, "depth_scale": 0.1}),
-        dataclasses.replace(SIZED, depth_scale=10_000),
-    ),
+    "BOP camera.json": (as_json(WITH_SIZE | {"depth_scale": 0.1}), Intrinsics(**WITH_SIZE, depth_scale=10_000)),
     "RealSense": (as_json({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}), SIZED),
     "RealSense with a scale": (
-        as_json({**REALSENSE, "depth_scale": 0.00025}),
-        dataclasses.replace(SIZED, depth_scale=4000),
+        as_json(REALSENSE | {"depth_scale": 0.00025}),
+        Intrinsics(**WITH_SIZE, depth_scale=4e3),
     ),
     "Open3D": (as_json(OPEN3D), SIZED),
     "Open3D camera": (as_json({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}), SIZED),

@@ -166,22 +166,18 @@ def test_why_is_503_until_explanations_are_compiled(
 
 
 @pytest.mark.usefixtures("teaching_url")  # starts the service
-@pytest.mark.parametrize(("state", "is_logged"), [("ready", True), ("stopping", False)])
-def test_compiled_explanations_are_logged_with_their_size(
-    teaching_app: FastAPI,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    state: str,
-    is_logged: bool,
+def test_compiled_explanations_are_logged_unless_the_service_stops(
+    teaching_app: FastAPI, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     service, compiled = teaching_app.state.service, Mock()
-    monkeypatch.setattr(service, "_compiled", {})
-    monkeypatch.setattr(service, "state", state)
     monkeypatch.setattr(pipeline, "compile_explanations", compiled)
-    service._compile_explanations((4096, True)).result(HANG)
-    assert compiled.call_args.args[1:3] == (4096, True)
-    assert ("clouds of 4096 points are compiled" in caplog.text) == is_logged
+    for state, size in (("ready", 4096), ("stopping", 2048)):
+        monkeypatch.setattr(service, "state", state)
+        monkeypatch.setattr(service, "_compiled", {})
+        service._compile_explanations((size, True)).result(HANG)
+        assert compiled.call_args.args[1:3] == (size, True)
+        assert (f"clouds of {size} points are compiled" in caplog.text) == (state == "ready")
 
 
 @pytest.mark.slow
