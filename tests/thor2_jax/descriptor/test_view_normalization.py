@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from small_clouds import DEGENERATE
 
 import thor2_jax as thor2
+from thor2_jax.descriptor.view_normalization import _minimum_area_angle
 from thor2_jax.types import matmul
 
 CONFIG = thor2.DescriptorConfig()
@@ -157,3 +158,13 @@ def test_volumes_against_an_exhaustive_search() -> None:
     ratios = [v / np.prod(trimesh.bounds.oriented_bounds(p)[1]) for v, p in zip(volumes, shapes(), strict=True)]
     assert np.median(ratios) <= 1.003
     assert max(ratios) <= 1.015  # 1.020 with fewer sweeps, 1.023 from the principal axes alone
+
+
+def test_a_mirrored_projection_has_the_opposite_angle() -> None:
+    """The signs of the initial frame of the search therefore do not matter."""
+    minimum_area_angle = jax.jit(_minimum_area_angle)
+    for seed in range(5):
+        xy = np.random.default_rng(seed).normal(size=(2, 80)).astype(np.float32)
+        angle = float(minimum_area_angle(xy))
+        assert 0 < abs(angle) < np.pi / 4
+        assert float(minimum_area_angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-angle, abs=1e-6)

@@ -16,7 +16,7 @@ from fastapi import FastAPI
 from image_files import encode_image
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Route, expect
 from processes import HANG
 from service_requests import check_refused
 from small_runs import untrained_run
@@ -36,8 +36,7 @@ from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import MAX_EXPLAINED, LabelMap
 
-Open = Callable[..., Page]
-Files = dict[str, bytes]
+from .conftest import Files, Open
 
 
 def decoded(label_map: LabelMap) -> np.ndarray:

@@ -24,7 +24,7 @@ from service_requests import check_refused
 from thor2_jax.service.decoding import MAX_BODY, decode_frame
 from thor2_jax.service.problem import RequestError
 
-Files = dict[str, bytes]
+from .conftest import Files
 
 
 @pytest.fixture(autouse=True)

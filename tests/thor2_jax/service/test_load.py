@@ -16,9 +16,7 @@ import schemathesis
 from processes import HANG, wait_until
 from slow_tier import slow
 
-from .conftest import assert_conforms
-
-Files = dict[str, bytes]
+from .conftest import Files, assert_conforms
 
 
 def memory(pid: int) -> int:

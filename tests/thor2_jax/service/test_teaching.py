@@ -29,9 +29,7 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 
-from .conftest import assert_conforms
-
-Files = dict[str, bytes]
+from .conftest import Files, assert_conforms
 
 
 @pytest.fixture
