@@ -117,13 +117,11 @@ def test_describe_against_finite_differences(name: str, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(view_normalization, "minimal_box", box)
 
-    def describe(
-        clouds: thor2.PointClouds, network: Any, config: thor2.DescriptorConfig, parameters: thor2.Parameters
-    ) -> thor2.Descriptors:
+    def describe(clouds: thor2.PointClouds, *settings: Any) -> thor2.Descriptors:
         # The function that is already compiled contains another frame.
+        parameters = settings[-1]
         points, camera = view_normalization._align.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
-        aligned = dataclasses.replace(clouds, points=points, camera=camera)
-        return thor2.describe_aligned(aligned, network, config, parameters)
+        return thor2.describe_aligned(dataclasses.replace(clouds, points=points, camera=camera), *settings)
 
     loss = loss_of(describe, clouds, config)
     derivatives = assert_differences_agree(loss, clouds.points, clouds.colors, parameters_of(config))

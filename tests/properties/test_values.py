@@ -56,9 +56,7 @@ def test_embedding_is_linear(pipeline: Any, data: st.DataObject, seed: int, fact
 
 
 @given(aligned=ALIGNED, network=laws.networks(), seed=laws.seeds(), axis=st.sampled_from("xyz"))
-def test_strips_and_other_networks(
-    aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int, axis: str
-) -> None:
+def test_strips_and_networks(aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int, axis: str) -> None:
     def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
         return thor2.describe_aligned(clouds, network, CONFIG)
 

@@ -70,9 +70,7 @@ def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     check_output_directory(tmp_path, "marker")
 
 
-def test_files_broken_links_and_unwritable_directories_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(dir: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(dir))
 

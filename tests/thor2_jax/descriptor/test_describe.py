@@ -91,9 +91,7 @@ def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
 
 
 @pytest.mark.parametrize(("capacity", "size"), [(1, 64), (512, 64), (2048, 64), (4096, 32), (8192, 16), (2**18, 1)])
-def test_chunks_have_few_points_except_on_accelerators(
-    capacity: int, size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_have_few_points_except_on_a_gpu(capacity: int, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert describe.chunk_size(clouds_of(2, capacity)) == size
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -1,6 +1,5 @@
 """Depth files: each format as other software writes it, and invalid files."""
 
-import io
 import sys
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from failures import Pickled
+from image_files import encode_npy
 from PIL import Image
 from refusals import assert_refused
 
@@ -104,16 +104,10 @@ def test_arrays_that_are_no_depth(tmp_path: Path, array: np.ndarray) -> None:
     assert_refused(r"^depth: .*d\.npy has ", read_depth, tmp_path / "d.npy")
 
 
-def npy_file(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
 def test_damaged_npy_files(tmp_path: Path) -> None:
-    whole = npy_file(METRES)
+    whole = encode_npy(METRES)
     huge = whole.replace(b"(5, 7), }" + b" " * 12, b"(1048576, 1048576), }")
-    for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[Pickled()]], object))):
+    for content in (b"", b"text", whole[:20], whole[:-3], encode_npy(np.array([[Pickled()]], object))):
         (tmp_path / "d.npy").write_bytes(content)
         assert_refused(r"^depth: .*d\.npy ", read_depth, tmp_path / "d.npy")
     (tmp_path / "d.npy").write_bytes(huge)

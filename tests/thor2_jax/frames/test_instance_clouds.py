@@ -71,6 +71,7 @@ def test_points_are_voxel_means_of_backprojected_pixels() -> None:
     frame = frame_of(depth, patch((1, 50, 110, 60, 150)))
     points = backproject(frame.depth_m, CAMERA)[frame.label_image == 1]
     cloud, expected = only(frame), voxel_downsample(points, points, 0.003)[0]
+    assert (cloud.points.dtype, cloud.colors.dtype) == (np.float32, np.uint8)
     distance = cdist(cloud.points, expected)
     assert distance.min(axis=1).max() < 1e-6
     assert len(set(distance.argmin(axis=1))) == len(cloud.points) >= 0.9 * len(expected)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from failures import Pickled
+from image_files import encode_npy
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import (
@@ -61,12 +62,6 @@ def as_text(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def as_npy(array: np.ndarray, **options: Any) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array, **options)
-    return stream.getvalue()
-
-
 BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
 SIZE = {"width": 640, "height": 480}
 REALSENSE = {**SIZE, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
@@ -94,7 +89,7 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "matrix in text": (as_text(MATRIX), Intrinsics(**PINHOLE)),
     "matrix in text with a comment": (b"\xef\xbb\xbf# K\r\n" + as_text(MATRIX), Intrinsics(**PINHOLE)),
     "matrix in CSV": (b"615.5, 0, 318.25\n0, 616.75, 241.5\n0, 0, 1\n", Intrinsics(**PINHOLE)),
-    "matrix in NPY": (as_npy(np.asfortranarray(MATRIX.astype(np.float32))), Intrinsics(**PINHOLE)),
+    "matrix in NPY": (encode_npy(np.asfortranarray(MATRIX.astype(np.float32))), Intrinsics(**PINHOLE)),
     "BOP entry": (as_json(BOP_ENTRY), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP scene": (as_json({"7": BOP_ENTRY}), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP camera.json": (as_json(WITH_SIZE | {"depth_scale": 0.1}), Intrinsics(**WITH_SIZE, depth_scale=10_000)),
@@ -183,11 +178,11 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
 
 def test_invalid_npy_files() -> None:
     for content in (
-        as_npy(MATRIX)[:100],
-        as_npy(MATRIX[:2]),
-        as_npy(np.array([Pickled()] * 9, object)),
-        as_npy(MATRIX + 0j),
-        as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
+        encode_npy(MATRIX)[:100],
+        encode_npy(MATRIX[:2]),
+        encode_npy(np.array([Pickled()] * 9, object)),
+        encode_npy(MATRIX + 0j),
+        encode_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
     ):
         assert_refused(r"^intrinsics[ .]", parse_intrinsics, content)
 
