@@ -66,6 +66,11 @@ def test_slices_have_their_borders(ax) -> None:
     draw(ax)
 
 
+def test_slices_leave_out_points_without_a_place(ax) -> None:
+    plot.slices(ax, np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS), COLORS, CONFIG)
+    assert len(ax.texts) == CONFIG.n_slices
+
+
 def test_diagram_has_every_pair(ax) -> None:
     clouds = thor2.PointClouds.pack([(POINTS, COLORS)])
     diagrams = thor2.diagrams(thor2.align(clouds, CONFIG), CONFIG)
@@ -163,9 +168,3 @@ def test_input_that_cannot_be_drawn_is_refused(ax, function, arguments, match: s
 @pytest.mark.parametrize("region", [-1, NETWORK.n_regions])
 def test_regions_of_no_network_are_refused(ax, region: int) -> None:
     assert_refused("regions is", plot.color_matrix, ax, np.zeros((31, NETWORK.n_regions)), NETWORK, regions=[region])
-
-
-def test_slices_leave_out_points_without_a_place(ax) -> None:
-    missing = np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS)
-    plot.slices(ax, missing, COLORS, CONFIG)
-    assert len(ax.texts) == CONFIG.n_slices

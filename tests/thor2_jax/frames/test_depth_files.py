@@ -87,18 +87,14 @@ def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert_refused(r"^depth: .*d\.exr is an EXR file; expected .*OpenEXR", read_depth, tmp_path / "d.exr")
 
 
-@pytest.mark.parametrize(
-    "array",
-    [
-        np.zeros((5, 7), np.uint8),
-        np.zeros((5, 7), np.complex64),
-        np.zeros((5, 7, 3), np.float32),
-        np.zeros(35, np.uint16),
-        np.zeros((0, 7), np.float32),
-        np.full((5, 7), -1),
-        np.full((5, 7), 2**32),
-    ],
+NO_DEPTH = (
+    *(np.zeros((5, 7), kind) for kind in (np.uint8, np.complex64)),
+    *(np.zeros(shape, np.float32) for shape in ((5, 7, 3), (35,), (0, 7))),
+    *(np.full((5, 7), value) for value in (-1, 2**32)),
 )
+
+
+@pytest.mark.parametrize("array", NO_DEPTH)
 def test_arrays_that_are_no_depth(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "d.npy", array)
     assert_refused(r"^depth: .*d\.npy has ", read_depth, tmp_path / "d.npy")

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from image_files import deep_png
+from image_files import deep_png, encode_image
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import (
@@ -183,6 +184,16 @@ def test_damaged_images(files: dict[str, Path], name: str) -> None:
     for content in (b"", b"not an image", raw[:20], raw[: len(raw) // 2], flipped):
         files[name].write_bytes(content)
         assert_refused(f"^{name}: {files[name]} [^<>]*$", read_frame, **files)  # without the name of an object
+
+
+def test_images_with_an_invalid_checksum_are_refused(tmp_path: Path) -> None:
+    """Even if their pixels can be decoded."""
+    text = PngInfo()
+    text.add_text("Title", "scene")
+    whole = encode_image(np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2, pnginfo=text)
+    for place in range(8, len(whole) - 12):  # all but the signature and the chunk that ends the file
+        (tmp_path / "l.png").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        assert_refused("^labels: .*l.png ", read_labels, tmp_path / "l.png")
 
 
 @pytest.mark.parametrize(

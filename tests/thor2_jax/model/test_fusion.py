@@ -95,16 +95,10 @@ def test_records_without_a_third_function_are_read() -> None:
     np.testing.assert_allclose(calibration.confidence(FUSED, EMBEDDED), CALIBRATION.score(FUSED, EMBEDDED))
 
 
-@pytest.mark.parametrize(
-    "record",
-    [
-        {"known_bias": 0.0},
-        RECORD | {"unknown_below": 2.0},
-        RECORD | {"known_bias": float("nan")},
-        RECORD | {"known_bias": "0"},
-        [],
-    ],
-)
+BAD_VALUES = ({"unknown_below": 2.0}, {"known_bias": float("nan")}, {"known_bias": "0"})
+
+
+@pytest.mark.parametrize("record", [[], {"known_bias": 0.0}, *(RECORD | values for values in BAD_VALUES)])
 def test_damaged_records_are_refused(record: Any) -> None:
     with pytest.raises(thor2.InputError, match="calibration"):
         Model.of_run(untrained_run("ab", record={"calibration": record})).calibration  # noqa: B018
