@@ -18,11 +18,10 @@ from thor2_jax.descriptor import view_normalization
 NETWORK = colornet.load_default()
 SMALL = {"n_slices": 3, "n_strips": 8, "image_size": 12}
 CLOSED, GUDHI = (thor2.DescriptorConfig(homology=name, **SMALL) for name in ("closed_form", "gudhi"))
-SOFT = dataclasses.replace(CLOSED, relaxation=thor2.Relaxation())
 CONFIGS = {
     "closed_form": CLOSED,
     "gudhi": GUDHI,
-    "relaxed": SOFT,
+    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
     "relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation()),
 }
 COUNT, CAPACITY = 44, 48

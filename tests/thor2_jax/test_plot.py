@@ -24,10 +24,6 @@ def ax() -> object:
     return figure.add_subplot()
 
 
-def draw(ax: object) -> None:
-    ax.figure.canvas.draw()
-
-
 def test_cloud_is_seen_by_the_camera(ax) -> None:
     drawn = plot.cloud(ax, POINTS, COLORS)
     offsets, faces = drawn.get_offsets(), drawn.get_facecolors()
@@ -37,7 +33,7 @@ def test_cloud_is_seen_by_the_camera(ax) -> None:
     assert ax.yaxis_inverted()
     plot.cloud(ax, POINTS, COLORS)  # A second cloud does not turn the axis back.
     assert ax.yaxis_inverted()
-    draw(ax)
+    ax.figure.canvas.draw()
     assert_refused("colors is int64", plot.cloud, ax, POINTS, COLORS.astype(np.int64))
 
 
@@ -63,7 +59,7 @@ def test_slices_have_their_borders(ax) -> None:
     top = float(aligned.points[..., 2].max())
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
-    draw(ax)
+    ax.figure.canvas.draw()
 
 
 def test_slices_leave_out_points_without_a_place(ax) -> None:
@@ -80,7 +76,7 @@ def test_diagram_has_every_pair(ax) -> None:
     mask = np.asarray(one.mask)
     expected = np.column_stack([np.asarray(one.births)[mask], np.asarray(one.deaths)[mask]])
     np.testing.assert_array_equal(drawn, expected)
-    draw(ax)
+    ax.figure.canvas.draw()
     assert_refused("diagrams", plot.persistence_diagram, ax, diagrams, CONFIG)
 
 
@@ -123,7 +119,7 @@ def test_network_emphasizes_used_regions(ax) -> None:
     faces = {tuple(np.round(collection.get_facecolors()[0][:3], 4)) for collection in ax.collections}
     for region in range(22):
         assert (tuple(np.round(NETWORK.mean_rgb[region] / 255, 4)) in faces) == (region in (2, 9))
-    draw(ax)
+    ax.figure.canvas.draw()
     for wrong in (weights[:-1], -weights):
         assert_refused("weights", plot.color_network, ax, NETWORK, wrong)
 
