@@ -145,9 +145,8 @@ def test_descriptors_and_statistics_are_those_of_each_look() -> None:
         # The cloud of the look alone: points of the rim are not there, instead of masked.
         alone = dataclasses.replace(thor2.PointClouds.pack([(points, colors)]), camera=aligned.camera[row : row + 1])
         descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
-        np.testing.assert_allclose(
-            descriptors.tops2, thor2.describe_aligned(alone, NETWORK, CONFIG).tops2[0], atol=1e-4
-        )
+        expected = thor2.describe_aligned(alone, NETWORK, CONFIG)
+        np.testing.assert_allclose(descriptors.tops2, expected.tops2[0], atol=1e-4)
         statistics = cloud_statistics(side_lengths(alone, CONFIG.alpha), alone, strips(alone, NETWORK, CONFIG))[0]
         np.testing.assert_allclose(described.statistics[row // 4, row % 4], statistics, atol=1e-4)
     assert np.abs(described.statistics[:, 2] - described.statistics[:, 3]).max() > 1e-3

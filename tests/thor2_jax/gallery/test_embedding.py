@@ -94,9 +94,8 @@ def test_nearest_views_of_the_answered_class_raise_the_odds(clouds: thor2.PointC
     nearest = np.array([of[:, label == k].max(axis=-1).mean() for of, k in zip(cosines, answer, strict=True)])
     assert (nearest < cosines.max(axis=-1).mean(axis=1)).any()
     odds = before / (1 - before.sum(axis=1, keepdims=True)) * np.exp(10 * (nearest - 0.8))[:, None]
-    np.testing.assert_allclose(
-        with_views.class_probabilities(oriented), odds / (1 + odds.sum(axis=1, keepdims=True)), rtol=0.02
-    )
+    expected = odds / (1 + odds.sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(with_views.class_probabilities(oriented), expected, rtol=0.02)
     without = dataclasses.replace(with_views, sizes=dataclasses.replace(SIZES, views=False))
     assert np.array_equal(without.class_probabilities(oriented), np.asarray(before, np.float32))
 
@@ -178,10 +177,8 @@ def test_files_of_earlier_versions_compare_no_images(tmp_path: Path, clouds: tho
     assert (loaded.sizes.version, embedding.sizes.version) == (1, 2)
     assert embedding.model.color_basis.shape[0] == n_colors + 2 * 4**2  # cells of two slices
     for each, changes in ((loaded, False), (embedding, True)):
-        blocks = [
-            np.asarray(each.embed_oriented(looks)[:, 0, 8:])
-            for looks in (oriented, dataclasses.replace(oriented, each=flat))
-        ]
+        both = (oriented, dataclasses.replace(oriented, each=flat))
+        blocks = (np.asarray(each.embed_oriented(looks)[:, 0, 8:]) for looks in both)
         first, second = (block / np.linalg.norm(block, axis=1, keepdims=True) for block in blocks)
         assert (np.abs(first - second).max() > 1e-3) == changes
 

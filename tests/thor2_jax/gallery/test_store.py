@@ -31,13 +31,9 @@ FINGERPRINT = "f" * 64
 def enrolled(seed: int, n_views: int = 2) -> GalleryObject:
     rng = np.random.default_rng(seed)
     embeddings = rng.normal(size=(2 * n_views, 16))
-    views = [
-        PreparedInstance(
-            1, rng.random((50, 3), np.float32), rng.integers(0, 256, (50, 3), np.uint8), np.zeros(50, bool)
-        )
-        for _ in range(n_views)
-    ]
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    points, colors = rng.random((n_views, 50, 3), np.float32), rng.integers(0, 256, (n_views, 50, 3), np.uint8)
+    views = [PreparedInstance(1, *each, np.zeros(50, bool)) for each in zip(points, colors, strict=True)]
     return GalleryObject(embeddings.astype(np.float16), CompactClouds.of(views), "frames", "2026-01-02")
 
 
@@ -104,9 +100,8 @@ def test_undo_restores_the_gallery_and_its_files(directory: Path) -> None:
     undone = update_gallery(directory, undo(directory, changed.generation), FINGERPRINT, changed)
     again = load_gallery(directory)
     assert undone.generation == again.generation == changed.generation + 1
-    assert object_files(undone) == object_files(again) == object_files(before) and undone.stamp == gallery_stamp(
-        directory
-    )
+    assert object_files(undone) == object_files(again) == object_files(before)
+    assert undone.stamp == gallery_stamp(directory)
     np.testing.assert_array_equal(again.objects["mug"].embeddings, enrolled(0).embeddings)
     update_gallery(directory, undo(directory, undone.generation))  # restores the change
     assert object_files(load_gallery(directory)) == object_files(changed)

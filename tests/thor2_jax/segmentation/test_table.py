@@ -147,10 +147,8 @@ def test_depth_with_nan_and_holes() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400)])
 def test_images_of_few_pixels(size: tuple[int, int]) -> None:
-    frame = RGBDFrame(
-        np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16), None, Intrinsics(500.0, 500.0, 0.0, 0.0)
-    )
-    assert segment_table(frame).shape == size
+    color, depth = np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16)
+    assert segment_table(RGBDFrame(color, depth, None, Intrinsics(500.0, 500.0, 0.0, 0.0))).shape == size
 
 
 def test_borders_are_refined_as_in_the_whole_image() -> None:
