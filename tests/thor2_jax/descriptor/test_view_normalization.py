@@ -1,7 +1,4 @@
-"""View normalization: a rigid motion that depends only on the object and the camera.
-
-Bounding boxes are compared with an exhaustive search (trimesh).
-"""
+"""View normalization: a rigid motion into a box that is nearly as small as that of an exhaustive search (trimesh)."""
 
 import dataclasses
 
