@@ -20,7 +20,8 @@ from image_files import deep_png, encode_image, png_file, with_checksums
 from processes import HANG
 from service_requests import check_refused
 
-from thor2_jax.service.decoding import MAX_BODY
+from thor2_jax.service.decoding import MAX_BODY, decode_frame
+from thor2_jax.service.problem import RequestError
 
 from .conftest import Files
 
@@ -68,8 +69,11 @@ def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame
 
 
 def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> None:
-    problem = post(http, files, **dict.fromkeys(("color", "labels", "intrinsics"), b"damaged")).json()
-    assert [problem["field"], *(other["field"] for other in problem["further"])] == ["color", "labels", "intrinsics"]
+    damaged = dict.fromkeys(("color", "labels", "intrinsics"), b"damaged")
+    problem = post(http, files, **damaged).json()
+    assert [problem["field"], *(other["field"] for other in problem["further"])] == list(damaged)
+    with pytest.raises(RequestError, match="color is damaged"):
+        decode_frame(**files | damaged)
 
 
 def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files) -> None:
