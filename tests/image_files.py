@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,13 @@ def encode_image(pixels: np.ndarray, kind: str = "PNG", **options: object) -> by
     """Return an image file's bytes."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def encode_npy(array: np.ndarray, **options: Any) -> bytes:
+    """Return an NPY file's bytes."""
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
     return stream.getvalue()
 
 

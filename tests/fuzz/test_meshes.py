@@ -88,9 +88,7 @@ def parts_of(path: Path) -> tuple[bytes, bytes]:
 
 @pytest.mark.parametrize("name", ["textured.glb", "painted.glb"])
 @given(data=st.data(), table_first=st.booleans())
-def test_damaged_glb_with_valid_lengths(
-    name: str, data: st.DataObject, table_first: bool, folder: Path, check: Any
-) -> None:
+def test_glb_with_valid_lengths(name: str, data: st.DataObject, table_first: bool, folder: Path, check: Any) -> None:
     parts = list(parts_of(folder / name))
     parts[not table_first] = data.draw(damaged(parts[not table_first], 2))
     check(write_glb(folder / "damaged.glb", *parts))

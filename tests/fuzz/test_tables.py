@@ -79,24 +79,12 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(0)
     xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
     rgb = rng.integers(0, 256, (12, 3), dtype=np.uint8)
-    content = encode(
-        NormalizedViews(xyz, rgb, np.array([5, 7]), 0, np.arange(2, dtype=np.int32), np.zeros(2, np.int32))
-    )
+    numbers = np.arange(2, dtype=np.int32), np.zeros(2, np.int32)
+    content = encode(NormalizedViews(xyz, rgb, np.array([5, 7]), 0, *numbers))
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
     Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
     return path
-
-
-def meaning(name: str, content: bytes) -> Any:
-    """Return a manifest without its layout and the position of its checksum; other files as they are."""
-    if name != MANIFEST:
-        return content
-    try:
-        table = json.loads(content)
-        return table.pop("sha256"), json.dumps(table)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None
 
 
 def read_damaged(name: str, content: bytes, views: Path, attempt: Any) -> Any:
@@ -104,7 +92,8 @@ def read_damaged(name: str, content: bytes, views: Path, attempt: Any) -> Any:
 
     def read() -> list[Any]:
         dataset = ViewDataset.open(views)
-        return [dataset.record, dataset.classes, len(dataset), *map(dataset.read, range(len(dataset.shards)))]
+        shards = [dataclasses.astuple(dataset.read(k)) for k in range(len(dataset.shards))]
+        return [dataset.record | {"digest": ""}, dataset.classes, len(dataset), shards]
 
     with other_content(views / name, content):
         return attempt(read)
@@ -115,9 +104,9 @@ def read_damaged(name: str, content: bytes, views: Path, attempt: Any) -> Any:
 def test_views(name: str, data: st.DataObject, views: Path, attempt: Any) -> None:
     """A file with another content is refused unless its meaning is the same."""
     whole = (views / name).read_bytes()
-    content = data.draw(damaged(whole))
-    loaded = read_damaged(name, content, views, attempt)
-    assert (loaded is None) == (meaning(name, content) != meaning(name, whole))
+    loaded = read_damaged(name, data.draw(damaged(whole)), views, attempt)
+    if loaded is not None:
+        np.testing.assert_equal(loaded, read_damaged(name, whole, views, attempt))
 
 
 def test_the_layout_of_a_manifest_does_not_matter(views: Path, attempt: Any) -> None:

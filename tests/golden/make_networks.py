@@ -82,10 +82,8 @@ def outputs() -> Iterator[tuple[str, np.ndarray]]:
         yield name, resnet_outputs(name, size)
     for name, (model, arguments, size) in DENSENETS.items():
         network: Any = filled(timm.create_model(model, **arguments))
-        yield (
-            name,
-            sampled(network.forward_head(network.forward_features(images(name, 2, size)), pre_logits=True).numpy()),
-        )
+        features = network.forward_features(images(name, 2, size))
+        yield name, sampled(network.forward_head(features, pre_logits=True).numpy())
     for name, (model, arguments) in VITS.items():
         network = filled(timm.create_model(model, **arguments))
         yield name, sampled(network.forward_features(images(name, 2, arguments["img_size"]))[:, 0].numpy())

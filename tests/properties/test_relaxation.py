@@ -28,10 +28,9 @@ def relaxed(factor: float) -> thor2.DescriptorConfig:
 
 
 def test_points_outside_the_hard_slices_are_left_out() -> None:
-    points = np.array(
-        [[0.01, 0.1, 0.05], [0.012, 0.3, 0.05], [-0.1, 0, 0.05], [0.1, 0, -0.2], [0.9, 0, 0], [0.1, 0, 2]]
-    )
-    clouds = thor2.PointClouds.pack([(points, np.full((6, 3), 0.2))], 16)
+    inside = [[0.01, 0.1, 0.05], [0.012, 0.3, 0.05]]
+    outside = [[-0.1, 0, 0.05], [0.1, 0, -0.2], [0.9, 0, 0], [0.1, 0, 2]]
+    clouds = thor2.PointClouds.pack([(np.array(inside + outside), np.full((6, 3), 0.2))], 16)
     hard, soft = (thor2.describe_aligned(clouds, NETWORK, config) for config in (HARD, relaxed(0.01)))
     np.testing.assert_allclose(soft.tops2, hard.tops2, atol=1e-3)
     assert int(soft.overflow[0]) == int(hard.overflow[0]) == 4

@@ -21,6 +21,7 @@ from thor2_jax.files import (
     has_json,
     json_digest,
     parse_yaml,
+    read_table,
     remove_leftovers,
     remove_written,
     temporary_directory,
@@ -69,9 +70,7 @@ def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     check_output_directory(tmp_path, "marker")
 
 
-def test_files_broken_links_and_unwritable_directories_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(dir: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(dir))
 
@@ -185,8 +184,11 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}", b"[1"],
-    ids=["deep", "cycle", "alias", "int", "digits", "merge", "open"],
+    [
+        *(b"[" * 5000, b"[1", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}", b"!!int ''"),
+        *(b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"a: !!python/object/apply:os.getpid []"),
+    ],
+    ids=["deep", "open", "digits", "merge", "int", "cycle", "alias", "call"],
 )
 def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
     with pytest.raises(ValueError):
@@ -194,9 +196,16 @@ def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
 
 
 def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_YAML_BYTES", 10)
+    monkeypatch.setattr(files, "MAX_YAML_BYTES", 20)
     monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
     assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
-    for content, message in ((b"[1,2,3,4]" + b" " * 2, "11 bytes"), (b"[{1},1,1]", "more than 5 values")):
+    many = "more than 5 values"
+    for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[{1},1,1]", many), (b"[&a [1,2],*a,*a]", many)):
         with pytest.raises(ValueError, match=message):
             parse_yaml(content)
+
+
+def test_damaged_json_is_refused(tmp_path: Path) -> None:
+    for content in ("[" * 10**6, "1" * 10**5, '{"fx": ' * 10**5, "[", "{} {}"):
+        (tmp_path / "a.json").write_text(content)
+        assert_refused(r"a\.json is damaged", read_table, tmp_path / "a.json")

@@ -30,9 +30,8 @@ def gudhi_pairs(heights: np.ndarray, edges: np.ndarray | None = None) -> np.ndar
 
 
 def pairs_of(diagrams: thor2.Diagrams) -> np.ndarray:
-    return np.array(sorted(zip(diagrams.births[diagrams.mask], diagrams.deaths[diagrams.mask], strict=True))).reshape(
-        -1, 2
-    )
+    pairs = zip(diagrams.births[diagrams.mask], diagrams.deaths[diagrams.mask], strict=True)
+    return np.array(sorted(pairs)).reshape(-1, 2)
 
 
 def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> None:
@@ -42,9 +41,8 @@ def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> Non
     assert diagrams.births.dtype == diagrams.deaths.dtype == heights.dtype
     for b in range(len(heights)):
         one = jax.tree.map(lambda a: np.asarray(a[b]), diagrams)  # noqa: B023  used at once
-        np.testing.assert_array_equal(
-            pairs_of(one), gudhi_pairs(heights[b], None if edges is None else edges[b]), strict=False
-        )
+        expected = gudhi_pairs(heights[b], None if edges is None else edges[b])
+        np.testing.assert_array_equal(pairs_of(one), expected)
         assert not one.births[~one.mask].any() and not one.deaths[~one.mask].any()
         np.testing.assert_array_equal(one.births[one.mask], heights[b][one.mask])
 
@@ -70,10 +68,7 @@ def test_absent_vertices_and_edges() -> None:
     for values, gaps in ((expected[0], None), expected):
         first = persistence.sublevel_diagrams(heights, None if gaps is None else edges)
         assert_as_gudhi(values, gaps)
-        for a, b in zip(
-            jax.tree.leaves(first), jax.tree.leaves(persistence.sublevel_diagrams(values, gaps)), strict=True
-        ):
-            np.testing.assert_array_equal(a, b)
+        jax.tree.map(np.testing.assert_array_equal, first, persistence.sublevel_diagrams(values, gaps))
     short = np.where(np.arange(17) < 9, expected[0], np.inf)
     assert_as_gudhi(short)
     assert len(gudhi_pairs(short[0])) == len(gudhi_pairs(expected[0][0, :9]))
@@ -86,8 +81,7 @@ def test_leading_axes_and_vmap(shape: tuple[int, ...]) -> None:
     assert diagrams.mask.shape == diagrams.births.shape == shape
     if len(shape) == 3:
         nested = jax.vmap(jax.vmap(persistence.sublevel_diagrams))(heights)
-        for a, b in zip(jax.tree.leaves(diagrams), jax.tree.leaves(nested), strict=True):
-            np.testing.assert_array_equal(a, b)
+        jax.tree.map(np.testing.assert_array_equal, diagrams, nested)
         assert diagrams.mask.any()
 
 
@@ -153,22 +147,16 @@ def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> 
     np.testing.assert_allclose(gradient, differences, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("heights", "edges", "name"),
-    [
-        (np.zeros(3, np.int32), None, "heights"),
-        (np.float32(1), None, "heights"),
-        (np.zeros(3, np.float32), np.zeros(3, np.float32), "edges"),
-        (np.zeros((2, 3), np.float32), np.zeros(2, np.float32), "edges"),
-        (np.zeros(3, np.float32), np.zeros(2, np.int32), "edges"),
-        (None, None, "heights"),
-        ("high", None, "heights"),
-        ([[1.0, 2.0], [1.0]], None, "heights"),
-        (np.zeros(3, np.float32), [[1.0], [1.0, 2.0]], "edges"),
-    ],
-)
-def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
-    assert_refused(f"^{name} is [^\n]*$", persistence.sublevel_diagrams, heights, edges)
+SOME, RAGGED = np.zeros(3, np.float32), [[1.0, 2.0], [1.0]]
+BAD_HEIGHTS = (np.zeros(3, np.int32), np.float32(1), None, "high", RAGGED)
+BAD_EDGES = ((SOME, SOME), (np.zeros((2, 3), np.float32), SOME[:2]), (SOME, np.zeros(2, np.int32)), (SOME, RAGGED))
+
+
+def test_bad_heights_and_edges() -> None:
+    for heights in BAD_HEIGHTS:
+        assert_refused("^heights is [^\n]*$", persistence.sublevel_diagrams, heights)
+    for heights, edges in BAD_EDGES:
+        assert_refused("^edges is [^\n]*$", persistence.sublevel_diagrams, heights, edges)
 
 
 def test_heights_of_the_other_byte_order() -> None:
@@ -179,47 +167,26 @@ def test_heights_of_the_other_byte_order() -> None:
     jax.tree.map(np.testing.assert_array_equal, swapped, expected)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"birth_range": (1.0, 1.0)},
-        {"persistence_range": (0.0, math.inf)},
-        {"pixels": (8, 0)},
-        {"pixels": (8,)},
-        {"pixels": 8},
-        {"birth_range": 3.0},
-        {"birth_range": ("0", "1")},
-        {"persistence_range": (0.0, 1e39)},
-        {"persistence_range": (1.0, 1.0 + 1e-12)},
-        {"variance": "0.1"},
-        {"variance": None},
-        {"variance": True},
-        {"exponent": 1j},
-        {"diagrams": np.zeros((3, 2))},
-        {"variance": 0},
-        {"variance": np.float32(0)},
-        {"variance": np.full(2, -1.0)},
-        {"exponent": -1.0},
-    ],
-)
-def test_bad_images(change: dict[str, Any]) -> None:
-    diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
-    options: dict[str, Any] = {"diagrams": diagrams, **IMAGE, "variance": 0.1} | change
-    assert_refused(f"^{next(iter(change))} is [^\n]*$", persistence.images, **options)
+BAD_OPTIONS: dict[str, list[Any]] = {
+    "birth_range": [(1.0, 1.0), 3.0, ("0", "1")],
+    "persistence_range": [(0.0, math.inf), (0.0, 1e39), (1.0, 1.0 + 1e-12)],
+    "pixels": [(8, 0), (8,), 8],
+    "variance": ["0.1", None, True, 0, np.float32(0), np.full(2, -1.0)],
+    "exponent": [1j, -1.0],
+    "diagrams": [np.zeros((3, 2)), *(thor2.Diagrams(*[births] * 3) for births in (np.zeros(3, int), [0.0, 1.0]))],
+}
 
 
-@pytest.mark.parametrize("births", [np.zeros(3, np.int32), [0.0, 1.0, 2.0]])
-def test_births_are_floating_arrays(births: Any) -> None:
-    diagrams = thor2.Diagrams(births, births, births)
-    assert_refused("diagrams has births .*floating", persistence.images, diagrams, **IMAGE, variance=0.1)
+@pytest.mark.parametrize("name", BAD_OPTIONS)
+def test_bad_options_of_images(name: str) -> None:
+    options: dict[str, Any] = {"diagrams": persistence.sublevel_diagrams(SOME), **IMAGE, "variance": 0.1}
+    for value in BAD_OPTIONS[name]:
+        assert_refused(f"^{name} (is|has births) [^\n]*$", persistence.images, **options | {name: value})
 
 
-def test_variance_and_exponent_may_be_integers() -> None:
+def test_options_of_images_may_be_integers_of_any_kind() -> None:
     diagrams = persistence.sublevel_diagrams(np.array([0, 2, 1, 3], np.float32))
-    images = [persistence.images(diagrams, **IMAGE, variance=kind(1), exponent=kind(2)) for kind in (int, float)]
+    options = {**IMAGE, "pixels": (np.int64(4), 4)}
+    images = [persistence.images(diagrams, **options, variance=kind(1), exponent=kind(2)) for kind in (int, float)]
+    assert images[0].shape == (4, 4)
     np.testing.assert_array_equal(*images)
-
-
-def test_numbers_of_pixels_may_be_from_numpy() -> None:
-    diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
-    assert persistence.images(diagrams, **(IMAGE | {"pixels": (np.int64(4), 4)}), variance=0.1).shape == (4, 4)

@@ -24,10 +24,6 @@ def ax() -> object:
     return figure.add_subplot()
 
 
-def draw(ax: object) -> None:
-    ax.figure.canvas.draw()
-
-
 def test_cloud_is_seen_by_the_camera(ax) -> None:
     drawn = plot.cloud(ax, POINTS, COLORS)
     offsets, faces = drawn.get_offsets(), drawn.get_facecolors()
@@ -37,7 +33,7 @@ def test_cloud_is_seen_by_the_camera(ax) -> None:
     assert ax.yaxis_inverted()
     plot.cloud(ax, POINTS, COLORS)  # A second cloud does not turn the axis back.
     assert ax.yaxis_inverted()
-    draw(ax)
+    ax.figure.canvas.draw()
     assert_refused("colors is int64", plot.cloud, ax, POINTS, COLORS.astype(np.int64))
 
 
@@ -63,7 +59,12 @@ def test_slices_have_their_borders(ax) -> None:
     top = float(aligned.points[..., 2].max())
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
-    draw(ax)
+    ax.figure.canvas.draw()
+
+
+def test_slices_leave_out_points_without_a_place(ax) -> None:
+    plot.slices(ax, np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS), COLORS, CONFIG)
+    assert len(ax.texts) == CONFIG.n_slices
 
 
 def test_diagram_has_every_pair(ax) -> None:
@@ -75,7 +76,7 @@ def test_diagram_has_every_pair(ax) -> None:
     mask = np.asarray(one.mask)
     expected = np.column_stack([np.asarray(one.births)[mask], np.asarray(one.deaths)[mask]])
     np.testing.assert_array_equal(drawn, expected)
-    draw(ax)
+    ax.figure.canvas.draw()
     assert_refused("diagrams", plot.persistence_diagram, ax, diagrams, CONFIG)
 
 
@@ -118,7 +119,7 @@ def test_network_emphasizes_used_regions(ax) -> None:
     faces = {tuple(np.round(collection.get_facecolors()[0][:3], 4)) for collection in ax.collections}
     for region in range(22):
         assert (tuple(np.round(NETWORK.mean_rgb[region] / 255, 4)) in faces) == (region in (2, 9))
-    draw(ax)
+    ax.figure.canvas.draw()
     for wrong in (weights[:-1], -weights):
         assert_refused("weights", plot.color_network, ax, NETWORK, wrong)
 
@@ -128,6 +129,8 @@ def test_confusion_shows_the_counts(ax) -> None:
     assert {(t.get_position(), t.get_text()) for t in ax.texts} == {((0, 0), "3"), ((1, 0), "1"), ((1, 1), "2")}
     np.testing.assert_allclose(ax.images[0].get_array(), [[0.75, 0.25], [0, 1]])  # the empty last column is left out
     assert_refused("counts", plot.confusion, ax, np.zeros((3, 2)), ("a", "b"))
+    plot.confusion(ax, np.eye(2), [4, 7])
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["4", "7"]
 
 
 def test_reliability_draws_accuracy_and_counts() -> None:
@@ -161,14 +164,3 @@ def test_input_that_cannot_be_drawn_is_refused(ax, function, arguments, match: s
 @pytest.mark.parametrize("region", [-1, NETWORK.n_regions])
 def test_regions_of_no_network_are_refused(ax, region: int) -> None:
     assert_refused("regions is", plot.color_matrix, ax, np.zeros((31, NETWORK.n_regions)), NETWORK, regions=[region])
-
-
-def test_slices_leave_out_points_without_a_place(ax) -> None:
-    missing = np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS)
-    plot.slices(ax, missing, COLORS, CONFIG)
-    assert len(ax.texts) == CONFIG.n_slices
-
-
-def test_classes_may_be_numbers(ax) -> None:
-    plot.confusion(ax, np.eye(2), [4, 7])
-    assert [label.get_text() for label in ax.get_xticklabels()] == ["4", "7"]

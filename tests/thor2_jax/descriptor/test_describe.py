@@ -1,9 +1,7 @@
 """TOPS and TOPS2 of clouds: equal by steps, in chunks of large batches and as a stream; compilations; bad input."""
 
-import dataclasses
 import logging
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -12,7 +10,6 @@ import pytest
 from refusals import assert_refused
 from slow_tier import slow
 from small_clouds import aligned_cloud, random_clouds
-from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
@@ -23,9 +20,11 @@ NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
 
 
-def test_describe_equals_its_steps() -> None:
+def test_describe_equals_its_steps_and_its_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     clouds = thor2.PointClouds.pack(random_clouds(0, [900] * 3))
     whole = thor2.describe(clouds, NETWORK, CLOSED)
+    monkeypatch.setattr(describe, "MAX_CHUNK_CLOUDS", 2)
+    np.testing.assert_allclose(thor2.describe(clouds, NETWORK, CLOSED).tops2, whole.tops2, atol=1e-6)
     aligned = thor2.align(clouds, CLOSED)
     for by_steps in (
         thor2.describe_aligned(aligned, NETWORK, CLOSED),
@@ -44,56 +43,22 @@ def test_describe_with_jax_enable_x64() -> None:
     np.testing.assert_allclose(tops2, expected, atol=1e-4)
 
 
-def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Values and gradients equal those of a small batch, with callbacks and with a last, smaller chunk."""
-    monkeypatch.setattr(describe, "MAX_CHUNK_CLOUDS", 2)
-    monkeypatch.setattr(describe, "CHUNKS_PER_STEP", 2)
-    config, count = dataclasses.replace(SMALL_CONFIG, homology="gudhi"), 7
-    few = thor2.PointClouds.pack([aligned_cloud(seed, 300) for seed in range(2)], 512)
-    order = np.arange(count) % 2
-    many = jax.tree.map(lambda a: a[order], few)
-
-    @jax.jit
-    @partial(jax.grad, has_aux=True)
-    def gradient_of_mass(points: jax.Array, clouds: thor2.PointClouds) -> tuple[jax.Array, thor2.Descriptors]:
-        descriptors = thor2.describe_aligned(dataclasses.replace(clouds, points=points), NETWORK, config)
-        return descriptors.images.sum(), descriptors
-
-    expected, actual = (jax.tree.map(np.asarray, gradient_of_mass(clouds.points, clouds)) for clouds in (few, many))
-    assert np.abs(expected[0]).max() > 0
-    for k, tolerance in enumerate((1e-5, 1e-6)):
-        same = partial(np.testing.assert_allclose, atol=tolerance)
-        jax.tree.map(lambda a, b, same=same: same(a, b[order]), actual[k], expected[k])
-
-
-def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
+def test_arguments_of_other_types_are_named() -> None:
     packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
     one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)
-    for function in (thor2.describe, thor2.describe_aligned, thor2.strips):
-        for clouds, words in (
-            (np.zeros((1, 5, 3)), "clouds is ndarray"),
-            (one, r"points \[512, 3\]"),
-            (batches, r"points \[1, 1, 512, 3\]"),
-        ):
-            assert_refused(words, function, clouds, NETWORK, CLOSED)
+    exchanged = "network is a DescriptorConfig; expected a ColorNetwork"
+    for function in (thor2.describe, thor2.describe_aligned, thor2.strips, describe.describe_sharded):
+        assert_refused("clouds is ndarray", function, np.zeros((1, 5, 3)), NETWORK, CLOSED)
+        assert_refused(r"points \[512, 3\]", function, one, NETWORK, CLOSED)
+        assert_refused(r"points \[1, 1, 512, 3\]", function, batches, NETWORK, CLOSED)
+        assert_refused(exchanged, function, packed, CLOSED, NETWORK)
+        assert_refused("config is a NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
     for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
         assert_refused("clouds is list", without_network, [], CLOSED)
-
-
-@pytest.mark.parametrize("function", [thor2.describe, thor2.describe_aligned, thor2.strips, describe.describe_sharded])
-def test_exchanged_settings_are_named(function: Callable) -> None:
-    packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
-    assert_refused("network is a DescriptorConfig; expected a ColorNetwork", function, packed, CLOSED, NETWORK)
-    assert_refused("config is a NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
-
-
-def test_settings_of_another_type_are_named() -> None:
-    packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
-    for function in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
-        assert_refused("config is a ColorNetwork", function, packed, NETWORK)
+        assert_refused("config is a ColorNetwork", without_network, packed, NETWORK)
     assert_refused("strips is a PointClouds; expected a Strips", thor2.describe_strips, packed, NETWORK, CLOSED)
     assert_refused("parameters is a dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
-    assert_refused("network is a DescriptorConfig", thor2.Parameters.of, CLOSED, NETWORK)
+    assert_refused(exchanged, thor2.Parameters.of, CLOSED, NETWORK)
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
@@ -126,9 +91,7 @@ def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
 
 
 @pytest.mark.parametrize(("capacity", "size"), [(1, 64), (512, 64), (2048, 64), (4096, 32), (8192, 16), (2**18, 1)])
-def test_chunks_have_few_points_except_on_accelerators(
-    capacity: int, size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_have_few_points_except_on_a_gpu(capacity: int, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert describe.chunk_size(clouds_of(2, capacity)) == size
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

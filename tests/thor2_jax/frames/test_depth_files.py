@@ -1,6 +1,5 @@
 """Depth files: each format as other software writes it, and invalid files."""
 
-import io
 import sys
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from failures import Pickled
+from image_files import encode_npy
 from PIL import Image
 from refusals import assert_refused
 
@@ -87,33 +87,23 @@ def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert_refused(r"^depth: .*d\.exr is an EXR file; expected .*OpenEXR", read_depth, tmp_path / "d.exr")
 
 
-@pytest.mark.parametrize(
-    "array",
-    [
-        np.zeros((5, 7), np.uint8),
-        np.zeros((5, 7), np.complex64),
-        np.zeros((5, 7, 3), np.float32),
-        np.zeros(35, np.uint16),
-        np.zeros((0, 7), np.float32),
-        np.full((5, 7), -1),
-        np.full((5, 7), 2**32),
-    ],
+NO_DEPTH = (
+    *(np.zeros((5, 7), kind) for kind in (np.uint8, np.complex64)),
+    *(np.zeros(shape, np.float32) for shape in ((5, 7, 3), (35,), (0, 7))),
+    *(np.full((5, 7), value) for value in (-1, 2**32)),
 )
+
+
+@pytest.mark.parametrize("array", NO_DEPTH)
 def test_arrays_that_are_no_depth(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "d.npy", array)
     assert_refused(r"^depth: .*d\.npy has ", read_depth, tmp_path / "d.npy")
 
 
-def npy_file(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
 def test_damaged_npy_files(tmp_path: Path) -> None:
-    whole = npy_file(METRES)
+    whole = encode_npy(METRES)
     huge = whole.replace(b"(5, 7), }" + b" " * 12, b"(1048576, 1048576), }")
-    for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[Pickled()]], object))):
+    for content in (b"", b"text", whole[:20], whole[:-3], encode_npy(np.array([[Pickled()]], object))):
         (tmp_path / "d.npy").write_bytes(content)
         assert_refused(r"^depth: .*d\.npy ", read_depth, tmp_path / "d.npy")
     (tmp_path / "d.npy").write_bytes(huge)

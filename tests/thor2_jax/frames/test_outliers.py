@@ -53,12 +53,6 @@ def test_types_are_kept_and_colors_rounded_halves_up() -> None:
     np.testing.assert_array_equal(mean_colors, [[1, 11, 255], [7, 8, 9]])
 
 
-def test_empty_cloud() -> None:
-    points, colors = voxel_downsample(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 0.01)
-    assert points.shape == colors.shape == (0, 3)
-    assert points.dtype == np.float32 and colors.dtype == np.uint8
-
-
 def test_points_that_are_not_finite_are_refused() -> None:
     points = np.array([[0, 0, math.nan], [0, 0, 0]])
     assert_refused("^points has rows", voxel_downsample, points, np.zeros((2, 3)), 0.01)
@@ -193,6 +187,8 @@ def test_the_neighbour_rule_is_skipped_if_it_drops_most(strays: int, relaxed: bo
     np.testing.assert_array_equal(kept, np.arange(1600))  # each scattered point is a component
 
 
-def test_no_points() -> None:
-    kept, relaxed = remove_outliers(np.zeros((0, 3), np.float32))
+def test_clouds_without_points() -> None:
+    points, colors = voxel_downsample(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 0.01)
+    assert (points.shape, points.dtype, colors.shape, colors.dtype) == ((0, 3), np.float32, (0, 3), np.uint8)
+    kept, relaxed = remove_outliers(points)
     assert len(kept) == 0 and not relaxed

@@ -99,9 +99,9 @@ def test_scores_against_a_gaussian_process() -> None:
     views = np.concatenate([*(each.embeddings for each in gallery.objects.values()), gallery.references.embeddings])
     owner = np.repeat([0, 1, 2, 0, 4, 4], [4, 24, 12, 12, 12, 40])  # mug, bowl, class, forgotten class, background
     counts = np.array([4, 24, 14, 14, 14])[owner]  # of an owner that is not enrolled, the mean of those that are
-    process = GaussianProcessRegressor(
-        RBF(GAMMA**-0.5, "fixed"), alpha=RIDGE * counts / counts.mean(), optimizer=None
-    ).fit(views, np.eye(5)[owner])
+    noise = RIDGE * counts / counts.mean()
+    process = GaussianProcessRegressor(RBF(GAMMA**-0.5, "fixed"), alpha=noise, optimizer=None)
+    process.fit(views, np.eye(5)[owner])
     pairs = [(0, 5), (1, 5), (6, 5), (0, 6), (1, 9)]
     queries = np.concatenate([unit(views_around(a, 5, seed=1) + views_around(b, 5, seed=3)) for a, b in pairs])
     values = process.predict(queries).clip(0)

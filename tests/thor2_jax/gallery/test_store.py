@@ -31,13 +31,9 @@ FINGERPRINT = "f" * 64
 def enrolled(seed: int, n_views: int = 2) -> GalleryObject:
     rng = np.random.default_rng(seed)
     embeddings = rng.normal(size=(2 * n_views, 16))
-    views = [
-        PreparedInstance(
-            1, rng.random((50, 3), np.float32), rng.integers(0, 256, (50, 3), np.uint8), np.zeros(50, bool)
-        )
-        for _ in range(n_views)
-    ]
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    points, colors = rng.random((n_views, 50, 3), np.float32), rng.integers(0, 256, (n_views, 50, 3), np.uint8)
+    views = [PreparedInstance(1, *each, np.zeros(50, bool)) for each in zip(points, colors, strict=True)]
     return GalleryObject(embeddings.astype(np.float16), CompactClouds.of(views), "frames", "2026-01-02")
 
 
@@ -104,9 +100,8 @@ def test_undo_restores_the_gallery_and_its_files(directory: Path) -> None:
     undone = update_gallery(directory, undo(directory, changed.generation), FINGERPRINT, changed)
     again = load_gallery(directory)
     assert undone.generation == again.generation == changed.generation + 1
-    assert object_files(undone) == object_files(again) == object_files(before) and undone.stamp == gallery_stamp(
-        directory
-    )
+    assert object_files(undone) == object_files(again) == object_files(before)
+    assert undone.stamp == gallery_stamp(directory)
     np.testing.assert_array_equal(again.objects["mug"].embeddings, enrolled(0).embeddings)
     update_gallery(directory, undo(directory, undone.generation))  # restores the change
     assert object_files(load_gallery(directory)) == object_files(changed)
@@ -170,7 +165,10 @@ def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
     assert files_of(directory) == before
 
 
-def test_files_of_the_user_stay_and_hinder_nothing(directory: Path) -> None:
+def test_files_and_links_of_the_user_stay_and_hinder_nothing(directory: Path, tmp_path: Path) -> None:
+    (link,) = (directory / "objects").glob(f"{load_gallery(directory).objects['mug'].file}.*")
+    link.rename(tmp_path / link.name)
+    link.symlink_to(tmp_path / link.name)
     content_addressed = hashlib.sha256(b"a user's").hexdigest()
     names = [f"objects/{name}" for name in ("scan.ply", ".DS_Store", f"{content_addressed}.safetensors", "a/b.txt")]
     users = [directory / name for name in (*names, ".index.backup12.json", ".vimrc.original", "notes.txt")]
@@ -180,7 +178,9 @@ def test_files_of_the_user_stay_and_hinder_nothing(directory: Path) -> None:
     for seed in (5, 6):
         update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
     assert all(path.read_text() == "a user's" for path in users)
-    assert len(list((directory / "objects").glob("*.safetensors"))) == 2 + 1 + 1  # of the change before, and the user's
+    assert link.is_symlink() and (tmp_path / link.name).is_file()
+    # Two objects, that of the change before, the user's file and the link.
+    assert len(list((directory / "objects").glob("*.safetensors"))) == 2 + 1 + 1 + 1
 
 
 def test_a_former_index_of_the_user_is_not_replaced(tmp_path: Path) -> None:
@@ -196,15 +196,6 @@ def test_nothing_behind_a_symbolic_link_is_removed(directory: Path, tmp_path: Pa
     for seed in (5, 6):
         update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
     assert before.items() <= files_of(tmp_path / "shared").items()
-
-
-def test_symbolic_links_to_objects_are_not_removed(directory: Path, tmp_path: Path) -> None:
-    (file,) = (directory / "objects").glob(f"{load_gallery(directory).objects['mug'].file}.*")
-    file.rename(tmp_path / file.name)
-    file.symlink_to(tmp_path / file.name)
-    for seed in (5, 6):
-        update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
-    assert file.is_symlink() and (tmp_path / file.name).is_file()
 
 
 def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:

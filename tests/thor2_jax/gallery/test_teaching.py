@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from image_files import tilted
 from refusals import assert_refused
 from small_runs import small_embedding, untrained_run
 
@@ -19,8 +20,6 @@ from thor2_jax.model.inference import answers
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
 from training.objects.builtin_objects import builtin_objects
-
-INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +36,12 @@ def frame(*shapes: tuple[int, int, int, int, tuple[int, int, int]], seed: int = 
     """Return a frame of tilted rectangles (top, left, height, width, colour); depth grows to the right."""
     rng = np.random.default_rng(seed)
     color = rng.integers(100, 120, (240, 320, 3), np.uint8)
-    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
     labels = np.zeros((240, 320), np.uint8)
     for number, (top, left, height, width, rgb) in enumerate(shapes, 1):
         place = slice(top, top + height), slice(left, left + width)
         labels[place] = number
         color[place] = np.clip(np.array(rgb) + rng.integers(-9, 10, (height, width, 3)), 0, 255)
-    return thor2.RGBDFrame(color, depth, labels, INTRINSICS)
+    return dataclasses.replace(tilted(labels), color=color)
 
 
 RED, BLUE = (20, 20, 60, 120, (220, 30, 30)), (120, 180, 90, 60, (30, 40, 220))

@@ -59,11 +59,8 @@ def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
     tables.add("table/000007", scene, detections_of(scene, ANSWERS), 0.25)
     tables.write(coco=tmp_path / "results.json")
     dataset = COCO()
-    dataset.dataset = {
-        "images": [{"id": 1, "height": 40, "width": 60}],
-        "annotations": [],
-        "categories": [{"id": 1}, {"id": 2}],
-    }
+    images, categories = [{"id": 1, "height": 40, "width": 60}], [{"id": 1}, {"id": 2}]
+    dataset.dataset = {"images": images, "annotations": [], "categories": categories}
     dataset.createIndex()
     loaded = dataset.loadRes(str(tmp_path / "results.json"))
     annotations = {entry["category_id"]: entry for entry in loaded.loadAnns(loaded.getAnnIds())}

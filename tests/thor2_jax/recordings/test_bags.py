@@ -135,9 +135,7 @@ def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
     ("name", "compression"),
     [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.mcap", "storage"), ("folder", "message"), ("folder", "file")],
 )
-def test_decompression_has_a_limit(
-    tmp_path: Path, name: str, compression: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decompression_is_limited(tmp_path: Path, name: str, compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_recording(tmp_path / name, FRAMES[:1], compression=compression)
     with Bag(path) as bag:
         np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)

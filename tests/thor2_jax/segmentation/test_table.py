@@ -20,41 +20,29 @@ APART = [
 ]
 
 
+TOUCHING = [Box(0.0, 0.12, (0.08, 0.03), 0.2, RED), Box(0.01, -0.06, (0.05, 0.03), 0.1, (180, 40, 40))]
+STACKED = [Box(0.0, 0.0, (0.09, 0.09), 0.05, YELLOW), Box(0.0, 0.04, (0.05, 0.04), 0.12, BLUE, bottom=0.05)]
+STRIPS = [Box(-0.15, 0.0, (0.08, 0.008), 0, BLUE), Box(0.1, 0.1, (0.008, 0.07), 0, (20, 20, 20))]
+
+
+def books(height: float) -> list[Box]:
+    """Return books whose tops lie in one plane, which is no table; thin ones are lower than the noise."""
+    return [
+        Box(-0.25, 0.1, (0.08, 0.11), height, BLUE),
+        Box(0.0, 0.1, (0.07, 0.1), height, (235, 235, 235)),
+        Box(0.25, 0.05, (0.08, 0.11), height, YELLOW),
+        Box(-0.15, -0.2, (0.1, 0.1), height, (225, 220, 215)),
+        Box(0.1, -0.2, (0.09, 0.09), height, (30, 30, 30)),
+    ]
+
+
+POSES = [(40, 0, 0, 0.9), (55, 30, 5, 0.8), (20, -70, -10, 1.1), (65, 140, 0, 0.9)]
 SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
-    **{
-        f"apart {pose}": (APART, pose, 0.85)
-        for pose in [(40, 0, 0, 0.9), (55, 30, 5, 0.8), (20, -70, -10, 1.1), (65, 140, 0, 0.9)]
-    },
-    "touching in the image": (
-        [Box(0.0, 0.12, (0.08, 0.03), 0.2, RED), Box(0.01, -0.06, (0.05, 0.03), 0.1, (180, 40, 40))],
-        (55,),
-        0.85,
-    ),
-    "meeting at a fold": (
-        [Box(0.0, 0.0, (0.09, 0.09), 0.05, YELLOW), Box(0.0, 0.04, (0.05, 0.04), 0.12, BLUE, bottom=0.05)],
-        (50, 0, 0, 0.6),
-        0.75,
-    ),
-    "flat strips": (
-        [Box(-0.15, 0.0, (0.08, 0.008), 0, BLUE), Box(0.1, 0.1, (0.008, 0.07), 0, (20, 20, 20))],
-        (30,),
-        0.7,
-    ),
-    # The tops of books lie in one plane, which is no table; thin ones are lower than the noise.
-    **{
-        f"books of {height} m": (
-            [
-                Box(-0.25, 0.1, (0.08, 0.11), height, BLUE),
-                Box(0.0, 0.1, (0.07, 0.1), height, (235, 235, 235)),
-                Box(0.25, 0.05, (0.08, 0.11), height, YELLOW),
-                Box(-0.15, -0.2, (0.1, 0.1), height, (225, 220, 215)),
-                Box(0.1, -0.2, (0.09, 0.09), height, (30, 30, 30)),
-            ],
-            (45, 0, 0, 1.1),
-            0.85,
-        )
-        for height in (0.004, 0.02)
-    },
+    **{f"apart {pose}": (APART, pose, 0.85) for pose in POSES},
+    "touching in the image": (TOUCHING, (55,), 0.85),
+    "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.75),
+    "flat strips": (STRIPS, (30,), 0.7),
+    **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.85) for height in (0.004, 0.02)},
 }
 """Name -> boxes, pose of the camera, and least overlap of each box with a piece."""
 
@@ -159,10 +147,8 @@ def test_depth_with_nan_and_holes() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400)])
 def test_images_of_few_pixels(size: tuple[int, int]) -> None:
-    frame = RGBDFrame(
-        np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16), None, Intrinsics(500.0, 500.0, 0.0, 0.0)
-    )
-    assert segment_table(frame).shape == size
+    color, depth = np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16)
+    assert segment_table(RGBDFrame(color, depth, None, Intrinsics(500.0, 500.0, 0.0, 0.0))).shape == size
 
 
 def test_borders_are_refined_as_in_the_whole_image() -> None:

@@ -40,6 +40,9 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
 
 Files = dict[str, bytes]
+Open = Callable[..., Page]
+"""Type of the fixture `open_page`."""
+
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
 """The classes of the run: the objects of the page's sample frames."""

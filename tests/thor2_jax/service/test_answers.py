@@ -21,9 +21,7 @@ import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
 from thor2_jax.frames.intrinsics import parse_intrinsics
 
-from .conftest import CLASSES
-
-Files = dict[str, bytes]
+from .conftest import CLASSES, Files
 
 
 def test_recognize_matches_the_library(

@@ -30,6 +30,8 @@ from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
 
+from .conftest import Files
+
 
 class Device:
     """Double numbers; wait for permission before each batch."""
@@ -117,7 +119,7 @@ def app(run_dir: Path) -> FastAPI:
     return create_app(Settings(run_dir, token="secret", queue=2, deadline=HANG, teach=True))
 
 
-def frame_request(files: dict[str, bytes], *then: Callable[[httpx.Response], None]) -> Callable[..., Any]:
+def frame_request(files: Files, *then: Callable[[httpx.Response], None]) -> Callable[..., Any]:
     """Return a function that sends a frame, and calls `then` with its answer."""
 
     async def send(client: httpx.AsyncClient) -> httpx.Response:
@@ -159,9 +161,7 @@ def test_token_is_required_except_for_health_and_page(app: FastAPI) -> None:
         assert answer.status_code == (503 if answer.url.path == "/readyz" else 200)
 
 
-def test_requests_are_refused_unless_ready(
-    app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_requests_are_refused_unless_ready(app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
     for state in ("starting", "stopping", "failed"):
         monkeypatch.setattr(app.state.service, "state", state)
         for answer in calls(app, lambda c: c.get("/readyz"), frame_request(files)):
@@ -201,7 +201,7 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
 
 
 def test_full_queue_is_429_and_deadline_504(
-    app: FastAPI, files: dict[str, bytes], recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
+    app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused, done, timeout = [], asyncio.Event(), asyncio.timeout
     deadlines = dict[float, asyncio.Timeout]()
@@ -234,7 +234,7 @@ def test_full_queue_is_429_and_deadline_504(
 
 @pytest.mark.parametrize(("adapt", "status"), [(False, 200), (True, 403)])
 def test_pages_of_other_sites_do_not_adapt_the_service(
-    teaching_run: Path, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, adapt: bool, status: int
+    teaching_run: Path, files: Files, monkeypatch: pytest.MonkeyPatch, adapt: bool, status: int
 ) -> None:
     app = create_app(Settings(teaching_run, adapt=adapt))
     monkeypatch.setattr(app.state.service, "state", "ready")
@@ -251,14 +251,14 @@ def test_a_list_at_the_end_of_a_message_has_three_dots() -> None:
     assert raised.value.message == "instance is 7; expected one of 1, 2, ..."
 
 
-def test_internal_error_hides_its_traceback(app: FastAPI, files: dict[str, bytes], recognize: AsyncMock) -> None:
+def test_internal_error_hides_its_traceback(app: FastAPI, files: Files, recognize: AsyncMock) -> None:
     recognize.side_effect = RuntimeError("at /some/path")
     check_refused(calls(app, frame_request(files))[0], 500, None)
     assert 'thor2_requests_total{path="/v1/recognize",status="500"} 1.0' in app.state.service.metrics.text().decode()
 
 
 def test_large_files_stay_in_memory(
-    app: FastAPI, files: dict[str, bytes], recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
+    app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(tempfile.SpooledTemporaryFile, "rollover")  # It would write to a file.
     large = files | {"color": bytes(MAX_BODY - 200_000)}

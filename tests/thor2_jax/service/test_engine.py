@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from unittest.mock import create_autospec
 
-import jax
 import numpy as np
 import pytest
 from slow_tier import slow
@@ -21,7 +20,7 @@ from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import ColorTransform
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
-from thor2_jax.service.engine import CloudResult, InferenceEngine
+from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 
 BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
@@ -41,10 +40,22 @@ def write_run(folder: Path, trained: tuple[str, ...], record: dict[str, object])
     return folder
 
 
-def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], list[CloudResult]]:
-    """Return the instances of a frame, and the results of those that can be used."""
+def check_answers(run: Path, frame: thor2.RGBDFrame) -> list[float | None]:
+    """Compare the engine's answers with the recognizer's; return the calibrated confidences, which are the answers'."""
+    engine, recognizer = InferenceEngine(Settings(run, max_batch=8)), thor2.Recognizer.load(run)
     instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    return instances, engine.infer([instance for instance in instances if instance.reason is None])
+    usable = [instance for instance in instances if instance.reason is None]
+    results = engine.infer(usable)
+    answers = engine.recognize(instances, results)
+    assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
+    assert engine.model.names == recognizer.classes
+    assert {answer.name for answer in engine.recognize([i for i in instances if i.reason is not None], [])} == {None}
+    given = [answer for answer in answers if answer.confidence is not None]
+    confidences = [
+        calibrated_confidence(engine.model, answer, one.inference) for answer, one in zip(given, results, strict=True)
+    ]
+    assert all(c in (None, answer.confidence) for c, answer in zip(confidences, given, strict=True))
+    return confidences
 
 
 @pytest.mark.parametrize("trained", [("a", "b"), *slow(())])
@@ -55,14 +66,7 @@ def test_the_engine_answers_as_the_recognizer(
     recognizer = thor2.Recognizer.load(write_run(tmp_path / "run", trained, record))
     recognizer.enroll("tall", [(frame, 200)])
     recognizer.enroll("wide", [(frame, 7)])
-    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
-    assert engine.model.names == (*trained, "tall", "wide")
-    instances, results = inferred(engine, frame)
-    recognitions = engine.recognize(instances, results)
-    assert_same_answers(recognitions, recognizer.recognize(frame), 1e-4)
-    assert [calibrated_confidence(engine.model, recognitions[0], one.inference) for one in results] == [None] * 3
-    unusable = [instance for instance in instances if instance.reason is not None]
-    assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
+    assert set(check_answers(tmp_path / "run", frame)) == {None}
 
 
 @pytest.mark.parametrize("calibration", [None, Calibration(0.0, 1.0, 1.0, 0.5, 0.1)])
@@ -70,18 +74,8 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     record: dict[str, object] = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
     run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
     save_run(run, tmp_path / "run")
-    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
-    assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
-    instances, results = inferred(engine, frame)
-    recognizer = thor2.Recognizer.load(tmp_path / "run")
-    answers = engine.recognize(instances, results)
-    assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
-    usable = [one for one in answers if one.confidence is not None]
-    assert len(usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}
-    for answer, result in zip(usable, results, strict=True):
-        expected = None if calibration is None else answer.confidence
-        assert calibrated_confidence(engine.model, answer, result.inference) == expected
-    assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
+    confidences = check_answers(tmp_path / "run", frame)
+    assert all((given is None) == (calibration is None) for given in confidences)
 
 
 def test_confidences_use_the_temperatures_of_both_classifiers(run_dir: Path) -> None:

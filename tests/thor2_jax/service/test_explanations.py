@@ -16,7 +16,7 @@ from fastapi import FastAPI
 from image_files import encode_image
 from page_actions import answered, assert_fits, upload, wait_until
 from PIL import Image
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Route, expect
 from processes import HANG
 from service_requests import check_refused
 from small_runs import untrained_run
@@ -36,8 +36,7 @@ from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import MAX_EXPLAINED, LabelMap
 
-Open = Callable[..., Page]
-Files = dict[str, bytes]
+from .conftest import Files, Open
 
 
 def decoded(label_map: LabelMap) -> np.ndarray:
@@ -166,22 +165,18 @@ def test_why_is_503_until_explanations_are_compiled(
 
 
 @pytest.mark.usefixtures("teaching_url")  # starts the service
-@pytest.mark.parametrize(("state", "is_logged"), [("ready", True), ("stopping", False)])
-def test_compiled_explanations_are_logged_with_their_size(
-    teaching_app: FastAPI,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    state: str,
-    is_logged: bool,
+def test_compiled_explanations_are_logged_unless_the_service_stops(
+    teaching_app: FastAPI, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     service, compiled = teaching_app.state.service, Mock()
-    monkeypatch.setattr(service, "_compiled", {})
-    monkeypatch.setattr(service, "state", state)
     monkeypatch.setattr(pipeline, "compile_explanations", compiled)
-    service._compile_explanations((4096, True)).result(HANG)
-    assert compiled.call_args.args[1:3] == (4096, True)
-    assert ("clouds of 4096 points are compiled" in caplog.text) == is_logged
+    for state, size in (("ready", 4096), ("stopping", 2048)):
+        monkeypatch.setattr(service, "state", state)
+        monkeypatch.setattr(service, "_compiled", {})
+        service._compile_explanations((size, True)).result(HANG)
+        assert compiled.call_args.args[1:3] == (size, True)
+        assert (f"clouds of {size} points are compiled" in caplog.text) == (state == "ready")
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from thor2_jax.service import preparation
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import Settings
 
-Files = dict[str, bytes]
+from .conftest import Files
 
 
 def failing(frame: thor2.RGBDFrame) -> np.ndarray:

@@ -16,9 +16,7 @@ import schemathesis
 from processes import HANG, wait_until
 from slow_tier import slow
 
-from .conftest import assert_conforms
-
-Files = dict[str, bytes]
+from .conftest import Files, assert_conforms
 
 
 def memory(pid: int) -> int:
@@ -48,9 +46,7 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
 
 
 @pytest.mark.parametrize("workers", [1, *slow(2)])
-def test_sigterm_under_load_answers_accepted_requests(
-    workers: int, start_server: Callable[..., Any], files: Files
-) -> None:
+def test_sigterm_answers_accepted_requests(workers: int, start_server: Callable[..., Any], files: Files) -> None:
     server, answered = start_server("--workers", str(workers), "--processes", "1"), list[int]()
     wait_until(lambda: server.log.read_text().count("ready: ") == workers, server.log.read_text)
 

@@ -13,10 +13,7 @@ from page_actions import FIELDS, answered, assert_fits, changed_answers, upload,
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
 
-from .conftest import CLASSES, SAMPLE_INDEX
-
-Files = dict[str, bytes]
-Open = Callable[..., Page]
+from .conftest import CLASSES, SAMPLE_INDEX, Files, Open
 
 
 def choose_sample(page: Page) -> np.ndarray:

@@ -15,8 +15,7 @@ from processes import HANG
 import thor2_jax as thor2
 from thor2_jax.segmentation.table import segment_table
 
-Open = Callable[..., Page]
-Files = dict[str, bytes]
+from .conftest import Files, Open
 
 
 def select(page: Page, label: int) -> None:

@@ -29,9 +29,7 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 
-from .conftest import assert_conforms
-
-Files = dict[str, bytes]
+from .conftest import Files, assert_conforms
 
 
 @pytest.fixture
@@ -248,9 +246,7 @@ def test_a_change_waits_for_another_writer(
         ({"Origin": "http://HOST"}, 200),
     ],
 )
-def test_pages_of_other_sites_cannot_teach(
-    headers: dict[str, str], status: int, http: httpx.Client, files: Files
-) -> None:
+def test_other_sites_cannot_teach(headers: dict[str, str], status: int, http: httpx.Client, files: Files) -> None:
     sent = {name: value.replace("HOST", http.base_url.netloc.decode()) for name, value in headers.items()}
     answer = http.post("/v1/objects", files=files, data={"name": "tall", "instance": "200"}, headers=sent)
     assert answer.status_code == status and known(http) == ({"tall": 1} if status == 200 else {})
