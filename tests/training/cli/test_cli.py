@@ -194,11 +194,13 @@ def test_options_replace_values_of_the_protocols(
     replace = dataclasses.replace
     distractors, quick = (replace(each.distractors, workers=2) for each in (DEFAULT, QUICK))
     default = replace(DEFAULT, distractors=distractors)
+    assert (distractors.procedural, quick.procedural) == (1500, 600)
     assert job().protocol == default and default.classifiers == ()
     assert job("--quick").protocol == replace(QUICK, distractors=quick)
     changed = job("--quick", "--embedding", 50, "--epochs", 2, "--azimuth-step", 40).protocol
     assert changed.distractors == replace(quick, procedural=50, epochs=2)
-    assert (changed.azimuth_step, changed.polar_step) == (40, QUICK.polar_step)
+    assert (changed.azimuth_step, changed.polar_step, changed.fit.epochs) == (40, QUICK.polar_step, 2)
+    assert job("--distractors", meshes).protocol.distractors.meshes.keys() == set(NAMES)
     assert job("--classifiers", "ce").protocol == replace(default, classifiers=("ce",))
     assert job("--embedding", 0).protocol == replace(DEFAULT, classifiers=FEATURES, distractors=None)
     assert job("--paper").protocol == PAPER and PAPER.classifiers == FEATURES and PAPER.distractors is None
