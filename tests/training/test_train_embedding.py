@@ -135,8 +135,10 @@ def test_invalid_and_changed_distractors_are_refused(whole: Whole) -> None:
     assert_refused("there are 9 objects", dataclasses.replace, DISTRACTORS, procedural=9)
 
 
-@pytest.mark.usefixtures("weights")
-def test_folds_of_embeddings(tmp_path: Path) -> None:
+def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    sample = mock.Mock(wraps=distractors.sample_normalized)
+    monkeypatch.setattr(distractors, "sample_normalized", sample)
     stages: dict[str, None] = {}
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
     runs = train(tmp_path / "run", short, progress=lambda stage, *values: stages.setdefault(stage))
@@ -144,12 +146,4 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
-
-
-def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("THOR2_CACHE", "off")
-    sample = mock.Mock(wraps=distractors.sample_normalized)
-    monkeypatch.setattr(distractors, "sample_normalized", sample)
-    short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
-    train(tmp_path / "run", short)
     assert sample.call_count == 1

@@ -14,7 +14,6 @@ from scipy.ndimage import generic_filter
 from written_files import files_of
 
 import thor2_jax as thor2
-from thor2_jax.frames.frames import backproject
 from training.objects.meshes import find_meshes, load_mesh
 from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
@@ -93,12 +92,6 @@ def test_enlarged_mask_matches_opencv() -> None:
     coverage = cv2.resize(mask[9:40, 15:46].astype(np.float32), (124, 124), interpolation=cv2.INTER_LINEAR)
     decided = np.abs(coverage - 0.5) > 1e-3
     np.testing.assert_array_equal(normals.any(axis=-1)[decided], coverage[decided] > 0.5)
-
-
-def test_normals_of_a_plane_are_equal_up_to_the_rim() -> None:
-    normal, mask = np.array([0.48, -0.36, -0.8]), box(4, 10, 30, 18)
-    points = backproject(plane_frame((0.48, -0.36, -0.8), mask).depth_m, CAMERA)
-    np.testing.assert_allclose(surface_normals(points, mask)[mask], np.tile(normal, (mask.sum(), 1)), atol=1e-5)
 
 
 def test_normals_of_a_sphere() -> None:
