@@ -51,9 +51,7 @@ def end_descendants_with_this_process() -> None:
 
 
 def wait_until(
-    condition: Callable[[], object],
-    explain: Callable[[], str] = str,
-    pause: Callable[[float], object] = time.sleep,
+    condition: Callable[[], object], explain: Callable[[], str] = str, pause: Callable[[float], object] = time.sleep
 ) -> None:
     """Wait until a condition holds, at most `HANG` seconds; `explain` gives the message of the failure."""
     until = time.monotonic() + HANG

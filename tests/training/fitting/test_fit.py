@@ -137,12 +137,7 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Sampl
 
 
 def test_invalid_options_are_refused_by_name() -> None:
-    for name, value in (
-        ("epochs", 0),
-        ("batch_size", 1),
-        ("seed", -1),
-        ("seed", 2**31),
-    ):
+    for name, value in (("epochs", 0), ("batch_size", 1), ("seed", -1), ("seed", 2**31)):
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 

@@ -19,15 +19,7 @@ from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
 from training.train_job import TrainJob, run_train_job
 from training.views import crops as crops_module
-from training.views.crops import (
-    CROP_SIZE,
-    ViewCrops,
-    fill_depth,
-    render_crops,
-    rgbd_crop,
-    stacked,
-    surface_normals,
-)
+from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, render_crops, rgbd_crop, stacked, surface_normals
 from training.views.dataset import ViewDataset, render_dataset
 from training.views.mesh_views import RenderJob
 from training.views.normalized_views import WithoutClasses
