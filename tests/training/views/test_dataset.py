@@ -288,8 +288,9 @@ def test_only_what_was_rendered_is_removed(copied: Path) -> None:
     assert all(path.read_text() == "a user's" for path in (*users, copied / "manifest.json"))
 
 
-def test_views_are_read_normalized(tmp_path: Path) -> None:
+def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Coordinates differ from those of `view_normalize`, cloud by cloud, by at most half a step."""
+    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 30)
     dataset = render_dataset(RenderJob(OBJECTS, 60, 45), tmp_path)
     assert dataset.classes == NAMES and [(shard.label, shard.views) for shard in dataset.shards] == [(0, 30), (1, 30)]
     for index, (name, clouds) in enumerate(render_views(OBJECTS, 60, 45).items()):
