@@ -15,7 +15,7 @@ from image_files import small_frame
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG, untrained_embedding_run
-from toy_recognizers import ToyDescriptors, UntaughtRecognizer
+from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
 from written_files import ParsedPage
 
 import thor2_jax as thor2
@@ -84,9 +84,7 @@ class ToyRecognizer(UntaughtRecognizer):
             raise KeyboardInterrupt
         with self.log.open("a") as file:
             file.write(f"{number}\n")
-        described = super().describe(frame)
-        described.oriented = ToyDescriptors(number)
-        return described
+        return described(super().describe(frame).instances, number)
 
     def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, oriented])
@@ -310,30 +308,17 @@ def test_page_of_a_video_and_of_stored_thresholds(tmp_path: Path) -> None:
     assert any(text.startswith("threshold 0.500") for text in page.text)
 
 
-class GivenRecognizer(UntaughtRecognizer):
-    """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
-
-    def __init__(self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, Any]) -> None:
-        super().__init__(("mug", "bowl", "can"), ("tops", "tops2"))
-        self.instances = [SimpleNamespace(label=k, reason=unusable.get(k), occluded=k == 4) for k in labels]
-        self.table = {name: np.array(rows) for name, rows in probabilities.items()}
-
-    def describe(self, frame: Any) -> Any:
-        usable = [instance for instance in self.instances if instance.reason is None]
-        return SimpleNamespace(instances=self.instances, usable=usable, oriented=ToyDescriptors(None))
-
-    def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
-        return self.table
-
-
 def test_every_labelled_instance_gets_an_answer() -> None:
     """Labels 2, 4 and 7 are rows 0, 1 and 2; 9 is unusable, 11 an unknown object, 12 has no pixels."""
     truth = {7: "bowl", 2: "mug", 4: "can", 9: "mug", 11: "dragon", 12: "can"}
     frame = LabelledFrame("f1", small_frame(), truth, {"light": "1"})
     tops = [[0.6, 0.3, 0.1], [0.5, 0.4, 0.1], [0.2, 0.7, 0.1], [1, 0, 0]]
     tops2 = [[0.1, 0.7, 0.2], [0.1, 0.1, 0.8], [0.3, 0.4, 0.3], [1, 0, 0]]
-    unusable = dict.fromkeys((9, 11), "too few points")
-    recognizer: Any = GivenRecognizer([2, 4, 7, 9, 11], unusable, {"tops": tops, "tops2": tops2})
+    lost = dict.fromkeys((9, 11), "too few points")
+    instances = [SimpleNamespace(label=k, reason=lost.get(k), occluded=k == 4) for k in (2, 4, 7, 9, 11)]
+    recognizer: Any = UntaughtRecognizer(("mug", "bowl", "can"), ("tops", "tops2"))
+    recognizer.describe = lambda _: described(instances, {"tops": np.array(tops), "tops2": np.array(tops2)})
+    recognizer.probabilities = lambda table: table
     ((item, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
     assert item is frame and answers.frame == "f1" and answers.attributes == {"light": "1"}
     assert [(i.label, i.truth, i.reason, i.occluded) for i in answers.instances] == [
@@ -357,7 +342,6 @@ def test_position_is_the_median_of_the_points() -> None:
     depth[1, 1:4] = 2000, 2000, 9000
     labels[1], labels[2, 0] = [0, 1, 1, 1, 1], 2
     frame = thor2.RGBDFrame(np.zeros((3, 5, 3), np.uint8), depth, labels, thor2.Intrinsics(10.0, 10.0, 0.0, 0.0))
-    recognizer: Any = GivenRecognizer([], {}, {"tops": np.zeros((0, 3)), "tops2": np.zeros((0, 3))})
     truth = dict.fromkeys((1, 2, 3), "mug")
-    ((_, answers),) = answer_frames([Run("run", "", recognizer)], [LabelledFrame("f", frame, truth, {})])
+    ((_, answers),) = answer_frames([Run("run", "", NamesInOrder())], [LabelledFrame("f", frame, truth, {})])
     assert [instance.position for instance in answers.instances] == [(0.4, 0.2, 2.0), None, None]
