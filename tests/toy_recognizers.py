@@ -1,8 +1,8 @@
-"""Recognizers without networks, whose answers a test determines."""
+"""Recognizers without networks, whose answers a test determines, and runs without a recognizer."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,3 +45,17 @@ class NamesInOrder(UntaughtRecognizer):
 
     def probabilities(self, usable: Sequence[Any]) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(usable))]).reshape(-1, 2)}
+
+
+class ToyRun(NamedTuple):
+    """The attributes of a run that results are computed from."""
+
+    name: str
+    predictors: tuple[str, ...] = ("tops",)
+    classes: tuple[str, ...] = ("bowl", "can", "mug")
+    temperatures: Mapping[str, float] = {}
+    answer_by: str = "classifiers"
+    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
+    baselines: Mapping[str, Any] = {}
+    own_objects: bool = False
+    has_real_views: bool = False
