@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -51,11 +51,8 @@ def train(out: Path, settings: Protocol = SETTINGS, **more: Any) -> list[Trained
     return train_run(SOURCE, out, settings, **more)
 
 
-class Whole(NamedTuple):
-    out: Path
-    run: TrainedRun
-    stages: list[str]
-    held_out: list[tuple[int, Cloud]]
+Whole = tuple[Path, TrainedRun, list[str], list[tuple[int, Cloud]]]
+"""Directory, run, stages and held-out clouds of a training."""
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +62,7 @@ def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     with mock.patch.object(module, "fit_calibration", wraps=fit_calibration) as calibrate:
         (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
     assert set(stages.values()) == {0}
-    return Whole(out, run, list(stages), calibrate.call_args.args[1])
+    return out, run, list(stages), calibrate.call_args.args[1]
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -128,10 +125,10 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
 
 
 def test_invalid_and_changed_distractors_are_refused(whole: Whole) -> None:
-    check_trained(SOURCE.digest, whole.out, SETTINGS)
+    check_trained(SOURCE.digest, whole[0], SETTINGS)
     for other in ({"networks": 3}, {"epochs": 4}, {"procedural": 11}):
         settings = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, **other))
-        assert_refused(next(iter(other)), check_trained, SOURCE.digest, whole.out, settings)
+        assert_refused(next(iter(other)), check_trained, SOURCE.digest, whole[0], settings)
     assert_refused("there are 9 objects", dataclasses.replace, DISTRACTORS, procedural=9)
 
 

@@ -248,8 +248,7 @@ def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
     labels[20:50, 50:85] = 2
     judged = [Annotation(2, INCORRECT, "b (c)"), Annotation(7, INCORRECT, "gone"), Annotation(1, CORRECT, "a")]
     draw_judged(color, labels, judged, tmp_path / "f.jpg")
-    with Image.open(tmp_path / "f.jpg") as image:
-        pixels = np.asarray(image.convert("RGB")).astype(int)
+    pixels = np.asarray(Image.open(tmp_path / "f.jpg").convert("RGB")).astype(int)
     for row, paint in (((49, 20), CORRECT), ((49, 70), INCORRECT)):
         assert np.abs(pixels[row] - paint).max() < 40
     assert np.abs(pixels[40, 20] - 128).max() < 20
