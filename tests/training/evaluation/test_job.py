@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_lines
-from image_files import small_frame
+from image_files import small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG, untrained_embedding_run
@@ -19,7 +19,6 @@ from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
 from written_files import ParsedPage
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
 from thor2_jax.frames.overlay import Annotation
 from thor2_jax.model.fusion import Calibration
@@ -28,6 +27,7 @@ from thor2_jax.recognizer import Recognizer
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
 from training.evaluation.runs import Run, load_runs
+from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import LOCK, locked
 
@@ -35,17 +35,11 @@ CLASSES = ("bowl", "can", "mug")
 
 
 class ToyDataset(LabelledFrames):
-    """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth.
+    """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth."""
 
-    They say that they are read from one file each, if a directory is given.
-    """
-
-    def __init__(self, n: int, prefix: str = "frame", directory: Path | None = None) -> None:
-        self.identifiers, self.directory = [f"{prefix}{k}" for k in range(n)], directory
+    def __init__(self, n: int, prefix: str = "frame") -> None:
+        self.identifiers = [f"{prefix}{k}" for k in range(n)]
         self.numbers: list[int] = []
-
-    def files(self, number: int) -> list[Path]:
-        return [] if self.directory is None else [self.directory / f"{number}.png"]
 
     def read(self, number: int) -> tuple[thor2.RGBDFrame, dict[int, str], dict[str, str]]:
         self.numbers.append(number)
@@ -214,16 +208,16 @@ def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
 
 def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
     """The message names the file; unchanged files are no reason to recompute anything."""
-    dataset, report = ToyDataset(3, directory=tmp_path), tmp_path / "report"
     for number in range(3):
-        (tmp_path / f"{number}.png").write_bytes(bytes([number]))
+        write_frame_files(tmp_path / "frames" / f"{number}", small_frame(number), {1: "mug"})
+    dataset, report, depth = FrameFolder(tmp_path / "frames"), tmp_path / "report", tmp_path / "frames/1/depth.png"
     first = evaluate_toys(tmp_path, dataset)
-    answers = (report / "answers.jsonl").read_bytes()
+    answers, content = (report / "answers.jsonl").read_bytes(), depth.read_bytes()
     assert without_times(evaluate_toys(tmp_path, dataset)) == without_times(first)
-    for change in (lambda: (tmp_path / "1.png").write_bytes(b"changed"), (tmp_path / "1.png").unlink):
+    for change in (lambda: depth.write_bytes(b"changed"), depth.unlink):
         change()
-        assert_refused(r"^out: .*1\.png", evaluate_toys, tmp_path, dataset)
-    (tmp_path / "1.png").write_bytes(bytes([1]))
+        assert_refused(rf"^out: .*{depth}", evaluate_toys, tmp_path, dataset)
+    depth.write_bytes(content)
     header, *lines = json_lines(answers.decode())
     lines = [{name: value for name, value in line.items() if name != "files"} for line in lines]  # of version 0.1.0
     (report / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in (header, *lines)))
@@ -231,11 +225,9 @@ def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
-    class Unreadable(ToyDataset):
-        def __getitem__(self, number: int) -> LabelledFrame:
-            raise InputError("color.png is damaged")
-
-    assert_refused("damaged", evaluate_toys, tmp_path, Unreadable(2))
+    folder = write_frame_files(tmp_path / "frames" / "0", small_frame(), {1: "mug"})
+    (folder / "depth.png").write_bytes(b"damaged")
+    assert_refused("depth", evaluate_toys, tmp_path, FrameFolder(tmp_path / "frames"))
     assert not (tmp_path / "report").exists()
 
 

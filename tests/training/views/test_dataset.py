@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-import trimesh
 from commands import Command
 from failures import Interrupted, full_disk
 from refusals import assert_refused
@@ -72,10 +71,9 @@ def copied(whole: Path, tmp_path: Path) -> Path:
     return shutil.copytree(whole, tmp_path / "views")
 
 
-def sphere(radius: float) -> TexturedMesh:
-    shape = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    colors = np.full((len(shape.faces), 3, 3), 9, np.uint8)
-    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
+def resized(factor: float) -> TexturedMesh:
+    ball = OBJECTS["tennis_ball"]
+    return dataclasses.replace(ball, vertices=ball.vertices * factor)
 
 
 def test_files_of_a_dataset(whole: Path) -> None:
@@ -194,7 +192,7 @@ def test_another_job_is_refused(copied: Path) -> None:
 
 def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 8)
-    ball = {"ball": sphere(0.03)}
+    ball = {"ball": resized(1)}
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
     job = RenderJob(ball, 90, 90, light, 1)
     dataset = render_dataset(job, out)
@@ -212,7 +210,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One shard keeps none of its views; objects may have any name."""
     monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 2)
-    sheet, name = sphere(0.03), "../a b/ü"
+    sheet, name = resized(1), "../a b/ü"
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
     dataset = render_dataset(RenderJob({name: sheet}, 180, 90), tmp_path / "views")
     assert [(shard.views, shard.left_out) for shard in dataset.shards] == [(2, 0), (0, 2), (2, 0)]
@@ -229,8 +227,8 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
         ({"azimuth_step": 0}, "azimuth_step"),
         ({"seed": -1}, "seed is -1"),
         ({"meshes": {**OBJECTS, "z": tmp_path / "bad.ply"}}, "bad.ply"),
-        ({"meshes": {"speck": sphere(0.003)}}, "object 'speck'"),
-        ({"meshes": {"door": sphere(0.6)}}, "object 'door' .*2.08 m"),
+        ({"meshes": {"speck": resized(0.1)}}, "object 'speck'"),
+        ({"meshes": {"door": resized(20)}}, "object 'door' .*2.32 m"),
     ]
     for changes, message in cases:
         assert_refused(message, render_dataset, dataclasses.replace(JOB, **changes), out)
