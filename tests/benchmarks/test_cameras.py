@@ -89,9 +89,7 @@ def test_several_runs_have_a_deviation() -> None:
 
 
 @pytest.mark.slow
-def test_command_writes_all_cameras(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     for k in range(2):
         write_frame_files(tmp_path / "video" / f"{k}", small_frame(k), {1: "mug", 4: "dragon"})
     for seed in range(2):

@@ -100,9 +100,7 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
         assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
 
 
-def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
-    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_joint_fit_resumes(whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a cache, the samples of the distractors are those in the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
     out = tmp_path / "run"

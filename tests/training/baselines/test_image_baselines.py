@@ -115,9 +115,7 @@ def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     check_baseline(tmp_path / "run", name)
 
 
-def test_interrupted_fit_resumes_to_the_same_weights(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, steps = write_run(tmp_path / "run"), []
     step = module._step
 

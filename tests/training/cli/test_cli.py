@@ -73,9 +73,7 @@ def views(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_evaluate_frames(
-    model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command
-) -> None:
+def test_evaluate(model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command) -> None:
     """Two runs are evaluated and agree with `recognize`; a repeated command keeps the answers."""
     other = tmp_path / "other"
     save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
@@ -98,9 +96,7 @@ def test_evaluate_frames(
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
 
-def test_labels_without_pixels_are_listed(
-    model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     labels = Path(shutil.copytree(images, tmp_path / "one")) / "labels.json"
     names = json.loads(labels.read_text())["labels"]
     for more in ({}, {"200": "mug_white"}):
@@ -179,9 +175,7 @@ def test_a_default_training_recognizes_and_is_evaluated(
     assert "nothing was trained" in text and line.split(" with: ")[1] in text
 
 
-def test_options_replace_values_of_the_protocols(
-    meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs: list[TrainJob] = []
     monkeypatch.setattr(protocol, "DEFAULT", DEFAULT)
     monkeypatch.setattr(protocol, "PAPER", PAPER)
@@ -212,9 +206,7 @@ def test_options_replace_values_of_the_protocols(
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
 
 
-def test_baselines_of_a_finished_run_were_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command
-) -> None:
+def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:
     monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
     assert "nothing was trained" in printed(*command)
@@ -249,7 +241,7 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
 
 
 @UNFITTED
-def test_train_by_sequences(
+def test_sequences(
     meshes: Path, views: Path, tmp_path: Path, refused: Command, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Each run has the objects of its sequence, whose name is shown; a repeated command trains only missing runs."""

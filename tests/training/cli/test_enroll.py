@@ -84,9 +84,7 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 
-def test_runs_and_the_files_of_a_frame_are_told_apart(
-    model: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_and_files_of_a_frame_are_told_apart(model: Path, frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
     monkeypatch.setattr(evaluate, "_evaluate", lambda *arguments, **_: calls.append(arguments))
     one = frame_options(frames / "000")
@@ -138,9 +136,7 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
         (None, "", {"025_mug", "can", "caf\u00e9"}),
     ],
 )
-def test_a_folder_of_meshes_is_enrolled(
-    name: str | None, folder: str, names: set[str], model: Path, tmp_path: Path
-) -> None:
+def test_a_folder_of_meshes(name: str | None, folder: str, names: set[str], model: Path, tmp_path: Path) -> None:
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
         write_box(tmp_path / "meshes" / file, BOX, color)
@@ -200,9 +196,7 @@ def test_a_lost_index_is_rebuilt_by_the_command(model: Path, printed: Command, r
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table) for name in ("brick", "book"))
 
 
-def test_a_gallery_outside_the_run_directory(
-    model: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
-) -> None:
+def test_a_gallery_elsewhere(model: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """The run directory does not change, and each gallery has its own objects."""
     before, other = files_of(model), ("--gallery", tmp_path / "other")
     assert "index.json" in refused("objects", "--model", model, *other)

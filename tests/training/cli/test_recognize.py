@@ -34,9 +34,7 @@ def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, pr
     assert table.count("unrecognized") == 2
 
 
-def test_one_failing_frame_does_not_lose_the_others(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for number in range(1, 7):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")

@@ -48,9 +48,7 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, r
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("unfitted")
-def test_frames_join_the_views_of_meshes(
-    meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
-) -> None:
+def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """The brick has a mesh and frames, the box a mesh, the book frames."""
     run = tmp_path / "run"
     command = ("--meshes", meshes, "--frames", frames, "--out", run, *STEPS, *TINY)

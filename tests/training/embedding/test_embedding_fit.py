@@ -149,9 +149,7 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
 
-def test_further_networks_leave_the_first_as_it_is(
-    views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path
-) -> None:
+def test_further_networks_keep_the_first(views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path) -> None:
     done = []
     show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
     programs = fit._step._cache_size()
@@ -165,9 +163,7 @@ def test_further_networks_leave_the_first_as_it_is(
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
 
 
-def test_too_few_samples_and_invisible_objects_are_refused(
-    views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
     assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1, Checkpoints(tmp_path))
     monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)

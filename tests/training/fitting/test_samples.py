@@ -32,9 +32,7 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
     ],
     ids=["paper", "released", "relaxed"],
 )
-def test_every_view_is_used_mirrored_in_four_ways(
-    config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []

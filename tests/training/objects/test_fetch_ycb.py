@@ -150,9 +150,7 @@ def test_archive_writes_only_into_its_folder(server: Any, tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
 
 
-def test_unknown_objects_and_addresses_that_cannot_be_read(
-    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_objects_and_unreadable_addresses(server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for names in ([], ["cracker box"], ["../003_cracker_box"], ["004_sugar_box"]):
         assert_refused("objects", fetch_ycb, names, tmp_path, url=server.url)
     for url in (

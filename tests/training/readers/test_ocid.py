@@ -172,9 +172,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert refused(*command) == f"error: {names}: No such file or directory"
 
 
-def test_each_sequence_has_its_own_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command
-) -> None:
+def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """Each run has its own classes; one run serves both cameras."""
     sequences = ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08")
     for sequence in sequences:

@@ -158,9 +158,7 @@ def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, 
     assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
 
 
-def test_interrupted_crops_resume_with_the_same_bytes(
-    meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """The damaged file alone is written again; the dataset keeps its digest."""
     directory = dataset.directory / "crops"
     before, first = files_of(directory), min(directory.glob("*.npz"))
