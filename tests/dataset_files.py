@@ -94,9 +94,8 @@ def pack_pcd(points: np.ndarray, color: np.ndarray, labels: np.ndarray, data: st
         f"POINTS {width * height}\nDATA {data}\n"
     ).encode()
     rows = []
-    for xyz, (red, green, blue), label in zip(
-        points.reshape(-1, 3), color.reshape(-1, 3).tolist(), labels.ravel().tolist(), strict=True
-    ):
+    colors, of_points = color.reshape(-1, 3).tolist(), labels.ravel().tolist()
+    for xyz, (red, green, blue), label in zip(points.reshape(-1, 3), colors, of_points, strict=True):
         rgba = 0xFF000000 | red << 16 | green << 8 | blue
         values = (*xyz.tolist(), rgba, max(label - 1, 0))
         ascii_row = "{:.9g} {:.9g} {:.9g} {} {}\n".format(*values).encode()

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rich.progress
 from commands import Command, run_thor2
 from image_files import write_frame
 from processes import HANG
 from refusals import assert_refused
+from rich.progress import Progress
 from small_runs import untrained_run
 
 import thor2_jax as thor2
@@ -249,13 +249,11 @@ def test_a_terminal_gets_bars_and_a_narrow_one_cuts_the_note(
 
 def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """A live display is cut at the height of the terminal."""
-    bars: list[rich.progress.Progress] = []
+    bars: list[Progress] = []
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("LINES", "10")
-    whole = rich.progress.Progress.__init__
-    monkeypatch.setattr(
-        rich.progress.Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1]
-    )
+    whole = Progress.__init__
+    monkeypatch.setattr(Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1])
     with show_progress() as show:
         for number in range(30):
             show(f"stage {number}", 1, 2, "")

@@ -69,9 +69,7 @@ def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: 
 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(
-        normalized_views, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
-    )
+    monkeypatch.setattr(normalized_views, "_random_axes", lambda *_: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1)))
     rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
     samples = sample_objects([0, 10], NETWORK, SMALL_CONFIG, 3, directory=tmp_path)

@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from training.evaluation import published
 from training.evaluation.page import comparison_table, comparison_title, marked
-from training.evaluation.published import (
-    compare_with_published,
-    published_attributes,
-    published_seconds,
-    published_tables,
-)
+from training.evaluation.published import compare_with_published, published_attributes, published_tables
 from training.readers.uwis import NOT_SCORED
 
 toy_run = functools.partial(SimpleNamespace, own_objects=False, has_real_views=False, baselines={})
@@ -48,7 +44,7 @@ def test_published_figures_are_complete() -> None:
 
 def test_other_datasets_have_no_published_tables() -> None:
     assert published_tables("frames") == [] == published_tables("bop")
-    assert all(seconds > 0 for seconds in published_seconds().values())
+    assert all(seconds > 0 for seconds in published.published_seconds().values())
 
 
 def test_attributes_have_the_names_of_the_paper() -> None:

@@ -67,9 +67,7 @@ def answers(model: MLP, samples: Samples) -> np.ndarray:
 def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
-    model, best = fitted(
-        log=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
-    )
+    model, best = fitted(log=curve.append, progress=lambda done, total, row: steps.append((done, total, row.epoch)))
     assert (answers(model, separable) == separable.label).all()
     assert [metrics.epoch for metrics in curve] == list(range(1, 9))
     assert curve[-1].loss < curve[0].loss / 2 and curve[-1].accuracy > 0.8

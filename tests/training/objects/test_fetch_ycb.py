@@ -153,16 +153,7 @@ def test_archive_writes_only_into_its_folder(server: Any, tmp_path: Path) -> Non
 def test_unknown_objects_and_unreadable_addresses(server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for names in ([], ["cracker box"], ["../003_cracker_box"], ["004_sugar_box"]):
         assert_refused("objects", fetch_ycb, names, tmp_path, url=server.url)
-    for url in (
-        "ftp://a",
-        "address",
-        "http://",
-        "http://[::1",
-        "http://a:b",
-        "http://a b",
-        "http://a..b",
-        "http://\u2100.com",
-    ):
+    for url in ("ftp://a", "a", "http://", "http://[::1", "http://a:b", "http://a b", "http://a..b", "http://\u2100"):
         assert_refused("expected", fetch_ycb, [NAME], tmp_path, url=url)
     assert_refused("network", fetch_ycb, [NAME], tmp_path, url=f"http://127.0.0.1:{free_port()}")
     monkeypatch.setenv("no_proxy", "")
