@@ -11,8 +11,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from commands import Command, frame_options, run_thor2
-from image_files import write_frame_files
-from rendered_objects import write_meshes
+from rendered_objects import write_meshes, write_scene
 from written_files import files_of
 
 import colornet
@@ -21,9 +20,8 @@ from thor2_jax.files import temporary_directory
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.networks import FEATURES
 from training import protocol, train_job
-from training.objects.builtin_objects import builtin_objects
 from training.protocol import DEFAULT, PAPER, QUICK
-from training.rendering.scenes import Scene, compose_scene
+from training.readers.frames import read_names
 from training.train_job import TrainJob
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -41,15 +39,9 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    objects = builtin_objects()
-    return compose_scene({name: objects[name] for name in NAMES}, np.random.default_rng(3), n_objects=3)
-
-
-@pytest.fixture(scope="module")
-def images(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
-    """Return a directory with the files of the scene, as `recognize` and `evaluate frames` read them."""
-    return write_frame_files(tmp_path_factory.mktemp("frames") / "one", scene.frame, scene.truth)
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the files of a scene, as `recognize` and `evaluate frames` read them."""
+    return write_scene(tmp_path_factory.mktemp("frames") / "one", NAMES, 3)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +65,7 @@ def views(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_evaluate(model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command) -> None:
+def test_evaluate(model: Path, images: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """Two runs are evaluated and agree with `recognize`; a repeated command keeps the answers."""
     other = tmp_path / "other"
     save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
@@ -83,9 +75,10 @@ def test_evaluate(model: Path, images: Path, scene: Scene, tmp_path: Path, print
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     printed("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", "--unknown-below", 0)
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
-    expected = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
+    truth = read_names(images / "labels.json")
+    expected = np.mean([a["name"] == truth[a["label"]] for a in answers])
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
-    assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
+    assert report["instances"]["scored"] == whole["instances"] == len(truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(expected), "std": 0.0, "runs": 2}
     before = (tmp_path / "report" / "answers.jsonl").read_bytes()
     assert "nothing was recomputed" in printed(*command)
@@ -107,14 +100,14 @@ def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, capfd:
 
 
 @pytest.mark.usefixtures("drawn_pictures")
-def test_any_name_of_an_object(model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command) -> None:
+def test_any_name_of_an_object(model: Path, images: Path, tmp_path: Path, printed: Command) -> None:
     """Names may look like markup, mathtext or terminal commands, and have any characters."""
     names = ("$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
     shown = dict(zip(NAMES, (*names[:2], r"茶碗\u202e\x1b[2J"), strict=True))
     renamed, trained = dict(zip(NAMES, names, strict=True)), load_run(model)
     save_run(dataclasses.replace(trained, classes=tuple(renamed[name] for name in trained.classes)), tmp_path / "run")
     shutil.copytree(images, tmp_path / "frames" / "one")
-    truth = {label: renamed[name] for label, name in scene.truth.items()}
+    truth = {label: renamed[name] for label, name in read_names(images / "labels.json").items()}
     (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
     expected = printed("recognize", "--model", model, *frame_options(images))
     out = printed("recognize", "--model", tmp_path / "run", *frame_options(images), "--out", tmp_path / "answer")
