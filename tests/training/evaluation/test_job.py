@@ -203,7 +203,7 @@ def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
     assert ParsedPage((tmp_path / "known" / "report" / "report.html").read_text()).open == []
     dragons = Frames([LabelledFrame("f", frame, {1: "dragon"}, {})])
     assert_refused("dragon.*bowl, can, mug", evaluate_toys, tmp_path / "unknown", dragons)
-    assert not (tmp_path / "unknown" / "report").exists()
+    assert not (tmp_path / "unknown" / "report" / "report.json").exists()
 
 
 def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:

@@ -98,8 +98,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     first, by_scene = json.loads((tmp_path / "report" / "report.json").read_text())["accuracy"]["max"]
     assert first["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.6
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
-    error = refused(*command)  # without names, all objects are unknown
-    assert "obj_000013, obj_000014, the runs have bowl, mug" in error
+    error = refused(*command, "--out", tmp_path / "other")  # without names, all objects are unknown
+    assert "obj_000013, obj_000014, the runs have bowl, mug" in error and not (tmp_path / "other").exists()
 
 
 def test_a_scene_without_ground_truth_can_be_segmented(tmp_path: Path) -> None:
