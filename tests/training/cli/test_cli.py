@@ -65,7 +65,7 @@ def views(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_evaluate(model: Path, images: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
+def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """Two runs are evaluated and agree with `recognize`; a repeated command keeps the answers."""
     other = tmp_path / "other"
     save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
@@ -234,7 +234,7 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
 
 
 @UNFITTED
-def test_sequences(
+def test_train_by_sequences(
     meshes: Path, views: Path, tmp_path: Path, refused: Command, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Each run has the objects of its sequence, whose name is shown; a repeated command trains only missing runs."""
