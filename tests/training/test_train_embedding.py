@@ -130,7 +130,7 @@ def test_invalid_and_changed_distractors_are_refused(whole: Whole) -> None:
     assert_refused("there are 9 objects", dataclasses.replace, DISTRACTORS, procedural=9)
 
 
-def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folds_of_embeddings_share_their_distractors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("THOR2_CACHE", "off")
     sample = mock.Mock(wraps=distractors.sample_normalized)
     monkeypatch.setattr(distractors, "sample_normalized", sample)

@@ -274,9 +274,7 @@ def test_train_by_sequences(
 
 
 @UNFITTED
-def test_rendered_views_are_kept_for_another_attempt(
-    meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rendered_views_stay(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)
     assert "folds is 99" in refused(*command, "--folds", 99, at_once=False)

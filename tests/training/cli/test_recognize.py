@@ -149,9 +149,7 @@ def test_no_file_of_the_user_is_replaced(model: Path, tmp_path: Path, refused: C
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
-def test_frames_without_labels_are_segmented(
-    model: Path, recognize: Recognize, tmp_path: Path, refused: Command, segmenter: str
-) -> None:
+def test_segmented_frames(model: Path, recognize: Recognize, tmp_path: Path, refused: Command, segmenter: str) -> None:
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]

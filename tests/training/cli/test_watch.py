@@ -60,9 +60,7 @@ def test_a_frame_without_labels_needs_opencv(
     assert "needs OpenCV" in messages[-1]["message"]
 
 
-def test_ctrl_c_ends_the_command(
-    model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LiveView, "show", lambda *_: signal.raise_signal(signal.SIGINT))
     handler = signal.getsignal(signal.SIGINT)
     assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0

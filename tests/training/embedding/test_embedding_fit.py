@@ -175,9 +175,7 @@ def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_an_embedding_and_resumes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     out, other = tmp_path / "new" / "embedding.safetensors", tmp_path / "other.safetensors"
     command = functools.partial(build_embedding, objects=24, views=6, epochs=1, workers=1)
     command(out)

@@ -47,10 +47,8 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     """Return `fit` on the separable samples, with a new checkpoint directory for each call."""
     folders = (tmp_path / str(number) for number in range(99))
 
-    def run(
-        options: FitOptions = QUICK, samples: Samples = separable, log: Any = lambda metrics: None, **arguments: object
-    ) -> tuple[MLP, int]:
-        return fit(samples, TOPS2, options, Checkpoints(next(folders), log), **arguments)
+    def run(options: FitOptions = QUICK, samples: Samples = separable, log: Any = lambda _: None, **more: Any) -> Any:
+        return fit(samples, TOPS2, options, Checkpoints(next(folders), log), **more)
 
     return run
 

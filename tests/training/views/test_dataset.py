@@ -115,9 +115,7 @@ def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("stops", [(1, 4, 18), pytest.param((2, 3, *range(5, 18)), marks=pytest.mark.slow)], ids=str)
-def test_rendering_interrupted_at_any_write_resumes(
-    stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rendering_resumes(stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupts before and after each of the nine files of a job is moved to its name.
 
     The quick ones are those before the first manifest, after the first shard, and the last one.
