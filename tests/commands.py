@@ -29,12 +29,8 @@ def run_thor2(*arguments: object) -> int:
 
 def frame_options(folder: Path, **changes: object) -> list[object]:
     """Return the options of `thor2 recognize` that name the files of a frame, with some changed."""
-    files = {
-        "color": folder / "color.png",
-        "depth": folder / "depth.png",
-        "labels": folder / "mask.png",
-        "intrinsics": folder / "intrinsics.json",
-    }
+    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
+    files = {option: folder / name for option, name in names.items()}
     return [part for name, value in {**files, **changes}.items() for part in (f"--{name}", value)]
 
 

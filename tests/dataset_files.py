@@ -16,9 +16,11 @@ K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
 """Intrinsics of YCB-Video with the principal point moved into the small images."""
 
 
-def color_and_depth(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def images(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8), rng.integers(5000, 15000, SHAPE, dtype=np.uint16)
+    color = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    depth = rng.integers(300, 2500, SHAPE, dtype=np.uint16)
+    return color, depth, rng.integers(0, 3, SHAPE, dtype=np.uint8)
 
 
 def band(start: int, stop: int) -> np.ndarray:
@@ -46,7 +48,7 @@ def write_bop(
 ) -> Path:
     for kind in ("rgb", "depth", "mask_visib"):
         (scene / kind).mkdir(parents=True, exist_ok=True)
-    color, depth = color_and_depth(seed)
+    color, depth, _ = images(seed)
     Image.fromarray(color).save(scene / "rgb" / f"{number:06d}.{suffix}")
     Image.fromarray(depth).save(scene / "depth" / f"{number:06d}.png")
     pairs = list(objects.items()) if isinstance(objects, dict) else objects
@@ -92,9 +94,8 @@ def pack_pcd(points: np.ndarray, color: np.ndarray, labels: np.ndarray, data: st
         f"POINTS {width * height}\nDATA {data}\n"
     ).encode()
     rows = []
-    for xyz, (red, green, blue), label in zip(
-        points.reshape(-1, 3), color.reshape(-1, 3).tolist(), labels.ravel().tolist(), strict=True
-    ):
+    colors, of_points = color.reshape(-1, 3).tolist(), labels.ravel().tolist()
+    for xyz, (red, green, blue), label in zip(points.reshape(-1, 3), colors, of_points, strict=True):
         rgba = 0xFF000000 | red << 16 | green << 8 | blue
         values = (*xyz.tolist(), rgba, max(label - 1, 0))
         ascii_row = "{:.9g} {:.9g} {:.9g} {} {}\n".format(*values).encode()
@@ -116,13 +117,6 @@ def write_ocid(
     (folder / "pcd").mkdir(exist_ok=True)
     (folder / "pcd" / f"{stem}.pcd").write_bytes(pack_pcd(points_of(depth), color, labels, data))
     return folder
-
-
-def images(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    color = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-    depth = rng.integers(300, 2500, SHAPE, dtype=np.uint16)
-    return color, depth, rng.integers(0, 3, SHAPE, dtype=np.uint8)
 
 
 def write_uwis(root: Path, video: str, stem: str, poses: str, seed: int = 0) -> Path:

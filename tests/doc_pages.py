@@ -14,9 +14,4 @@ def thor2_commands(page: str) -> list[list[str]]:
     blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
     parts = [part for block in blocks for part in re.split(r"&&|\||\n", block.replace("\\\n", " "))]
     commands = [shlex.split(part.partition(" >")[0], comments=True) for part in parts]
-    return [
-        words[number + 1 :]
-        for words in commands
-        for number, word in enumerate(words)
-        if word.rpartition("/")[2] == "thor2"
-    ]
+    return [words[k + 1 :] for words in commands for k, word in enumerate(words) if word.rpartition("/")[2] == "thor2"]

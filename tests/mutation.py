@@ -17,7 +17,6 @@ of 80, indices JAX clips), another `DESCRIPTOR_VERSION`, and searches whose resu
 
 import argparse
 import ast
-import dataclasses
 import difflib
 import functools
 import hashlib
@@ -32,7 +31,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
@@ -42,7 +41,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", "thor2_jax/model")
 """Directories whose modules are mutated."""
-
 
 MORE_TESTS = {
     "colornet/network.py": ["tests/colornet/test_files.py", "tests/colornet/test_membership.py"],
@@ -62,15 +60,14 @@ def tests_of(module: str) -> list[str]:
 
 
 MODULES = [f"{folder}/{path.name}" for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.py"))]
-TESTS = {module: tests_of(module) for module in MODULES if tests_of(module)}
+TESTS = {module: tests for module in MODULES if (tests := tests_of(module))}
 """Module -> its test files."""
 
 FAMILIES = ({"Add", "Sub", "Mul", "Div", "FloorDiv", "Mod", "Pow"}, {"RShift", "LShift"}, {"BitOr", "BitAnd", "BitXor"})
 """Families of binary operators."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Mutant:
+class Mutant(NamedTuple):
     """A change of a module: the occurrence with this number, counted through the file, of an operator of Cosmic Ray."""
 
     module: str
@@ -85,28 +82,19 @@ def digest_of(module: str) -> str:
 
 
 def within_a_family(operator: str) -> bool:
-    parts = operator.rpartition("/")[2].split("_")
-    if parts[0] == "ReplaceBinaryOperator":
-        return any({*parts[1:]} <= family for family in FAMILIES)
-    return not (parts[0] == "ReplaceComparisonOperator" and {"Is", "IsNot"} & {*parts[1:]})
-
-
-def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return the first and the last (line, column) of every annotation."""
-    nodes = [
-        annotation
-        for node in ast.walk(ast.parse(source))
-        for annotation in (getattr(node, "annotation", None), getattr(node, "returns", None))
-        if annotation is not None
-    ]
-    return [((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0)) for node in nodes]
+    kind, *parts = operator.rpartition("/")[2].split("_")
+    if kind == "ReplaceBinaryOperator":
+        return any({*parts} <= family for family in FAMILIES)
+    return not (kind == "ReplaceComparisonOperator" and {"Is", "IsNot"} & {*parts})
 
 
 def mutants_by_place(module: str) -> list[list[Mutant]]:
-    """Return all mutants of a module, grouped by their place in the source, in source order."""
+    """Return all mutants of a module, grouped by their place in the source, in source order, without annotations."""
     source, digest = (ROOT / module).read_text(), digest_of(module)
-    excluded, tree = annotations(source), get_ast(source)
-    places: dict[tuple[tuple[int, int], tuple[int, int]], list[Mutant]] = defaultdict(list)
+    tree = get_ast(source)
+    nodes = [getattr(node, name, None) for node in ast.walk(ast.parse(source)) for name in ("annotation", "returns")]
+    excluded = [((n.lineno, n.col_offset), (n.end_lineno, n.end_col_offset)) for n in nodes if n is not None]
+    places: dict[Any, list[Mutant]] = defaultdict(list)
     for name in sorted(filter(within_a_family, operator_names())):
         operator = get_operator(name)
         if operator.arguments():
@@ -128,62 +116,37 @@ def draw_mutants(module: str, sample: int | None, seed: int) -> list[Mutant]:
     return [rng.choice(place) for place in places[:sample]]
 
 
-class Sandbox:
-    """A copy of the checkout in which mutants are tested."""
-
-    def __init__(self, folder: Path) -> None:
-        self.tree = folder / "tree"
-        shutil.copytree(ROOT, self.tree, ignore=shutil.ignore_patterns(".*", "__pycache__"))
-        if (ROOT.parent / "shared").is_dir():
-            (folder / "shared").symlink_to(ROOT.parent / "shared")
-        self.environment = {
-            **os.environ,
-            "PYTHONPATH": str(self.tree),
-            "PYTHONDONTWRITEBYTECODE": "1",  # a mutant can have the size and time stamp of the previous one
-            "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),  # three times as fast
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-        }
-
-    @functools.cache  # noqa: B019
-    def limit(self, module: str) -> float:
-        """Return the time limit for a mutant of the module in seconds; its tests must pass without a mutant."""
-        start = time.monotonic()
-        if self.test(module, None) != "survived":
-            sys.exit(f"{module}: its tests fail without a mutant: {' '.join(TESTS[module])}")
-        return 3 * (time.monotonic() - start) + 30
-
-    def test(self, module: str, limit: float | None) -> str:
-        """Run the tests of a module; return "killed", "survived" or "timeout"."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
-        try:  # what the tests start ends with them, see tests/conftest.py
-            done = subprocess.run(
-                [*command, *TESTS[module]], cwd=self.tree, env=self.environment, capture_output=True, timeout=limit
-            )
-        except subprocess.TimeoutExpired:
-            return "timeout"
-        return "killed" if done.returncode else "survived"
-
-    def run(self, mutant: Mutant) -> dict[str, Any]:
-        """Test a mutant and return its record for the results file."""
-        path, limit = self.tree / mutant.module, self.limit(mutant.module)
-        source = path.read_text()
-        changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
-        try:
-            path.write_text(changed)
-            outcome = self.test(mutant.module, limit)
-        finally:
-            path.write_text(source)
-        diff = list(difflib.unified_diff(source.splitlines(), changed.splitlines(), n=0, lineterm=""))[3:]
-        return {**dataclasses.asdict(mutant), "outcome": outcome, "diff": diff}
+def test(tree: Path, module: str, limit: float | None = None) -> str:
+    """Run the tests of a module in a copy of the checkout; return "killed", "survived" or "timeout"."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *TESTS[module]]
+    # A mutant can have the size and time stamp of the previous one. The tests share compiled programs.
+    environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:  # what the tests start ends with them, see tests/conftest.py
+        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=limit)
+    except subprocess.TimeoutExpired:
+        return "timeout"
+    return "killed" if done.returncode else "survived"
 
 
-def read_results(path: Path) -> dict[Mutant, dict[str, Any]]:
-    """Read the records of the mutants of the current sources."""
-    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    fields = [field.name for field in dataclasses.fields(Mutant)]
-    results = {Mutant(*(record[name] for name in fields)): record for record in records}
-    return {mutant: record for mutant, record in results.items() if mutant.source == digest_of(mutant.module)}
+@functools.cache
+def time_limit(tree: Path, module: str) -> float:
+    """Return the time limit for a mutant of the module in seconds; its tests must pass without a mutant."""
+    start = time.monotonic()
+    if test(tree, module) != "survived":
+        sys.exit(f"{module}: its tests fail without a mutant: {' '.join(TESTS[module])}")
+    return 3 * (time.monotonic() - start) + 30
+
+
+def run_mutant(tree: Path, mutant: Mutant) -> dict[str, Any]:
+    """Test a mutant and return its record for the results file."""
+    path, limit = tree / mutant.module, time_limit(tree, mutant.module)
+    source = (ROOT / mutant.module).read_text()
+    changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+    path.write_text(changed)
+    outcome = test(tree, mutant.module, limit)
+    path.write_text(source)
+    diff = list(difflib.unified_diff(source.splitlines(), changed.splitlines(), n=0, lineterm=""))[3:]
+    return {**mutant._asdict(), "outcome": outcome, "diff": diff}
 
 
 def main() -> None:
@@ -197,12 +160,18 @@ def main() -> None:
     if unknown := set(modules) - set(TESTS):
         parser.error(f"MODULE is {', '.join(sorted(unknown))}; expected a module that has tests")
 
-    results = read_results(options.results)
+    options.results.touch()
+    records = [json.loads(line) for line in options.results.read_text().splitlines()]
+    results = {Mutant(*(record[name] for name in Mutant._fields)): record for record in records}
+    results = {mutant: record for mutant, record in results.items() if mutant.source == digest_of(mutant.module)}
     todo = [m for name in modules for m in draw_mutants(name, options.sample, options.seed) if m not in results]
     with tempfile.TemporaryDirectory() as folder, open(options.results, "a") as stream:
-        sandbox = Sandbox(Path(folder))
+        tree = Path(folder) / "tree"
+        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        if (ROOT.parent / "shared").is_dir():
+            (Path(folder) / "shared").symlink_to(ROOT.parent / "shared")
         for k, mutant in enumerate(todo, 1):
-            results[mutant] = sandbox.run(mutant)
+            results[mutant] = run_mutant(tree, mutant)
             print(json.dumps(results[mutant]), file=stream, flush=True)
             print(f"{k}/{len(todo)} {mutant.module}:{mutant.line} {results[mutant]['outcome']}", flush=True)
     for mutant, record in results.items():

@@ -51,9 +51,7 @@ def end_descendants_with_this_process() -> None:
 
 
 def wait_until(
-    condition: Callable[[], object],
-    explain: Callable[[], str] = str,
-    pause: Callable[[float], object] = time.sleep,
+    condition: Callable[[], object], explain: Callable[[], str] = str, pause: Callable[[float], object] = time.sleep
 ) -> None:
     """Wait until a condition holds, at most `HANG` seconds; `explain` gives the message of the failure."""
     until = time.monotonic() + HANG
@@ -85,10 +83,8 @@ def free_port() -> int:
 
 def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess.Popen[str]:
     """Start a Python program on the CPU, which JAX divides into some devices."""
-    environment = os.environ | {
-        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}",
-        "JAX_PLATFORMS": "cpu",
-    }
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

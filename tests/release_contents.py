@@ -25,9 +25,7 @@ def check(directory: Path) -> None:
     problems = [f"{wheel.name} lacks {name}" for name in REQUIRED if name not in in_wheel]
     problems += [f"{sdist.name} lacks {name}" for name in (*REQUIRED, "LICENSE", "README.md") if name not in in_sdist]
     allowed = tuple(f"{package}/" for package in PACKAGES)
-    problems += [
-        f"{wheel.name} has {name}" for name in in_wheel if not name.startswith(allowed) and ".dist-info/" not in name
-    ]
+    problems += [f"{wheel.name} has {n}" for n in in_wheel if not n.startswith(allowed) and ".dist-info/" not in n]
     problems += [f"{wheel.name} has {name}" for name in in_wheel if name.endswith((".pyc", ".orig", ".rej"))]
     large = [path for path in (wheel, sdist) if path.stat().st_size > MAX_BYTES]
     problems += [f"{path.name} has {path.stat().st_size:,} bytes, more than {MAX_BYTES:,.0f}" for path in large]

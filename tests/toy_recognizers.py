@@ -1,6 +1,6 @@
-"""Recognizers without networks, whose answers a test determines."""
+"""Recognizers without networks, whose answers a test determines, and runs without a recognizer."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -11,24 +11,15 @@ from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.model import Model
 
 
-class ToyDescriptors(NamedTuple):
-    """Stands in for the descriptors of a frame; `content` is what the toy recognizer reads."""
-
-    content: Any
-    overflow: int = 0
-
-
 class UntaughtRecognizer:
-    """Base of toy recognizers, whose `probabilities` maps the content of `ToyDescriptors`; no object is enrolled."""
+    """Base of toy recognizers, whose `probabilities` maps the content of the descriptors; no object is enrolled."""
 
     unknown_below: float | None = None
+    probabilities: Any
 
-    def __init__(self, classes: Sequence[str], features: Sequence[str] = ("tops",)) -> None:
-        network = SimpleNamespace(fingerprint="")
-        classifiers = dict.fromkeys(features)
-        self.run: Any = SimpleNamespace(
-            classes=tuple(classes), classifiers=classifiers, config=None, network=network, record={}
-        )
+    def __init__(self, classes: Sequence[str] = ("mug", "bowl"), features: Sequence[str] = ("tops",)) -> None:
+        run = {"classes": tuple(classes), "classifiers": dict.fromkeys(features), "config": None, "record": {}}
+        self.run: Any = SimpleNamespace(**run, network=SimpleNamespace(fingerprint=""))
 
     @property
     def model(self) -> Model:
@@ -39,25 +30,32 @@ class UntaughtRecognizer:
         return Model(self.run, classifiers, Gallery("", trained=self.run.classes), self.unknown_below)
 
     def describe(self, frame: thor2.RGBDFrame) -> Any:
-        instances = [
-            SimpleNamespace(label=label, reason=self.reason(label, frame), occluded=False) for label in frame.instances
-        ]
-        usable = [instance for instance in instances if instance.reason is None]
-        return SimpleNamespace(instances=instances, usable=usable, oriented=ToyDescriptors(usable))
+        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
+        return described(instances, instances)
 
-    def reason(self, label: int, frame: thor2.RGBDFrame) -> str | None:
-        """Return why an instance cannot be used."""
-        return None
 
-    def probabilities(self, content: Any) -> dict[str, np.ndarray]:
-        raise NotImplementedError
+def described(instances: list[Any], content: Any) -> Any:
+    """Return descriptors of instances, with what the toy recognizer reads."""
+    usable = [instance for instance in instances if instance.reason is None]
+    return SimpleNamespace(instances=instances, usable=usable, oriented=SimpleNamespace(content=content, overflow=0))
 
 
 class NamesInOrder(UntaughtRecognizer):
     """Predicts the first class for the first usable instance of a frame and the second for all others."""
 
-    def __init__(self, classes: Sequence[str] = ("mug", "bowl")) -> None:
-        super().__init__(classes)
-
     def probabilities(self, usable: Sequence[Any]) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(usable))]).reshape(-1, 2)}
+
+
+class ToyRun(NamedTuple):
+    """The attributes of a run that results are computed from."""
+
+    name: str
+    predictors: tuple[str, ...] = ("tops",)
+    classes: tuple[str, ...] = ("bowl", "can", "mug")
+    temperatures: Mapping[str, float] = {}
+    answer_by: str = "classifiers"
+    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
+    baselines: Mapping[str, Any] = {}
+    own_objects: bool = False
+    has_real_views: bool = False

@@ -3,13 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from image_files import small_frame, write_frame_files
 from refusals import assert_refused
 from small_runs import untrained_run
+from toy_recognizers import ToyRun
 
 from benchmarks import cameras
 from thor2_jax.model.run_directory import save_run
@@ -17,15 +17,6 @@ from training.augmentation.simulated_cameras import CHOOSE
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 
 CLASSES = ("bowl", "can", "mug")
-
-
-class ToyRun(NamedTuple):
-    name: str
-    predictors: tuple[str, ...] = ("tops",)
-    classes: tuple[str, ...] = CLASSES
-    answer_by: str = "classifiers"
-    temperatures: dict[str, float] = {}
-    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
 
 
 def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
@@ -98,9 +89,7 @@ def test_several_runs_have_a_deviation() -> None:
 
 
 @pytest.mark.slow
-def test_command_writes_all_cameras(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     for k in range(2):
         write_frame_files(tmp_path / "video" / f"{k}", small_frame(k), {1: "mug", 4: "dragon"})
     for seed in range(2):

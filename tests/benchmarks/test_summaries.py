@@ -37,11 +37,8 @@ def test_affected_cameras_are_those_that_lost_enough() -> None:
 
 
 def test_an_object_keeps_the_answer_of_its_last_view() -> None:
-    correct = {method: [False, True] for method in METHODS}
-    rows = [
-        {"occlusion": "high", "correct": correct},
-        {"occlusion": "none", "correct": {method: [True] * VIEWS for method in METHODS}},
-    ]
+    late, always = dict.fromkeys(METHODS, [False, True]), dict.fromkeys(METHODS, [True] * VIEWS)
+    rows = [{"occlusion": "high", "correct": late}, {"occlusion": "none", "correct": always}]
     results = summarize_scenes(rows)
     assert results["all"]["fused"] == {"accuracy": [0.5, *[1.0] * (VIEWS - 1)], "views needed": 2}
     assert results["high"]["objects"] == 1 and results["high"]["merged"]["accuracy"][0] == 0

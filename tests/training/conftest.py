@@ -56,10 +56,8 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
         for stage in (RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS):
             fold.report(stage, 1, 1)
         fold.checkpoints("embedding").log(metrics())
-        settings, classes = fold.settings, fold.source.classes
-        created = Embedding.create(
-            settings.config, settings.network, train_run.RUN_SIZES, classes=classes, distractors=9
-        )
+        given, classes = fold.settings, fold.source.classes
+        created = Embedding.create(given.config, given.network, train_run.RUN_SIZES, classes=classes, distractors=9)
         views = References(np.zeros((1, created.size), np.float16), np.full(1, BACKGROUND, np.int32))
         return dataclasses.replace(created, references=views), []
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -51,11 +51,8 @@ def train(out: Path, settings: Protocol = SETTINGS, **more: Any) -> list[Trained
     return train_run(SOURCE, out, settings, **more)
 
 
-class Whole(NamedTuple):
-    out: Path
-    run: TrainedRun
-    stages: list[str]
-    held_out: list[tuple[int, Cloud]]
+Whole = tuple[Path, TrainedRun, list[str], list[tuple[int, Cloud]]]
+"""Directory, run, stages and held-out clouds of a training."""
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +62,7 @@ def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     with mock.patch.object(module, "fit_calibration", wraps=fit_calibration) as calibrate:
         (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
     assert set(stages.values()) == {0}
-    return Whole(out, run, list(stages), calibrate.call_args.args[1])
+    return out, run, list(stages), calibrate.call_args.args[1]
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -103,9 +100,7 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
         assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
 
 
-def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
-    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_joint_fit_resumes(whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a cache, the samples of the distractors are those in the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
     out = tmp_path / "run"
@@ -128,15 +123,17 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
 
 
 def test_invalid_and_changed_distractors_are_refused(whole: Whole) -> None:
-    check_trained(SOURCE.digest, whole.out, SETTINGS)
+    check_trained(SOURCE.digest, whole[0], SETTINGS)
     for other in ({"networks": 3}, {"epochs": 4}, {"procedural": 11}):
         settings = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, **other))
-        assert_refused(next(iter(other)), check_trained, SOURCE.digest, whole.out, settings)
+        assert_refused(next(iter(other)), check_trained, SOURCE.digest, whole[0], settings)
     assert_refused("there are 9 objects", dataclasses.replace, DISTRACTORS, procedural=9)
 
 
-@pytest.mark.usefixtures("weights")
-def test_folds_of_embeddings(tmp_path: Path) -> None:
+def test_folds_of_embeddings_share_their_distractors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    sample = mock.Mock(wraps=distractors.sample_normalized)
+    monkeypatch.setattr(distractors, "sample_normalized", sample)
     stages: dict[str, None] = {}
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
     runs = train(tmp_path / "run", short, progress=lambda stage, *values: stages.setdefault(stage))
@@ -144,12 +141,4 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
-
-
-def test_folds_share_their_distractors_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("THOR2_CACHE", "off")
-    sample = mock.Mock(wraps=distractors.sample_normalized)
-    monkeypatch.setattr(distractors, "sample_normalized", sample)
-    short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
-    train(tmp_path / "run", short)
     assert sample.call_count == 1

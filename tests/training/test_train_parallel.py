@@ -16,22 +16,17 @@ import jax
 if port != "0":
     jax.distributed.initialize(f"localhost:{port}", 2, rank)
 import numpy as np
-import thor2_jax as thor2
+from small_clouds import brick_and_stick
+from small_runs import SMALL_CONFIG
 from thor2_jax.networks import model_arrays
 from training.fitting.loop import FitOptions
 from training.train_run import train_run
 from training.protocol import Protocol
 from training.views.normalized_views import MemoryViews
 
-rng = np.random.default_rng(0)
-def clouds(size, low, high):
-    return [((rng.random((150, 3)) * size + (0, 0, 0.5)).astype(np.float32),
-             rng.integers(low, high, (150, 3), dtype=np.uint8)) for _ in range(16)]
-
-config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
-views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
-settings = Protocol(["tops2"], FitOptions(epochs=4, batch_size=16), config, 2)
-runs = train_run(MemoryViews(views, config), out, settings)
+views = MemoryViews(brick_and_stick(16), SMALL_CONFIG)
+settings = Protocol(["tops2"], FitOptions(epochs=4, batch_size=16), SMALL_CONFIG, 2)
+runs = train_run(views, out, settings)
 assert len(jax.devices()) == int(sys.argv[4])
 for fold, run in enumerate(runs):
     np.savez(out.parent / f"{out.name}-{rank}-{fold}.npz", **model_arrays(run.classifiers["tops2"]))

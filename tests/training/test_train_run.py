@@ -124,9 +124,7 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
         assert names(tmp_path) == []
 
 
-def test_an_interrupted_run_resumes_to_the_same_result(
-    whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is interrupted first where an epoch is logged and has no checkpoint yet."""
     out = tmp_path / "run"
     with monkeypatch.context() as patch, pytest.raises(Interrupted):

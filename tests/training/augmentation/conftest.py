@@ -3,16 +3,14 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.frames.frames import Intrinsics
 from training.augmentation.augmentations import Augmentations, augment
 from training.rendering.camera import RenderedView
 
 
-def flat_view(
-    depth: NDArray[np.uint16], color: tuple[int, int, int] = (100, 100, 100), f: float = 1099.0
-) -> RenderedView:
+def flat_view(depth: NDArray[np.uint16], color: ArrayLike = (100, 100, 100), f: float = 1099.0) -> RenderedView:
     """Return a view of one colour with the principal point in its middle."""
     height, width = depth.shape
     colors = np.where(depth[..., None] > 0, np.array(color), 0).astype(np.uint8)

@@ -12,16 +12,9 @@ from small_clouds import random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.networks import model_arrays
+from training.baselines import cloud_baselines as module
 from training.baselines.baseline import BaselineInputs, Predictor
-from training.baselines.cloud_baselines import (
-    POINTS,
-    PointNet,
-    forest_features,
-    load_forest,
-    load_pointnet,
-    predict_forest,
-    tree_arrays,
-)
+from training.baselines.cloud_baselines import POINTS, PointNet, forest_features, load_forest, load_pointnet
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -64,12 +57,14 @@ def test_predictions_match_scikit_learn(depth: int | None) -> None:
     y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
     grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
     features = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
-    np.testing.assert_allclose(predict_forest(tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6)
+    np.testing.assert_allclose(
+        module.predict_forest(module.tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6
+    )
 
 
 def test_single_leaf_trees_and_missing_arrays() -> None:
     grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
-    nodes = tree_arrays(grown)
+    nodes = module.tree_arrays(grown)
     run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
     inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32), None)
     probabilities = load_forest(nodes, run)(inputs)

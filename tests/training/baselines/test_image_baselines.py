@@ -115,9 +115,7 @@ def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     check_baseline(tmp_path / "run", name)
 
 
-def test_interrupted_fit_resumes_to_the_same_weights(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, steps = write_run(tmp_path / "run"), []
     step = module._step
 
@@ -218,11 +216,8 @@ def test_nearest_template_has_the_largest_cosine() -> None:
     features = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float16)
     similarity = np.array([[0.8, 0.96], [-1.0, -0.6]])
     expected = np.exp(20 * similarity) / np.exp(20 * similarity).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(
-        compare(np.array([[0.8, 0.6], [-1, 0]], np.float32), features, np.array([0, 1, 1], np.int16), 2),
-        expected,
-        atol=1e-3,
-    )
+    queries, label = np.array([[0.8, 0.6], [-1, 0]], np.float32), np.array([0, 1, 1], np.int16)
+    np.testing.assert_allclose(compare(queries, features, label, 2), expected, atol=1e-3)
 
 
 def test_inputs_are_scaled_and_the_background_is_zero() -> None:

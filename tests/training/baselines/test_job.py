@@ -74,9 +74,7 @@ def described(seed: int) -> Any:
 
 
 @pytest.mark.parametrize("names", [("forest",), pytest.param(CLOUD_BASELINES, marks=pytest.mark.slow)])
-def test_baselines_learn_and_are_calibrated(
-    trained: Path, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Baselines that a run has are not trained again."""
     monkeypatch.setitem(job._METHODS, "forest", (lambda task: pytest.fail("trained again"), load_forest))
     train_baselines(trained, SOURCE, names)

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from safetensors.numpy import save_file
 
 from training.baselines.architectures import load_backbone, resampled_positions, tensor_shapes
 from training.baselines.cnn import DENSENET_161, GRU, DenseNet, ResNet18
-from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT, ViTConfig
+from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
@@ -32,50 +33,31 @@ def _float32_products() -> Iterator[None]:
 OUTPUTS = json.loads((GOLDEN / "networks" / "outputs.json").read_text())["outputs"]
 
 
-def loaded(create: Any, folder: Path) -> Any:
-    """Return a network in evaluation mode with the random weights of its tensors' names, from a file."""
-    model = nnx.eval_shape(create)
-    save_file(random_tensors(tensor_shapes(model)), folder / "weights.safetensors")
-    load_backbone(model, folder / "weights.safetensors")
-    model.eval()
-    return model
-
-
 def assert_golden(name: str, outputs: list[Any]) -> None:
     expected = np.array(OUTPUTS[name])
     actual = np.concatenate([sampled(np.asarray(values)) for values in outputs])
     np.testing.assert_allclose(actual, expected, rtol=2e-3, atol=2e-4 * np.abs(expected).max())
 
 
-def test_resnet_matches_timm(tmp_path: Path) -> None:
-    model = loaded(lambda: ResNet18(rngs=nnx.Rngs(0)), tmp_path)
-    assert_golden("resnet18", nnx.jit(model)(jnp.asarray(random_images("resnet18", 2, 64))))
-
-
 @pytest.mark.parametrize(
-    ("name", "arguments", "size"),
+    ("name", "create", "size"),
     [
-        ("densenet_small", {"growth": 12, "blocks": (2, 4, 4, 2)}, 96),
-        pytest.param("densenet_161", DENSENET_161, 64, marks=pytest.mark.slow),
+        ("resnet18", ResNet18, 64),
+        ("densenet_small", partial(DenseNet, 12, (2, 4, 4, 2)), 96),
+        ("vit_tiny_4", partial(ViT, VIT_TINY_4, 96), 96),
+        pytest.param("densenet_161", partial(DenseNet, **DENSENET_161), 64, marks=pytest.mark.slow),
+        pytest.param("vit_tiny", partial(ViT, VIT_TINY, 224), 224, marks=pytest.mark.slow),
+        pytest.param("vit_dinov2_small", partial(ViT, VIT_DINOV2_SMALL, 224), 224, marks=pytest.mark.slow),
+        pytest.param("vit_base", partial(ViT, VIT_BASE, 224), 224, marks=pytest.mark.slow),
     ],
 )
-def test_densenet_matches_timm(tmp_path: Path, name: str, arguments: dict[str, Any], size: int) -> None:
-    model = loaded(lambda: DenseNet(**arguments, rngs=nnx.Rngs(0)), tmp_path)
-    assert_golden(name, [nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))])
-
-
-@pytest.mark.parametrize(
-    ("name", "config", "size"),
-    [
-        ("vit_tiny_4", VIT_TINY_4, 96),
-        pytest.param("vit_tiny", VIT_TINY, 224, marks=pytest.mark.slow),
-        pytest.param("vit_dinov2_small", VIT_DINOV2_SMALL, 224, marks=pytest.mark.slow),
-        pytest.param("vit_base", VIT_BASE, 224, marks=pytest.mark.slow),
-    ],
-)
-def test_vit_matches_timm(tmp_path: Path, name: str, config: ViTConfig, size: int) -> None:
-    model = loaded(lambda: ViT(config, size, rngs=nnx.Rngs(0)), tmp_path)
-    assert_golden(name, [nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))])
+def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int) -> None:
+    """They have the random weights of their tensors' names, from a file."""
+    model = nnx.eval_shape(lambda: create(rngs=nnx.Rngs(0)))
+    save_file(random_tensors(tensor_shapes(model)), tmp_path / "weights.safetensors")
+    load_backbone(model, tmp_path / "weights.safetensors")
+    model.eval()
+    assert_golden(name, jax.tree.leaves(nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))))
 
 
 def test_gru_matches_torch() -> None:

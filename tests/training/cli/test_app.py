@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rich.progress
 from commands import Command, run_thor2
 from image_files import write_frame
 from processes import HANG
 from refusals import assert_refused
+from rich.progress import Progress
 from small_runs import untrained_run
 
 import thor2_jax as thor2
@@ -229,32 +229,31 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
     ]
 
 
-def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with show_progress() as show:
-        show("render [red]", 3, 10, "of [/x]")
-    err: Any = capsys.readouterr().err
-    assert "━" in err and "render [red]" in err and "3/10" in err and "of [/x]" in err
-
-
-def test_a_narrow_terminal_cuts_the_note(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("stage", "done", "total", "note"),
+    [
+        ("render [red]", 3, 10, "of [/x]"),
+        ("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2),
+    ],
+)
+def test_a_terminal_gets_bars_and_a_narrow_one_cuts_the_note(
+    stage: str, done: int, total: int, note: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
     with show_progress() as show:
-        show("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2)
+        show(stage, done, total, note)
     err: Any = capsys.readouterr().err
-    assert "stage 4 of 5: fit networks" in err and "━" in err and "20/104" in err
+    assert "━" in err and stage in err and f"{done}/{total}" in err and note[:7] in err
 
 
 def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """A live display is cut at the height of the terminal."""
-    bars: list[rich.progress.Progress] = []
+    bars: list[Progress] = []
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("LINES", "10")
-    whole = rich.progress.Progress.__init__
-    monkeypatch.setattr(
-        rich.progress.Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1]
-    )
+    whole = Progress.__init__
+    monkeypatch.setattr(Progress, "__init__", lambda self, *a, **k: (bars.append(self), whole(self, *a, **k))[1])
     with show_progress() as show:
         for number in range(30):
             show(f"stage {number}", 1, 2, "")

@@ -11,8 +11,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from commands import Command, frame_options, run_thor2
-from image_files import write_frame_files
-from rendered_objects import write_meshes
+from rendered_objects import write_meshes, write_scene
 from written_files import files_of
 
 import colornet
@@ -21,9 +20,8 @@ from thor2_jax.files import temporary_directory
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.networks import FEATURES
 from training import protocol, train_job
-from training.objects.builtin_objects import builtin_objects
 from training.protocol import DEFAULT, PAPER, QUICK
-from training.rendering.scenes import Scene, compose_scene
+from training.readers.frames import read_names
 from training.train_job import TrainJob
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -41,15 +39,9 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    objects = builtin_objects()
-    return compose_scene({name: objects[name] for name in NAMES}, np.random.default_rng(3), n_objects=3)
-
-
-@pytest.fixture(scope="module")
-def images(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
-    """Return a directory with the files of the scene, as `recognize` and `evaluate frames` read them."""
-    return write_frame_files(tmp_path_factory.mktemp("frames") / "one", scene.frame, scene.truth)
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the files of a scene, as `recognize` and `evaluate frames` read them."""
+    return write_scene(tmp_path_factory.mktemp("frames") / "one", NAMES, 3)
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +65,7 @@ def views(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_evaluate_frames(
-    model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command
-) -> None:
+def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """Two runs are evaluated and agree with `recognize`; a repeated command keeps the answers."""
     other = tmp_path / "other"
     save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
@@ -85,9 +75,10 @@ def test_evaluate_frames(
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     printed("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", "--unknown-below", 0)
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
-    expected = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
+    truth = read_names(images / "labels.json")
+    expected = np.mean([a["name"] == truth[a["label"]] for a in answers])
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
-    assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
+    assert report["instances"]["scored"] == whole["instances"] == len(truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(expected), "std": 0.0, "runs": 2}
     before = (tmp_path / "report" / "answers.jsonl").read_bytes()
     assert "nothing was recomputed" in printed(*command)
@@ -98,9 +89,7 @@ def test_evaluate_frames(
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
 
-def test_labels_without_pixels_are_listed(
-    model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     labels = Path(shutil.copytree(images, tmp_path / "one")) / "labels.json"
     names = json.loads(labels.read_text())["labels"]
     for more in ({}, {"200": "mug_white"}):
@@ -111,14 +100,14 @@ def test_labels_without_pixels_are_listed(
 
 
 @pytest.mark.usefixtures("drawn_pictures")
-def test_any_name_of_an_object(model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command) -> None:
+def test_any_name_of_an_object(model: Path, images: Path, tmp_path: Path, printed: Command) -> None:
     """Names may look like markup, mathtext or terminal commands, and have any characters."""
     names = ("$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
     shown = dict(zip(NAMES, (*names[:2], r"茶碗\u202e\x1b[2J"), strict=True))
     renamed, trained = dict(zip(NAMES, names, strict=True)), load_run(model)
     save_run(dataclasses.replace(trained, classes=tuple(renamed[name] for name in trained.classes)), tmp_path / "run")
     shutil.copytree(images, tmp_path / "frames" / "one")
-    truth = {label: renamed[name] for label, name in scene.truth.items()}
+    truth = {label: renamed[name] for label, name in read_names(images / "labels.json").items()}
     (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
     expected = printed("recognize", "--model", model, *frame_options(images))
     out = printed("recognize", "--model", tmp_path / "run", *frame_options(images), "--out", tmp_path / "answer")
@@ -179,9 +168,7 @@ def test_a_default_training_recognizes_and_is_evaluated(
     assert "nothing was trained" in text and line.split(" with: ")[1] in text
 
 
-def test_options_replace_values_of_the_protocols(
-    meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs: list[TrainJob] = []
     monkeypatch.setattr(protocol, "DEFAULT", DEFAULT)
     monkeypatch.setattr(protocol, "PAPER", PAPER)
@@ -194,11 +181,13 @@ def test_options_replace_values_of_the_protocols(
     replace = dataclasses.replace
     distractors, quick = (replace(each.distractors, workers=2) for each in (DEFAULT, QUICK))
     default = replace(DEFAULT, distractors=distractors)
+    assert (distractors.procedural, quick.procedural) == (1500, 600)
     assert job().protocol == default and default.classifiers == ()
     assert job("--quick").protocol == replace(QUICK, distractors=quick)
     changed = job("--quick", "--embedding", 50, "--epochs", 2, "--azimuth-step", 40).protocol
     assert changed.distractors == replace(quick, procedural=50, epochs=2)
-    assert (changed.azimuth_step, changed.polar_step) == (40, QUICK.polar_step)
+    assert (changed.azimuth_step, changed.polar_step, changed.fit.epochs) == (40, QUICK.polar_step, 2)
+    assert job("--distractors", meshes).protocol.distractors.meshes.keys() == set(NAMES)
     assert job("--classifiers", "ce").protocol == replace(default, classifiers=("ce",))
     assert job("--embedding", 0).protocol == replace(DEFAULT, classifiers=FEATURES, distractors=None)
     assert job("--paper").protocol == PAPER and PAPER.classifiers == FEATURES and PAPER.distractors is None
@@ -210,9 +199,7 @@ def test_options_replace_values_of_the_protocols(
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
 
 
-def test_baselines_of_a_finished_run_were_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command
-) -> None:
+def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:
     monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
     assert "nothing was trained" in printed(*command)
@@ -287,9 +274,7 @@ def test_train_by_sequences(
 
 
 @UNFITTED
-def test_rendered_views_are_kept_for_another_attempt(
-    meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rendered_views_stay(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)
     assert "folds is 99" in refused(*command, "--folds", 99, at_once=False)

@@ -58,9 +58,7 @@ def test_nothing_is_left_after_an_error(
     assert "No space left" in error and not (tmp_path / "deep").exists()
 
 
-def test_folders_of_the_user_are_not_replaced(
-    model: Path, frame: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("1/scan.ply", "4/photo.png"):
         (frame / name).parent.mkdir()
         (frame / name).write_text("a user's")
@@ -124,9 +122,7 @@ def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, 
     assert "mine.txt" in refused(*command)
 
 
-def test_options_of_recognition_hold_for_its_explanation(
-    model: Path, frame: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_recognition_hold(model: Path, frame: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
     def explain(recognizer: Recognizer, *_: Any) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pickle
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -55,31 +56,22 @@ def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path
         assert vars(one.frame).keys() > sent.keys() == {field.name for field in dataclasses.fields(one.frame)}
 
 
-def test_answers_before_an_unreadable_frame_are_kept(
-    model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames, arguments = FrameFolder(folder), ((model,), None)
-    expected = list(answer_frames(load_evaluated(*arguments), frames))
-    broken, read = 6, FrameFolder.read
-
-    def damaged(self: FrameFolder, number: int) -> Any:
-        if self.identifiers[number] == f"{broken:03d}":
-            raise InputError("depth: damaged")
-        return read(self, number)
-
-    monkeypatch.setattr(FrameFolder, "read", damaged)
-    answers = []
+def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, tmp_path: Path) -> None:
+    arguments, damaged = ((model,), None), Path(shutil.copytree(folder, tmp_path / "frames"))
+    expected = answer_frames(load_evaluated(*arguments), FrameFolder(folder))
+    (damaged / "006" / "depth.png").write_bytes(b"damaged")
+    frames, answers = FrameFolder(damaged), []
 
     def pool(answer: Callable[[FrameFolder], Any], parts: Iterable[FrameFolder]) -> Iterator[Any]:
         for part in parts:
             assert len(part.sources) == 1  # workers get no other frames
             yield answer(part)
 
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match="depth"):
         for _, answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
             answers.append(answer)
-    assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(broken)]
-    for (_, one), other in zip(expected, answers, strict=False):
+    assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(6)]
+    for one, (_, other) in zip(answers, expected, strict=False):
         for instance, again in zip(one.instances, other.instances, strict=True):
             np.testing.assert_array_equal(instance.probabilities, again.probabilities)
 

@@ -34,9 +34,7 @@ def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, pr
     assert table.count("unrecognized") == 2
 
 
-def test_one_failing_frame_does_not_lose_the_others(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for number in range(1, 7):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
@@ -151,9 +149,7 @@ def test_no_file_of_the_user_is_replaced(model: Path, tmp_path: Path, refused: C
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
-def test_frames_without_labels_are_segmented(
-    model: Path, recognize: Recognize, tmp_path: Path, refused: Command, segmenter: str
-) -> None:
+def test_segmented_frames(model: Path, recognize: Recognize, tmp_path: Path, refused: Command, segmenter: str) -> None:
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
@@ -203,37 +199,28 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
     assert "track" in printed("recognize", "--model", model, *command)
 
 
-def test_a_damaged_frame_does_not_end_a_sequence(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    for number in range(4):
-        write_frame_files(tmp_path / "video" / f"{number}", small_frame(number))
-    (tmp_path / "video" / "1" / "depth.png").write_bytes(b"damaged")
-    (tmp_path / "video" / "2" / "mask.png").unlink()
-    assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
-    out, err = capfd.readouterr()
-    answers = json_lines(out)
-    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 3)] == [[2, 2]] * 2
-    assert "depth" in answers[1]["error"] and "labels" in answers[2]["error"] and "2 of 4 frames" in err
-
-
-def test_a_frame_that_is_removed_does_not_end_a_sequence(
+def test_a_bad_frame_does_not_end_a_sequence(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
+    """One is damaged, one lacks labels, and one is removed after it has been read for the tracks."""
+    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(5)]
+    (frames[1] / "depth.png").write_bytes(b"damaged")
+    (frames[2] / "mask.png").unlink()
 
     def read_and_remove(source: FrameSource) -> RGBDFrame:
         frame = read_source(source)
-        if source.name == "2":
-            (frames[1] / "depth.png").unlink(missing_ok=True)
+        if source.name == "4":
+            (frames[3] / "depth.png").unlink(missing_ok=True)
         return frame
 
     monkeypatch.setattr("training.frame_recognition.read_source", read_and_remove)
     assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
     out, err = capfd.readouterr()
     answers = json_lines(out)
-    assert ["instances" in answer for answer in answers] == [True, False, True]
-    assert "No such file" in answers[1]["error"] and "1 of 3 frames" in err
+    assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 4)] == [[3, 3]] * 2
+    for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file")):
+        assert reason in answers[number]["error"] and "instances" not in answers[number]
+    assert "3 of 5 frames" in err
 
 
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:

@@ -83,9 +83,7 @@ def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: C
         assert (tmp_path / name).read_bytes().startswith(b"RRF2")
 
 
-def test_a_frame_that_fails_does_not_stop_the_others(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         for k, pixels in enumerate((FRAMES[0].color, FRAMES[0].color[:100], FRAMES[0].color)):

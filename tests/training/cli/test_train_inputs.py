@@ -48,9 +48,7 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, r
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("unfitted")
-def test_frames_join_the_views_of_meshes(
-    meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
-) -> None:
+def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     """The brick has a mesh and frames, the box a mesh, the book frames."""
     run = tmp_path / "run"
     command = ("--meshes", meshes, "--frames", frames, "--out", run, *STEPS, *TINY)
@@ -90,10 +88,8 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--meshes absent", "absent: no such folder"),
         ("--meshes meshes --names names.json", "no_such_scan"),
         ("--meshes meshes --azimuth-step 0", "azimuth_step is 0"),
-        ("--meshes meshes --mesh-scale 0", "mesh_scale is 0"),
         ("--meshes meshes --classifiers shape", "shape"),
         ("--meshes meshes --epochs 0", "epochs"),
-        ("--meshes meshes --batch-size 100000", "batch_size is 100000"),
         ("--meshes meshes --leave-out nobody", "leave_out has 'nobody'"),
         ("--meshes meshes --leave-out brick,box", "leave_out has box, brick, all"),
         ("--meshes meshes --embedding 9 --distractors meshes", "also a class"),

@@ -26,9 +26,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "frames"
 
 
-def test_frames_of_a_folder(
-    model: Path, folder: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]) -> None:
     assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0
     err = capfd.readouterr().err
     assert "watch at http://127.0.0.1:" in err and "2 of 3 were recognized" in err
@@ -62,9 +60,7 @@ def test_a_frame_without_labels_needs_opencv(
     assert "needs OpenCV" in messages[-1]["message"]
 
 
-def test_ctrl_c_ends_the_command(
-    model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LiveView, "show", lambda *_: signal.raise_signal(signal.SIGINT))
     handler = signal.getsignal(signal.SIGINT)
     assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0

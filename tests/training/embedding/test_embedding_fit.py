@@ -69,9 +69,7 @@ def test_each_object_has_one_label(views: Samples, tmp_path: Path, monkeypatch: 
 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(
-        normalized_views, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
-    )
+    monkeypatch.setattr(normalized_views, "_random_axes", lambda *_: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1)))
     rendered = render_clouds({0: 0, 1: 10}, 3)
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
     samples = sample_objects([0, 10], NETWORK, SMALL_CONFIG, 3, directory=tmp_path)
@@ -90,28 +88,22 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 
 
-def test_samples_of_several_tasks_do_not_depend_on_workers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A batch is made of the selected samples; a selection has the samples in its order."""
-    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
-    done = []
-    pool = lambda function, tasks: (function(t) for t in tasks)  # noqa: E731
-    show = lambda *numbers: done.append(numbers)  # noqa: E731
-    pooled = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, pool=pool, directory=tmp_path / "pooled")
-    whole = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show, directory=tmp_path / "whole")
-    assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
-    np.testing.assert_equal(vars(pooled), vars(whole))
+def test_a_selection_has_the_samples_in_its_order(views: Samples) -> None:
     rows = np.array([5, 0, 5])
-    chosen, batch = whole.select(rows), whole.take(rows, NETWORK, SMALL_CONFIG)
+    chosen, batch = views.select(rows), views.take(rows, NETWORK, SMALL_CONFIG)
     np.testing.assert_equal(chosen.take(np.arange(3), NETWORK, SMALL_CONFIG), batch)
     np.testing.assert_array_equal((batch.length != 0).sum(axis=(1, 2)), chosen.lengths)
     np.testing.assert_array_equal((batch.color != 0).sum(axis=(1, 2, 3)), chosen.colors)
 
 
-def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
-    whole = sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, directory=tmp_path / "whole")
     rendered: list[int] = []
     done: list[Any] = []
+    show = lambda *numbers: done.append(numbers)  # noqa: E731
+    sample = functools.partial(sample_objects, OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show)
+    whole = sample(directory=tmp_path / "whole")
+    assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
 
     def stopped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
         for task in tasks:
@@ -120,19 +112,14 @@ def test_interrupted_rendering_resumes_to_the_same_samples(monkeypatch: pytest.M
             rendered.append(min(task))
             yield function(task)
 
-    def render() -> Samples:
-        show = lambda *numbers: done.append(numbers)  # noqa: E731
-        return sample_objects(OBJECTS, NETWORK, SMALL_CONFIG, 2, stopped, show, directory=tmp_path / "samples")
-
     with pytest.raises(Interrupted):
-        render()
+        sample(pool=stopped, directory=tmp_path / "samples")
     (tmp_path / "samples" / "000000.safetensors").write_bytes(b"damaged")
     rendered.clear()
     done.clear()
-    np.testing.assert_equal(vars(render()), vars(whole))
-    assert rendered == [0, 6] and done == [(3, 8), (6, 8), (8, 8)]
-    np.testing.assert_equal(vars(render()), vars(whole))
-    assert rendered == [0, 6]
+    for _ in range(2):
+        np.testing.assert_equal(vars(sample(pool=stopped, directory=tmp_path / "samples")), vars(whole))
+        assert rendered == [0, 6] and done[:3] == [(3, 8), (6, 8), (8, 8)]
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +147,7 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
 
-def test_further_networks_leave_the_first_as_it_is(
-    views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path
-) -> None:
+def test_further_networks_keep_the_first(views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path) -> None:
     done = []
     show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
     programs = fit._step._cache_size()
@@ -176,9 +161,7 @@ def test_further_networks_leave_the_first_as_it_is(
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
 
 
-def test_too_few_samples_and_invisible_objects_are_refused(
-    views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(fit, "BATCH_SIZE", 4096)
     assert_refused("expected at least 4096", fit_embedding, views, NETWORK, SMALL_CONFIG, 1, Checkpoints(tmp_path))
     monkeypatch.setattr(module, "MIN_VIEW_POINTS", 10**6)
@@ -192,9 +175,7 @@ def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_an_embedding_and_resumes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     out, other = tmp_path / "new" / "embedding.safetensors", tmp_path / "other.safetensors"
     command = functools.partial(build_embedding, objects=24, views=6, epochs=1, workers=1)
     command(out)

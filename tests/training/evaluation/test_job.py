@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_lines
-from image_files import small_frame
+from image_files import small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG, untrained_embedding_run
-from toy_recognizers import ToyDescriptors, UntaughtRecognizer
+from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
 from written_files import ParsedPage
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
 from thor2_jax.frames.overlay import Annotation
 from thor2_jax.model.fusion import Calibration
@@ -28,6 +27,7 @@ from thor2_jax.recognizer import Recognizer
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
 from training.evaluation.runs import Run, load_runs
+from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import LOCK, locked
 
@@ -35,17 +35,11 @@ CLASSES = ("bowl", "can", "mug")
 
 
 class ToyDataset(LabelledFrames):
-    """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth.
+    """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth."""
 
-    They say that they are read from one file each, if a directory is given.
-    """
-
-    def __init__(self, n: int, prefix: str = "frame", directory: Path | None = None) -> None:
-        self.identifiers, self.directory = [f"{prefix}{k}" for k in range(n)], directory
+    def __init__(self, n: int, prefix: str = "frame") -> None:
+        self.identifiers = [f"{prefix}{k}" for k in range(n)]
         self.numbers: list[int] = []
-
-    def files(self, number: int) -> list[Path]:
-        return [] if self.directory is None else [self.directory / f"{number}.png"]
 
     def read(self, number: int) -> tuple[thor2.RGBDFrame, dict[int, str], dict[str, str]]:
         self.numbers.append(number)
@@ -84,9 +78,7 @@ class ToyRecognizer(UntaughtRecognizer):
             raise KeyboardInterrupt
         with self.log.open("a") as file:
             file.write(f"{number}\n")
-        described = super().describe(frame)
-        described.oriented = ToyDescriptors(number)
-        return described
+        return described(super().describe(frame).instances, number)
 
     def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, oriented])
@@ -216,16 +208,16 @@ def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
 
 def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
     """The message names the file; unchanged files are no reason to recompute anything."""
-    dataset, report = ToyDataset(3, directory=tmp_path), tmp_path / "report"
     for number in range(3):
-        (tmp_path / f"{number}.png").write_bytes(bytes([number]))
+        write_frame_files(tmp_path / "frames" / f"{number}", small_frame(number), {1: "mug"})
+    dataset, report, depth = FrameFolder(tmp_path / "frames"), tmp_path / "report", tmp_path / "frames/1/depth.png"
     first = evaluate_toys(tmp_path, dataset)
-    answers = (report / "answers.jsonl").read_bytes()
+    answers, content = (report / "answers.jsonl").read_bytes(), depth.read_bytes()
     assert without_times(evaluate_toys(tmp_path, dataset)) == without_times(first)
-    for change in (lambda: (tmp_path / "1.png").write_bytes(b"changed"), (tmp_path / "1.png").unlink):
+    for change in (lambda: depth.write_bytes(b"changed"), depth.unlink):
         change()
-        assert_refused(r"^out: .*1\.png", evaluate_toys, tmp_path, dataset)
-    (tmp_path / "1.png").write_bytes(bytes([1]))
+        assert_refused(rf"^out: .*{depth}", evaluate_toys, tmp_path, dataset)
+    depth.write_bytes(content)
     header, *lines = json_lines(answers.decode())
     lines = [{name: value for name, value in line.items() if name != "files"} for line in lines]  # of version 0.1.0
     (report / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in (header, *lines)))
@@ -233,11 +225,9 @@ def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
-    class Unreadable(ToyDataset):
-        def __getitem__(self, number: int) -> LabelledFrame:
-            raise InputError("color.png is damaged")
-
-    assert_refused("damaged", evaluate_toys, tmp_path, Unreadable(2))
+    folder = write_frame_files(tmp_path / "frames" / "0", small_frame(), {1: "mug"})
+    (folder / "depth.png").write_bytes(b"damaged")
+    assert_refused("depth", evaluate_toys, tmp_path, FrameFolder(tmp_path / "frames"))
     assert not (tmp_path / "report").exists()
 
 
@@ -250,8 +240,7 @@ def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
     labels[20:50, 50:85] = 2
     judged = [Annotation(2, INCORRECT, "b (c)"), Annotation(7, INCORRECT, "gone"), Annotation(1, CORRECT, "a")]
     draw_judged(color, labels, judged, tmp_path / "f.jpg")
-    with Image.open(tmp_path / "f.jpg") as image:
-        pixels = np.asarray(image.convert("RGB")).astype(int)
+    pixels = np.asarray(Image.open(tmp_path / "f.jpg").convert("RGB")).astype(int)
     for row, paint in (((49, 20), CORRECT), ((49, 70), INCORRECT)):
         assert np.abs(pixels[row] - paint).max() < 40
     assert np.abs(pixels[40, 20] - 128).max() < 20
@@ -310,30 +299,17 @@ def test_page_of_a_video_and_of_stored_thresholds(tmp_path: Path) -> None:
     assert any(text.startswith("threshold 0.500") for text in page.text)
 
 
-class GivenRecognizer(UntaughtRecognizer):
-    """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
-
-    def __init__(self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, Any]) -> None:
-        super().__init__(("mug", "bowl", "can"), ("tops", "tops2"))
-        self.instances = [SimpleNamespace(label=k, reason=unusable.get(k), occluded=k == 4) for k in labels]
-        self.table = {name: np.array(rows) for name, rows in probabilities.items()}
-
-    def describe(self, frame: Any) -> Any:
-        usable = [instance for instance in self.instances if instance.reason is None]
-        return SimpleNamespace(instances=self.instances, usable=usable, oriented=ToyDescriptors(None))
-
-    def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
-        return self.table
-
-
 def test_every_labelled_instance_gets_an_answer() -> None:
     """Labels 2, 4 and 7 are rows 0, 1 and 2; 9 is unusable, 11 an unknown object, 12 has no pixels."""
     truth = {7: "bowl", 2: "mug", 4: "can", 9: "mug", 11: "dragon", 12: "can"}
     frame = LabelledFrame("f1", small_frame(), truth, {"light": "1"})
     tops = [[0.6, 0.3, 0.1], [0.5, 0.4, 0.1], [0.2, 0.7, 0.1], [1, 0, 0]]
     tops2 = [[0.1, 0.7, 0.2], [0.1, 0.1, 0.8], [0.3, 0.4, 0.3], [1, 0, 0]]
-    unusable = dict.fromkeys((9, 11), "too few points")
-    recognizer: Any = GivenRecognizer([2, 4, 7, 9, 11], unusable, {"tops": tops, "tops2": tops2})
+    lost = dict.fromkeys((9, 11), "too few points")
+    instances = [SimpleNamespace(label=k, reason=lost.get(k), occluded=k == 4) for k in (2, 4, 7, 9, 11)]
+    recognizer: Any = UntaughtRecognizer(("mug", "bowl", "can"), ("tops", "tops2"))
+    recognizer.describe = lambda _: described(instances, {"tops": np.array(tops), "tops2": np.array(tops2)})
+    recognizer.probabilities = lambda table: table
     ((item, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
     assert item is frame and answers.frame == "f1" and answers.attributes == {"light": "1"}
     assert [(i.label, i.truth, i.reason, i.occluded) for i in answers.instances] == [
@@ -357,7 +333,6 @@ def test_position_is_the_median_of_the_points() -> None:
     depth[1, 1:4] = 2000, 2000, 9000
     labels[1], labels[2, 0] = [0, 1, 1, 1, 1], 2
     frame = thor2.RGBDFrame(np.zeros((3, 5, 3), np.uint8), depth, labels, thor2.Intrinsics(10.0, 10.0, 0.0, 0.0))
-    recognizer: Any = GivenRecognizer([], {}, {"tops": np.zeros((0, 3)), "tops2": np.zeros((0, 3))})
     truth = dict.fromkeys((1, 2, 3), "mug")
-    ((_, answers),) = answer_frames([Run("run", "", recognizer)], [LabelledFrame("f", frame, truth, {})])
+    ((_, answers),) = answer_frames([Run("run", "", NamesInOrder())], [LabelledFrame("f", frame, truth, {})])
     assert [instance.position for instance in answers.instances] == [(0.4, 0.2, 2.0), None, None]

@@ -1,11 +1,9 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
-
 import numpy as np
 import pytest
 from sklearn.metrics import confusion_matrix
+from toy_recognizers import ToyRun
 
 from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
 from training.evaluation.page import answer_texts
@@ -13,20 +11,6 @@ from training.evaluation.results import compute_results, named_answers
 from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
 
 CLASSES = ("bowl", "can", "mug")
-
-
-class ToyRun(NamedTuple):
-    """The attributes of a run that the results use."""
-
-    name: str
-    predictors: tuple[str, ...]
-    classes: tuple[str, ...] = CLASSES
-    temperatures: Mapping[str, float] = {}
-    answer_by: str = "classifiers"
-    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
-    baselines: Mapping[str, Any] = {}
-    own_objects: bool = False
-    has_real_views: bool = False
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]

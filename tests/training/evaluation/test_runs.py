@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,25 +24,16 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
 
-Maker = Callable[..., Path]
+
+def make(folder: Path, classes: Sequence[str] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG) -> Path:
+    """Write an untrained run with CE only."""
+    save_run(untrained_run(classes, ("ce",), config, seed=seed), folder)
+    return folder
 
 
-@pytest.fixture
-def make(tmp_path: Path) -> Maker:
-    """Return a function that writes an untrained run with CE only."""
-
-    def make(
-        name: str, classes: tuple[str, ...] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG
-    ) -> Path:
-        save_run(untrained_run(classes, ("ce",), config, seed=seed), tmp_path / name)
-        return tmp_path / name
-
-    return make
-
-
-def test_folds_have_names_and_digests(make: Maker, tmp_path: Path) -> None:
+def test_folds_have_names_and_digests(tmp_path: Path) -> None:
     for fold in range(2):
-        make(f"both/fold-{fold}", seed=fold)
+        make(tmp_path / f"both/fold-{fold}", seed=fold)
     runs = load_runs([tmp_path / "both"])
     assert [run.name for run in runs] == ["both/fold-0", "both/fold-1"]
     assert len({run.digest for run in runs}) == 2
@@ -52,12 +43,12 @@ def test_folds_have_names_and_digests(make: Maker, tmp_path: Path) -> None:
     assert [run.digest for run in load_runs([tmp_path / "both"])] == [run.digest for run in runs]
 
 
-def test_incompatible_runs_are_refused(make: Maker, tmp_path: Path) -> None:
-    first = make("first")
+def test_incompatible_runs_are_refused(tmp_path: Path) -> None:
+    first = make(tmp_path / "first")
     cases = {
-        "different classes (c)": make("classes", ("a", "b", "c")),
-        "different classes (in another order)": make("order", ("b", "a")),
-        "different descriptors": make("config", config=dataclasses.replace(CONFIG, alpha=0.5)),
+        "different classes (c)": make(tmp_path / "classes", ("a", "b", "c")),
+        "different classes (in another order)": make(tmp_path / "order", ("b", "a")),
+        "different descriptors": make(tmp_path / "config", config=dataclasses.replace(CONFIG, alpha=0.5)),
         "the same run": first,
         "run.json": tmp_path,
     }
@@ -65,10 +56,10 @@ def test_incompatible_runs_are_refused(make: Maker, tmp_path: Path) -> None:
         assert_refused(f"^model: .*{other}.*{re.escape(message)}", load_runs, [first, other])
 
 
-def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> None:
+def test_each_sequence_is_answered_by_its_run(tmp_path: Path) -> None:
     for fold in range(2):
-        make(f"runs/bottom/s1/fold-{fold}", ("b", "c"), seed=fold)
-        make(f"runs/s2/fold-{fold}", ("a", "b"), seed=2 + fold)
+        make(tmp_path / f"runs/bottom/s1/fold-{fold}", ("b", "c"), seed=fold)
+        make(tmp_path / f"runs/s2/fold-{fold}", ("a", "b"), seed=2 + fold)
     runs = load_sequence_runs(tmp_path / "runs", ["x/bottom/s1/f1", "x/bottom/s1/f2", "x/top/s2/f1"])
     assert [run.name for run in runs] == ["runs/*/fold-0", "runs/*/fold-1"]
     assert all(run.classes == ("a", "b", "c") and run.predictors == ("ce",) for run in runs)
@@ -86,11 +77,11 @@ def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> No
             np.testing.assert_array_equal(values, expected.astype(np.float32))
 
 
-def test_incompatible_sequence_runs_are_refused(make: Maker, tmp_path: Path) -> None:
-    make("runs/s1")
-    make("runs/s2/fold-0")
-    make("runs/s2/fold-1", seed=1)
-    make("runs/s3", config=dataclasses.replace(CONFIG, alpha=0.5))
+def test_incompatible_sequence_runs_are_refused(tmp_path: Path) -> None:
+    make(tmp_path / "runs/s1")
+    make(tmp_path / "runs/s2/fold-0")
+    make(tmp_path / "runs/s2/fold-1", seed=1)
+    make(tmp_path / "runs/s3", config=dataclasses.replace(CONFIG, alpha=0.5))
     (tmp_path / "runs" / "s4").mkdir()
     cases = {
         ("s1", "s2"): "different folds, classifiers or baselines",

@@ -2,7 +2,7 @@
 
 import errno
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,19 +16,13 @@ from training.fitting.loop import Checkpoints, find_run_directories
 from training.storage.jobs import load_arrays, save_arrays
 
 
-class State(NamedTuple):
-    weights: Any
-    count: Any
-    key: Any
-
-
-def state(seed: int, size: int = 100) -> State:
+def state(seed: int, size: int = 100) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     weights = {"a": jnp.asarray(rng.random((size, 7))), "none": jnp.zeros((3, 0))}
-    return State(weights, jnp.int32(seed), jnp.asarray([seed], jnp.uint32))
+    return {"weights": weights, "count": jnp.int32(seed), "key": jnp.asarray([seed], jnp.uint32)}
 
 
-def assert_equal(a: State, b: State) -> None:
+def assert_equal(a: Any, b: Any) -> None:
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         assert one.dtype == other.dtype

@@ -47,10 +47,8 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     """Return `fit` on the separable samples, with a new checkpoint directory for each call."""
     folders = (tmp_path / str(number) for number in range(99))
 
-    def run(
-        options: FitOptions = QUICK, samples: Samples = separable, log: Any = lambda metrics: None, **arguments: object
-    ) -> tuple[MLP, int]:
-        return fit(samples, TOPS2, options, Checkpoints(next(folders), log), **arguments)
+    def run(options: FitOptions = QUICK, samples: Samples = separable, log: Any = lambda _: None, **more: Any) -> Any:
+        return fit(samples, TOPS2, options, Checkpoints(next(folders), log), **more)
 
     return run
 
@@ -67,9 +65,7 @@ def answers(model: MLP, samples: Samples) -> np.ndarray:
 def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
-    model, best = fitted(
-        log=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
-    )
+    model, best = fitted(log=curve.append, progress=lambda done, total, row: steps.append((done, total, row.epoch)))
     assert (answers(model, separable) == separable.label).all()
     assert [metrics.epoch for metrics in curve] == list(range(1, 9))
     assert curve[-1].loss < curve[0].loss / 2 and curve[-1].accuracy > 0.8
@@ -137,12 +133,7 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Sampl
 
 
 def test_invalid_options_are_refused_by_name() -> None:
-    for name, value in (
-        ("epochs", 0),
-        ("batch_size", 1),
-        ("seed", -1),
-        ("seed", 2**31),
-    ):
+    for name, value in (("epochs", 0), ("batch_size", 1), ("seed", -1), ("seed", 2**31)):
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import assert_refused
+from slow_tier import slow
 from small_clouds import random_clouds as views
 
 import colornet
@@ -21,20 +22,11 @@ NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        CONFIG,
-        pytest.param(thor2.DescriptorConfig.released(homology="closed_form"), marks=pytest.mark.slow),
-        pytest.param(
-            thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation()), marks=pytest.mark.slow
-        ),
-    ],
-    ids=["paper", "released", "relaxed"],
-)
-def test_every_view_is_used_mirrored_in_four_ways(
-    config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+RELAXED = thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation())
+
+
+@pytest.mark.parametrize("config", [CONFIG, *slow(thor2.DescriptorConfig.released(homology="closed_form"), RELAXED)])
+def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []

@@ -210,11 +210,9 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
+    scene, quad = trimesh.Scene(), textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)))
     for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
-        scene.add_geometry(
-            textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))), transform=np.diag([*scale, 1.0])
-        )
+        scene.add_geometry(quad, transform=np.diag([*scale, 1.0]))
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
     expected = trimesh.load_scene(tmp_path / "scene.glb", process=False).to_mesh()

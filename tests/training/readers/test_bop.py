@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import Command
-from dataset_files import TWO, K, band, color_and_depth, write_bop
+from dataset_files import TWO, K, band, images, write_bop
 from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
@@ -45,8 +45,8 @@ def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     items = [pickle.loads(pickle.dumps(dataset.only(k)))[0] for k in range(3)]  # as worker processes get frames
     assert [item.identifier for item in items] == ["000048/1000000", "000050/000002", "000050/000010"]
     for item, seed in zip(items[1:], (2, 10), strict=True):
-        np.testing.assert_array_equal(item.frame.color, color_and_depth(seed)[0])
-        np.testing.assert_array_equal(item.frame.depth, color_and_depth(seed)[1])
+        np.testing.assert_array_equal(item.frame.color, images(seed)[0])
+        np.testing.assert_array_equal(item.frame.depth, images(seed)[1])
     monkeypatch.chdir(tmp_path / "000048")
     assert BOP(".").identifiers == ["000048/1000000"]
 
@@ -98,8 +98,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     first, by_scene = json.loads((tmp_path / "report" / "report.json").read_text())["accuracy"]["max"]
     assert first["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.6
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
-    error = refused(*command)  # without names, all objects are unknown
-    assert "obj_000013, obj_000014, the runs have bowl, mug" in error
+    error = refused(*command, "--out", tmp_path / "other")  # without names, all objects are unknown
+    assert "obj_000013, obj_000014, the runs have bowl, mug" in error and not (tmp_path / "other").exists()
 
 
 def test_a_scene_without_ground_truth_can_be_segmented(tmp_path: Path) -> None:

@@ -80,8 +80,7 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     assert view.depth.size < camera.width * camera.height / 2
     _, depth = full_image(view, camera)
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
-    expected = intersect_triangles(shape, pose[:3, 3], rays)
-    expected = expected.reshape(depth.shape)
+    expected = intersect_triangles(shape, pose[:3, 3], rays).reshape(depth.shape)
     assert np.array_equal(depth > 0, expected > 0)
     assert np.abs(depth - expected * 1000).max() <= 0.501
 

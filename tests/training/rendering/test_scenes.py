@@ -7,17 +7,9 @@ from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
+from training.rendering import scenes as module
 from training.rendering.camera import Camera
-from training.rendering.scenes import (
-    MIN_PIXELS,
-    SCENE_CAMERA,
-    Scene,
-    _arrange,
-    _put_down,
-    _sensed_depth,
-    compose_scene,
-    compose_views,
-)
+from training.rendering.scenes import MIN_PIXELS, SCENE_CAMERA, Scene, compose_scene, compose_views
 
 OBJECTS = builtin_objects()
 SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
@@ -92,7 +84,7 @@ def test_clutter_increases_occlusion() -> None:
 def test_objects_stand_apart_on_the_table() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        meshes = _arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
+        meshes = module._arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
         hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull for mesh in meshes]
         for k, one in enumerate(hulls):
             assert one.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
@@ -109,10 +101,10 @@ def test_poses() -> None:
     """Poses are rigid motions; tall objects stand or lie, and no object balances on a tip."""
     rng = np.random.default_rng(0)
     names = ("soup_can_red", "cereal_box_blue", "screwdriver", "white_plate", "wooden_spoon")
-    can, box, *flat = ({round(_put_down(OBJECTS[name], rng).height, 3) for _ in range(60)} for name in names)
+    can, box, *flat = ({round(module._put_down(OBJECTS[name], rng).height, 3) for _ in range(60)} for name in names)
     assert can == {0.101, 0.066} and box == {0.235, 0.16, 0.055} and [len(heights) for heights in flat] == [1, 1, 1]
     mesh = OBJECTS["mug_blue"]
-    moved = _put_down(mesh, rng).mesh
+    moved = module._put_down(mesh, rng).mesh
     before, after = (np.linalg.norm(m.vertices[:-1] - m.vertices[1:], axis=1) for m in (mesh, moved))
     np.testing.assert_allclose(after, before, atol=1e-12)
     assert trimesh.Trimesh(moved.vertices, moved.faces).volume > 0
@@ -121,17 +113,17 @@ def test_poses() -> None:
 def test_noise_of_depth() -> None:
     rng = np.random.default_rng(0)
     for z in (0.6, 1.5, 3.0):
-        depth = _sensed_depth(np.full((200, 200), z), 1.0, rng)
+        depth = module._sensed_depth(np.full((200, 200), z), 1.0, rng)
         assert depth.mean() == pytest.approx(z * 1000, abs=0.3)
         expected = np.hypot(1.2 + 1.9 * (z - 0.4) ** 2, 1 / np.sqrt(12))
         assert depth.std() == pytest.approx(expected, rel=0.03)
     step = np.full((100, 100), 0.8)
     step[:, 50:] = 1.0
-    depth = _sensed_depth(step, 1.0, rng)
+    depth = module._sensed_depth(step, 1.0, rng)
     assert (depth[:, :49] > 0).all() and (depth[:, 51:] > 0).all()
     assert 0.15 < (depth[:, 49:51] == 0).mean() < 0.45
-    assert not _sensed_depth(np.array([[0.0, 5.0], [0.0, 4.5]]), 1.0, rng).any()
-    assert np.array_equal(_sensed_depth(step, 0.0, rng), np.rint(step * 1000))
+    assert not module._sensed_depth(np.array([[0.0, 5.0], [0.0, 4.5]]), 1.0, rng).any()
+    assert np.array_equal(module._sensed_depth(step, 0.0, rng), np.rint(step * 1000))
 
 
 def test_light_changes_colours_by_a_gain() -> None:

@@ -10,10 +10,8 @@ from pathlib import Path
 
 import pytest
 from processes import HANG, is_running, wait_until
-from refusals import assert_refused
 
-from training.storage import workers as worker_pools
-from training.storage.workers import IN_PROCESS, local_workers, ray_workers
+from training.storage.workers import IN_PROCESS, local_workers
 
 # A worker cannot import functions of a test file; it can import `eval`, whose items contain the work.
 SLOW_FIRST = ["__import__('time').sleep(0.3) or 0", *map(str, range(1, 9))]
@@ -90,14 +88,6 @@ time.sleep(10_000)
         assert workers and all(is_running(pid) for pid in workers)
         parent.send_signal(signal.SIGKILL)
     wait_until(lambda: not any(map(is_running, workers)))
-
-
-def test_ray_that_is_not_installed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> None:
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr(worker_pools.importlib, "import_module", absent)
-    assert_refused(r"engine is ray", ray_workers, 2)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such options")

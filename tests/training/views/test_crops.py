@@ -14,21 +14,12 @@ from scipy.ndimage import generic_filter
 from written_files import files_of
 
 import thor2_jax as thor2
-from thor2_jax.frames.frames import backproject
 from training.objects.meshes import find_meshes, load_mesh
 from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
 from training.train_job import TrainJob, run_train_job
 from training.views import crops as crops_module
-from training.views.crops import (
-    CROP_SIZE,
-    ViewCrops,
-    fill_depth,
-    render_crops,
-    rgbd_crop,
-    stacked,
-    surface_normals,
-)
+from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, render_crops, rgbd_crop, stacked, surface_normals
 from training.views.dataset import ViewDataset, render_dataset
 from training.views.mesh_views import RenderJob
 from training.views.normalized_views import WithoutClasses
@@ -93,12 +84,6 @@ def test_enlarged_mask_matches_opencv() -> None:
     coverage = cv2.resize(mask[9:40, 15:46].astype(np.float32), (124, 124), interpolation=cv2.INTER_LINEAR)
     decided = np.abs(coverage - 0.5) > 1e-3
     np.testing.assert_array_equal(normals.any(axis=-1)[decided], coverage[decided] > 0.5)
-
-
-def test_normals_of_a_plane_are_equal_up_to_the_rim() -> None:
-    normal, mask = np.array([0.48, -0.36, -0.8]), box(4, 10, 30, 18)
-    points = backproject(plane_frame((0.48, -0.36, -0.8), mask).depth_m, CAMERA)
-    np.testing.assert_allclose(surface_normals(points, mask)[mask], np.tile(normal, (mask.sum(), 1)), atol=1e-5)
 
 
 def test_normals_of_a_sphere() -> None:
@@ -173,9 +158,7 @@ def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, 
     assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
 
 
-def test_interrupted_crops_resume_with_the_same_bytes(
-    meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """The damaged file alone is written again; the dataset keeps its digest."""
     directory = dataset.directory / "crops"
     before, first = files_of(directory), min(directory.glob("*.npz"))

@@ -59,11 +59,8 @@ def test_copies_depend_only_on_name_view_and_seed() -> None:
     np.testing.assert_equal(part, whole[15:21])
     plain = views.render_task(views.ViewTask("ball", ball(), angles))
     np.testing.assert_equal(plain, whole[::3])
-    others = [
-        views.render_task(views.ViewTask("bowl", ball(), angles[:1], 0, augmentations, 7)),
-        views.render_task(views.ViewTask("ball", ball(), angles[:1], 0, augmentations, 8)),
-        views.render_task(views.ViewTask("ball", ball(), angles[:1], 1, augmentations, 7)),
-    ]
+    tasks = (("bowl", 0, 7), ("ball", 0, 8), ("ball", 1, 7))
+    others = [views.render_task(views.ViewTask(n, ball(), angles[:1], k, augmentations, seed)) for n, k, seed in tasks]
     copies = [clouds[copy][2][1].tobytes() for clouds in (whole, *others) for copy in (1, 2)]
     assert len(set(copies)) == len(copies)
 
