@@ -29,7 +29,6 @@ from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 __all__ = [
     "LOOKS",
     "ObjectGallery",
-    "augmented_copies",
     "augmented_view",
     "embed_looks",
     "enrolled_object",

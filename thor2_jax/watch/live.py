@@ -1,7 +1,7 @@
 """The live view: a loop that recognizes each frame and publishes it, and the local web server of its page.
 
 with serve_live(broadcast, port=0) as url:
-    view = LiveView(recognizer.recognize, load_segmenter("table"), broadcast)
+    view = LiveView(recognizer.recognize, partial(load_segmenter, "table"), broadcast)
     for recorded in frames:
         view.show(recorded)
 
@@ -95,22 +95,26 @@ class LiveView:
 
     Attributes:
         n_frames: number of recognized frames.
+        n_unlabelled: number of frames that had no labels.
     """
 
     def __init__(
-        self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: Segmenter, broadcast: Broadcast
+        self,
+        recognize: Callable[[RGBDFrame], Sequence[Recognition]],
+        load_segmenter: Callable[[], Segmenter],
+        broadcast: Broadcast,
     ) -> None:
         """Publish the state "waiting" for the first frame.
 
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
-            segmenter: segmenter of frames without labels.
+            load_segmenter: function that returns the segmenter of frames without labels.
             broadcast: receiver of the messages.
         """
-        self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
+        self._recognize, self._load_segmenter, self._broadcast = recognize, load_segmenter, broadcast
         self._times: deque[float] = deque(maxlen=FPS_FRAMES)
         self._last: dict[str, Any] = {}
-        self.n_frames = 0
+        self.n_frames = self.n_unlabelled = 0
         self.publish_state("waiting", "Waiting for the first frame; the model is being compiled.")
 
     def publish_state(self, state: str, message: str) -> None:
@@ -124,7 +128,8 @@ class LiveView:
         try:
             frame = recorded.read()
             if frame.labels is None:
-                frame = segmented(frame, self._segmenter)
+                self.n_unlabelled += 1
+                frame = segmented(frame, self._load_segmenter())
             recognitions = self._recognize(frame)
         except InputError as error:
             self._last = {**self._last, **values, "error": str(error)}

@@ -81,7 +81,7 @@ def latest(broadcast: Broadcast) -> dict[str, Any]:
 def test_messages_of_a_view() -> None:
     broadcast = Broadcast()
     message = functools.partial(latest, broadcast)
-    view = LiveView(recognize, segment_table, broadcast)
+    view = LiveView(recognize, lambda: segment_table, broadcast)
     assert message()["state"] == "waiting" and "image" not in message()
     view.show(recorded(1))
     one = message()
@@ -107,7 +107,9 @@ def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
 
     broadcast, labels = Broadcast(), np.zeros((240, 320), np.uint8)
     labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
-    view = LiveView(lambda f: [Tracked(label, f"name {label}") for label in f.instances], segment_table, broadcast)
+    view = LiveView(
+        lambda f: [Tracked(label, f"name {label}") for label in f.instances], lambda: segment_table, broadcast
+    )
     view.show(recorded(1, lambda: dataclasses.replace(table_frame(), labels=labels)))
     objects = latest(broadcast)["objects"]
     assert sorted(one["name"] for one in objects) == ["name 3", "name 7"]
@@ -148,7 +150,7 @@ def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.Monk
     monkeypatch.setattr(live, "KEEP_ALIVE", 0.05)
     broadcast, page, errors = Broadcast(), browser.new_page(), []
     page.set_default_timeout(1000 * HANG)
-    view = LiveView(recognize, segment_table, broadcast)
+    view = LiveView(recognize, lambda: segment_table, broadcast)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:
