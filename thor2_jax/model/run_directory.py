@@ -140,15 +140,12 @@ def load_run(path: str | Path) -> TrainedRun:
         network = colornet.load(path / "network.npz")
         if network.fingerprint != fingerprint:
             raise ValueError(f"it is not the colour network that {RUN_FILE} names")
-    classifiers = {}
-    for name in names:
-        file, sizes = weights_file(path, name), (input_size(name, config, network.n_regions), len(classes))
-        with decoding(f"model: {file} cannot be used", _EXPECTED):
-            content = read_file(file)
-            if content_digest([content]) != digests[name]:
-                raise ValueError(f"its SHA-256 is not the one in {RUN_FILE}")
-            arrays = unpack_arrays(content)[0]
-            classifiers[name] = model_from_arrays(lambda sizes=sizes: MLP(*sizes, rngs=nnx.Rngs(0)), arrays)
+    classifiers = {
+        name: _load_classifier(
+            weights_file(path, name), input_size(name, config, network.n_regions), len(classes), digests[name]
+        )
+        for name in names
+    }
     file = path / EMBEDDING_FILE
     embedding = Embedding.load(file, network) if file.is_file() else None
     stored = None if embedding is None else embedding.fingerprint
@@ -167,3 +164,11 @@ def load_run(path: str | Path) -> TrainedRun:
 def weights_file(run: Path, name: str) -> Path:
     """Return the path of a classifier's weights in a run directory."""
     return run / "weights" / f"{name}.safetensors"
+
+
+def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
+    with decoding(f"model: {path} cannot be used", _EXPECTED):
+        content = read_file(path)
+        if content_digest([content]) != digest:
+            raise ValueError(f"its SHA-256 is not the one in {RUN_FILE}")
+        return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])
