@@ -71,16 +71,23 @@ def test_a_rotation_and_a_shift_of_cloud_and_camera(seed: int) -> None:
     assert after[:, 0].mean() <= sides[0] / 2  # sign rule
 
 
-BALL = np.asarray(trimesh.creation.icosphere(2, radius=0.1).vertices) + [0, 0, 0.6]
+AMBIGUOUS = {
+    **{name: points for name, points in DEGENERATE.items() if len(points)},
+    "three points": np.array([[0, 0, 0.5], [0.1, 0, 0.5], [0, 0.2, 0.5]]),
+    "ball": np.asarray(trimesh.creation.icosphere(2, radius=0.1).vertices) + [0, 0, 0.6],
+}
 
 
-@pytest.mark.parametrize("points", [*list(DEGENERATE.values())[1:], BALL], ids=[*list(DEGENERATE)[1:], "ball"])
-def test_degenerate_clouds_move_rigidly_too(points: np.ndarray) -> None:
+@pytest.mark.parametrize("name", AMBIGUOUS)
+def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
+    points = AMBIGUOUS[name]
     after = normalized(points)
     assert np.isfinite(after).all()
     between = np.linalg.norm(points[:, None] - points, axis=-1) * 2.5
     np.testing.assert_allclose(np.linalg.norm(after[:, None] - after, axis=-1), between, atol=3e-6)
-    assert (np.diff(after.max(axis=0)) <= 2e-6).all()
+    sides = after.max(axis=0)
+    assert (np.diff(sides) <= 2e-6).all()
+    np.testing.assert_allclose(sides[np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) :], 0, atol=3e-6)
 
 
 @pytest.mark.parametrize("height", [0.03, 0.045, 0.055, 0.07])
@@ -92,20 +99,6 @@ def test_the_camera_side_is_relative_to_the_middle_of_the_box(height: float, hea
     points[:400, 2] = 0 if heavy == "below" else 0.1
     normal = thor2.view_normalize(pack(points, camera=np.array([1, 0.15, height])), CONFIG)
     assert float(normal.camera[0, 2]) <= float(normal.points[0, : len(points), 2].max()) / 2
-
-
-@pytest.mark.parametrize(("at_start", "at_end"), [(3, 2), (1, 0), (2, 2), (2, 3)])
-def test_the_occluded_end_does_not_come_first(at_start: int, at_end: int) -> None:
-    """A rotation by pi about z exactly if the first two bins of 0.01 hold more boundary points than the last two."""
-    points = object_cloud(5, 1200)
-    plain = normalized(points)
-    bins = np.floor(plain[:, 0] / 0.01)
-    first, last = np.flatnonzero(bins == 1), np.flatnonzero(bins == bins.max() - 1)
-    between = np.flatnonzero((bins > 1) & (bins < bins.max() - 1))
-    boundary = np.isin(np.arange(len(points)), [*first[:at_start], *last[:at_end], *between[:40]])
-    turned = plain * [-1, -1, 1] + plain.max(axis=0) * [1, 1, 0]
-    expected = turned if at_start > at_end else plain
-    np.testing.assert_allclose(normalized(points, boundary=[boundary]), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("alpha", [np.pi / 4, -0.3])
@@ -157,15 +150,13 @@ compiled_box, compiled_support = jax.jit(minimal_box), jax.jit(support_points)
 def padded(points: np.ndarray, capacity: int = 512) -> np.ndarray:
     """Return the centred points, [3, N], padded with zeros."""
     out = np.zeros((3, capacity), np.float32)
-    out[:, : len(points)] = (points - (points.mean(axis=0) if len(points) else 0)).T
+    out[:, : len(points)] = (points - points.mean(axis=0)).T
     return out
 
 
 def box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes, float64, and the side lengths along them, measured on the points."""
     axes, low, high = (np.asarray(part, np.float64) for part in compiled_box(padded(points)))
-    if len(points) == 0:
-        return axes, np.zeros(3)
     turned = (points - points.mean(axis=0)) @ axes.T
     np.testing.assert_allclose([low, high], [turned.min(axis=0), turned.max(axis=0)], atol=1e-6 * np.abs(points).max())
     return axes, np.ptp(turned, axis=0)
@@ -185,23 +176,6 @@ def shapes() -> list[np.ndarray]:
         points = points * rng.uniform(0.1, 1, 3) + rng.normal(scale=0.01, size=points.shape)
         clouds.append(points @ Rotation.random(random_state=k).as_matrix().T)
     return clouds
-
-
-CLOUDS = {
-    **DEGENERATE,
-    "three points": np.array([[0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]]),
-    "ball": trimesh.creation.icosphere(2).vertices,
-}
-
-
-@pytest.mark.parametrize("name", CLOUDS)
-def test_axes_of_degenerate_clouds_are_orthonormal(name: str) -> None:
-    axes, sides = box_of(CLOUDS[name])
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
-    assert sides[0] >= sides[1] - 1e-5 and sides[1] >= sides[2] - 1e-5
-    if len(CLOUDS[name]):
-        rank = np.linalg.matrix_rank(CLOUDS[name] - CLOUDS[name].mean(axis=0), tol=1e-6)
-        np.testing.assert_allclose(sides[rank:], 0, atol=1e-5)
 
 
 def test_volumes_against_an_exhaustive_search() -> None:
