@@ -59,12 +59,6 @@ def test_released_convention_fixes_the_widths_and_borders(change: dict[str, Any]
     assert_refused(message, DescriptorConfig.released, **change)
 
 
-def test_relaxed_configs_are_hashable_and_differ() -> None:
-    relaxed = DescriptorConfig(relaxation=Relaxation(color=2.0))
-    assert hash(relaxed) == hash(DescriptorConfig(relaxation=Relaxation(color=2.0)))
-    assert len({relaxed, DescriptorConfig(), DescriptorConfig(relaxation=Relaxation())}) == 3
-
-
 def stored(**changes: object) -> dict[str, object]:
     """Return the record of a config as JSON holds it, with some constants changed; None removes one."""
     record = json.loads(json.dumps(dataclasses.asdict(DescriptorConfig()))) | changes

@@ -1,11 +1,7 @@
-"""Slices, strips and colour vectors against a plain loop over the points in NumPy, float64."""
-
-import dataclasses
+"""The rounding of the released rule, and colour regions, against NumPy in float64; tests/properties tests strips."""
 
 import jax
 import numpy as np
-import pytest
-from small_clouds import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
@@ -13,53 +9,13 @@ from thor2_jax.descriptor.slicing import color_sets, region_sets, slices_and_str
 from thor2_jax.testing.values import cells
 
 NETWORK = colornet.load_default()
-PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
-Cloud = tuple[np.ndarray, np.ndarray]
+RELEASED = thor2.DescriptorConfig.released()
 
 
 @jax.jit
 def released_indices(points: np.ndarray, mask: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Return the slices and the strips of points [N, 3] by the released rule."""
     return slices_and_strips(points[:, 0], points[:, 2], mask, RELEASED)
-
-
-def expected_strips(points: np.ndarray, rgb: np.ndarray, config: thor2.DescriptorConfig) -> dict[str, np.ndarray]:
-    released, (i, j) = config.convention == "released", cells(points, config)
-    y = np.round(points[:, 1], 2) if released else points[:, 1]
-    weights = NETWORK.membership(rgb).astype(np.float64)
-    out = {name: np.zeros((7, 31)) for name in ("low", "high")}
-    out["occupied"], out["color"] = np.zeros((7, 31), bool), np.zeros((7, 31, 22))
-    for a in range(7):
-        for b in range(31):
-            here = (i == a) & (j == b)
-            if here.any():
-                out["low"][a, b], out["high"][a, b] = y[here].min(), y[here].max()
-                out["occupied"][a, b] = True
-                out["color"][a, b] = weights[here].sum(axis=0) / (here.sum() if released else 1)
-    out["overflow"] = np.sum((i >= 7) | (j >= 31))
-    return out
-
-
-@pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
-@pytest.mark.parametrize(
-    ("sizes", "extent"),
-    [
-        ((1, 2), (0.76, 0.4, 0.68)),
-        ((333, 0, 512), (0.76, 0.4, 0.68)),
-        *(((500, 77), extent) for extent in ((0.7, 0.4, 1.2), (1.3, 0.4, 0.6), (1.6, 0.4, 1.3))),  # points are left out
-    ],
-)
-def test_strips_against_numpy(
-    sizes: tuple[int, ...], extent: tuple[float, float, float], config: thor2.DescriptorConfig
-) -> None:
-    clouds = [aligned_cloud(k, n, extent) for k, n in enumerate(sizes)]
-    strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
-    for b, (points, rgb) in enumerate(clouds):
-        expected = expected_strips(points.astype(np.float64), rgb, config)
-        for field in dataclasses.fields(strips):
-            actual = np.asarray(getattr(strips, field.name)[b])
-            np.testing.assert_allclose(actual, expected[field.name], atol=1e-5, err_msg=f"{b} {field.name}")
-        assert max(extent) < 1 or int(strips.overflow[b]) > 0
 
 
 def test_the_released_rounding_at_every_half() -> None:

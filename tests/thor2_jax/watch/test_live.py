@@ -22,6 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.segmentation.table import segment_table
+from thor2_jax.tracking.tracker import TrackedRecognition
 from thor2_jax.watch import live
 from thor2_jax.watch.live import LONGEST_PAUSE, Broadcast, LiveView, paced, serve_live
 
@@ -102,13 +103,10 @@ def test_messages_of_a_view() -> None:
 
 
 def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
-    class Tracked(Recognition):
-        track, frames = 2, 5
-
     broadcast, labels = Broadcast(), np.zeros((240, 320), np.uint8)
     labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
     view = LiveView(
-        lambda f: [Tracked(label, f"name {label}") for label in f.instances], lambda: segment_table, broadcast
+        lambda f: [TrackedRecognition(k, f"name {k}", track=2, frames=5) for k in f.instances], fail, broadcast
     )
     view.show(recorded(1, lambda: dataclasses.replace(table_frame(), labels=labels)))
     objects = latest(broadcast)["objects"]
