@@ -188,14 +188,14 @@ def check_types(**arguments: object) -> None:
             raise InputError(f"{name} is a {type(value).__name__}; expected a {expected[0].__name__}")
 
 
-def as_array(values: ArrayLike, name: str, expected: str = "numbers") -> NDArray[Any]:
+def as_array(values: ArrayLike, name: str, expected: str = "an array of numbers") -> NDArray[Any]:
     """Return an array of numbers or flags; texts, rows of different lengths and other objects raise InputError."""
     try:
         array = np.asarray(values)
     except ValueError:
         array = np.zeros(0, object)
     if array.dtype.kind not in "biuf":
-        raise InputError(f"{name} is {reprlib.repr(values)}; expected {expected}, in rows of equal length")
+        raise InputError(f"{name} is {reprlib.repr(values)}; expected {expected}")
     return array
 
 
@@ -208,7 +208,9 @@ def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[n
     """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
-    points, colors = as_array(pair[0], f"{name}: xyz"), as_array(pair[1], f"{name}: rgb")
+    points, colors = (
+        as_array(part, f"{name}: {k}", "an array [n, 3]") for k, part in zip(("xyz", "rgb"), pair, strict=True)
+    )
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
         raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], in metres")
     if colors.shape != points.shape:

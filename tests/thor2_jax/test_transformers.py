@@ -113,9 +113,7 @@ INVALID = {
     "X is empty": [],
     "X[1] is a int": [(XYZ, RGB), 7],
     "X[1]: xyz[2] is [nan, nan, nan]": [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)],
-    "X[0]: xyz is [[0.0, 1.0, 2.0], [0.0]]; expected numbers, in rows of equal length": [
-        ([[0.0, 1.0, 2.0], [0.0]], RGB)
-    ],
+    "X[0]: xyz is [[0.0, 1.0, 2.0], [0.0]]; expected an array [n, 3]": [([[0.0, 1.0, 2.0], [0.0]], RGB)],
     "X[0]: rgb is [2, 3]": [(XYZ, RGB[:2])],
     "X[1] has 8193 points": [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))],
 }

@@ -11,8 +11,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import safetensors.numpy
-from failures import full_disk
 from refusals import assert_refused
 from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
@@ -82,20 +80,6 @@ def test_an_empty_directory_may_be_filled(tmp_path: Path) -> None:
     save_run(make_run(("ce",)), tmp_path / "run")
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert tuple(load_run(tmp_path / "run").classifiers) == ("ce",)
-
-
-@pytest.mark.parametrize("broken", ["network", "weights", "json"])
-def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = make_run()
-    if broken == "network":
-        monkeypatch.setattr(colornet, "save", full_disk)
-    elif broken == "weights":
-        monkeypatch.setattr(safetensors.numpy, "save", full_disk)
-    else:
-        run = dataclasses.replace(run, record={"not JSON": object()})
-    with pytest.raises(TypeError if broken == "json" else OSError):
-        save_run(run, tmp_path / "run")
-    assert list(tmp_path.iterdir()) == []
 
 
 def edited(**changes: Any) -> Callable[[Path], None]:
