@@ -63,11 +63,3 @@ def test_every_level_of_a_channel_and_every_half_between_two() -> None:
         colors = np.full((len(values), 3), 0.5, np.float32)
         colors[:, axis] = values
         np.testing.assert_array_equal(weights(colors), NETWORK.membership(as_8_bit(colors)))
-
-
-def test_floating_colours_in_any_shape() -> None:
-    colors = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
-    region_weights = weights(colors)
-    assert region_weights.shape == (4, 5, 22) and region_weights.dtype == np.float32
-    np.testing.assert_array_equal(region_weights, NETWORK.membership(as_8_bit(colors)))
-    np.testing.assert_allclose(region_weights.sum(axis=-1), 1, atol=1e-6)
