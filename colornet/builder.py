@@ -20,17 +20,7 @@ from sklearn.neighbors import sort_graph_by_row_values
 from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, hyab, to_lab
 from colornet.network import ColorNetwork
 
-__all__ = [
-    "EPS",
-    "MIN_SAMPLES",
-    "HyabDBSCAN",
-    "build_network",
-    "hyab_neighbors",
-    "lens",
-    "merge_redundant",
-    "relabel",
-    "similarity",
-]
+__all__ = ["build_network", "similarity"]
 
 HUE_SHIFT = np.pi / 8
 """Shift xi of the lens, which moves the cut of the hue circle away from the reds."""

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.builder import HyabDBSCAN
-from colornet.colors import GRID_WHITE, grid_colors, to_lab
 
 NETWORK = colornet.load_default()
 BUILD = """
@@ -36,27 +34,6 @@ def test_packaged_network_is_built_in_little_memory(tmp_path: Path) -> None:
         else:
             np.testing.assert_array_equal(built, packaged, err_msg=field.name)
     assert rebuilt.fingerprint == NETWORK.fingerprint
-
-
-def test_regions_are_the_clusters_of_their_cubes() -> None:
-    """Clusters of five cubes of the cover, found anew, are regions; one was merged with that of another cube.
-
-    The cover has 3 x 8 intervals of chroma and hue, each widened by its overlap.
-    """
-    lab = to_lab(grid_colors(), GRID_WHITE)
-    lens = np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1])
-    regions = [np.flatnonzero(NETWORK.region_bits >> np.uint32(r) & 1) for r in range(NETWORK.n_regions)]
-    equal_regions = []
-    for cube in ((1, 0), (1, 1), (2, 3), (2, 5), (2, 7)):
-        inside = np.ones(len(lab), bool)
-        for values, count, overlap, number in zip(lens, (3, 8), (0.10, 0.25), cube, strict=True):
-            length = np.ptp(values) / count
-            inside &= np.abs(values - values.min() - length * (number + 0.5)) <= length / (2 * (1 - overlap))
-        rows = np.flatnonzero(inside)
-        labels = HyabDBSCAN().fit_predict(lab[rows])
-        for cluster in (rows[labels == k] for k in range(labels.max() + 1)):
-            equal_regions.append([r for r, members in enumerate(regions) if np.array_equal(cluster, members)])
-    assert equal_regions == [[8], [9], [17], [], [19], [21]]
 
 
 def test_counts_and_edges() -> None:

@@ -38,8 +38,10 @@ def described(
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_paper_convention(golden_files: tuple[Path, ...], homology: str) -> None:
-    descriptors, strips, _ = described(golden_files, thor2.DescriptorConfig(homology=homology))
+    descriptors, strips, diagrams = described(golden_files, thor2.DescriptorConfig(homology=homology))
     assert not np.asarray(descriptors.overflow).any()
+    for values in (diagrams.births, diagrams.deaths):
+        assert not np.asarray(values)[~np.asarray(diagrams.mask)].any()
     for row, path in enumerate(golden_files):
         golden, close = load(path), functools.partial(np.testing.assert_allclose, err_msg=path.name, atol=TOLERANCE)
         close(descriptors.images[row], golden["paper_images"])

@@ -10,7 +10,7 @@ from image_files import patches, tilted
 from refusals import assert_refused
 from scipy.stats import gmean
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, assert_same_answers, class_probabilities, small_embedding, untrained_run
+from small_runs import SMALL_CONFIG, class_probabilities, small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
@@ -124,15 +124,6 @@ def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recogn
     for name, probabilities in class_probabilities(recognizer, described.oriented).items():
         expected = jax.nn.softmax(run.classifiers[name](feature_of(described.descriptors, name)))
         np.testing.assert_allclose(probabilities, expected, atol=1e-5)
-
-
-def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> None:
-    labels = squares(9)  # two batches of four and one of one
-    alone = [np.where(labels == number, labels, 0) for number in range(1, 10)]
-    expected = [answer for part in alone for answer in recognizer.recognize(tilted(part))]
-    answers = recognizer.recognize(tilted(labels))
-    assert [a.label for a in answers] == list(range(1, 10)) and all(a.reason is None for a in answers)
-    assert_same_answers(answers, expected, 1e-5)
 
 
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:

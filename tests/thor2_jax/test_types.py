@@ -103,7 +103,7 @@ def put(array: np.ndarray, value: float) -> np.ndarray:
         ({"camera": "here"}, ["camera", "here"]),
         ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
-        ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
+        ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "[[True], [True, False]]; expected bool [n]"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),

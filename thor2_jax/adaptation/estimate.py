@@ -37,20 +37,7 @@ from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.networks import EMBEDDING, Classifier
 from thor2_jax.types import PointClouds, matmul
 
-__all__ = [
-    "Adaptation",
-    "CAPACITY",
-    "Criterion",
-    "MAX_INSTANCES",
-    "MIN_INSTANCES",
-    "OnlineAdaptation",
-    "adaptation_criterion",
-    "camera_instances",
-    "entropy",
-    "estimate_transform",
-    "objective",
-    "transform_colors",
-]
+__all__ = ["Adaptation", "OnlineAdaptation", "adaptation_criterion", "camera_instances", "estimate_transform"]
 
 ROWS = 8
 """Number of instances that are described in one call."""

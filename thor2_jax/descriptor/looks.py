@@ -33,7 +33,6 @@ from thor2_jax.types import HIGHEST, Descriptors, PointClouds, Strips
 __all__ = [
     "N_BALANCED",
     "N_SCALARS",
-    "WARMTH",
     "LookDescriptors",
     "aligned_looks",
     "balanced_histogram",
@@ -41,7 +40,6 @@ __all__ = [
     "describe_aligned_looks",
     "describe_looks",
     "is_color",
-    "side_lengths",
 ]
 
 WARMTH = 1.06

@@ -32,11 +32,9 @@ from thor2_jax.types import Strips, matmul
 __all__ = [
     "RegionSets",
     "color_sets",
-    "interval_log_weights",
     "region_sets",
     "relaxed_strips",
     "slices_and_strips",
-    "soft_regions",
     "square_root",
     "strip_births",
     "strips_of_cloud",

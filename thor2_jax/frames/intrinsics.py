@@ -14,8 +14,9 @@
 import codecs
 import dataclasses
 import io
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -131,17 +132,17 @@ class Intrinsics:
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
             values = values["intrinsic"]
-        for names, convert in _FORMATS:
-            if any(name in values for name in names):
-                matrix, scale, distortion = convert(values)
-                scale = DEFAULT_DEPTH_SCALE if scale is None else scale
-                width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
-                return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
-        shown = ", ".join(map(str, list(values)[:8])) or "no entry"
-        raise InputError(
-            f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
-            "intrinsic_matrix"
-        )
+        parts = _parts(values)
+        if parts is None:
+            shown = ", ".join(map(str, list(values)[:8])) or "no entry"
+            raise InputError(
+                f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
+                "intrinsic_matrix"
+            )
+        matrix, scale, distortion = parts
+        scale = DEFAULT_DEPTH_SCALE if scale is None else scale
+        width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
+        return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
 
     @classmethod
     def of_matrix(
@@ -257,59 +258,51 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-_Parts = tuple[Any, Any, Any]
-"""A camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion."""
+def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
+    """Return a camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion.
+
+    The entries of a mapping determine its format; the result is None if no format has them.
+    """
+    scale: Any = values.get("depth_scale")
+    model = values.get("distortion_model")
+    if "cam_K" in values:
+        return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number"), ()
+    if "intrinsic_matrix" in values:
+        matrix = np.asarray(values["intrinsic_matrix"], dtype=object)
+        if matrix.size != 9:
+            raise InputError(
+                f"intrinsics.intrinsic_matrix is {str(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, 0, "
+                "cx, cy, 1"
+            )
+        return matrix.reshape(3, 3).T, scale, ()
+    if "ppx" in values or "ppy" in values:
+        scale = _units_per_metre(scale, 1, 1, "metres per depth unit beside ppx and ppy, such as 0.001")
+        return _pinhole_matrix(values, "ppx", "ppy"), scale, _supported(values.get("model"), values.get("coeffs"))
+    if any(name in values for name in ("camera_matrix", "K", "k")):  # K alone is a camera_info, too
+        coefficients = _supported(model, _entry(values, "distortion_coefficients", "D", "d"))
+        return _entry(values, "camera_matrix", "K", "k"), scale, coefficients
+    if any(name in values for name in _PINHOLE):
+        has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
+        if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
+            scale = 1000 / scale  # BOP's camera.json
+        return _pinhole_matrix(values, "cx", "cy"), scale, _supported(model, values.get("distortion"))
+    return None
 
 
-def _pinhole_matrix(values: Mapping[Any, Any], *names: str) -> list[Any]:
+def _pinhole_matrix(values: Mapping[Any, Any], column: str, row: str) -> list[Any]:
+    """Return the matrix of focal lengths and a principal point, whose names are given."""
+    names = ("fx", "fy", column, row)
     missing = [name for name in names if name not in values]
     if missing:
         raise InputError(f"intrinsics lacks {', '.join(missing)}; expected {', '.join(names)}")
-    fx, fy, cx, cy = (values[name] for name in names)
-    return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+    return [values["fx"], 0, values[column], 0, values["fy"], values[row], 0, 0, 1]
 
 
-def _of_pinhole(values: Mapping[Any, Any]) -> _Parts:
-    scale: Any = values.get("depth_scale")
-    has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
-    if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
-        scale = 1000 / scale  # BOP's camera.json
-    distortion = _supported(values.get("distortion_model"), values.get("distortion"))
-    return _pinhole_matrix(values, *_PINHOLE), scale, distortion
-
-
-def _of_realsense(values: Mapping[Any, Any]) -> _Parts:
-    matrix = _pinhole_matrix(values, "fx", "fy", "ppx", "ppy")
-    scale = values.get("depth_scale")
-    if scale is not None and not (_is_number(scale) and 0 < scale < 1):
-        raise InputError(
-            f"intrinsics.depth_scale is {scale!r} beside ppx and ppy; expected metres per depth unit, such as 0.001"
-        )
-    return matrix, None if scale is None else 1 / scale, _supported(values.get("model"), values.get("coeffs"))
-
-
-def _of_camera_info(values: Mapping[Any, Any]) -> _Parts:
-    coefficients = _supported(values.get("distortion_model"), _entry(values, "distortion_coefficients", "D", "d"))
-    matrix = _entry(values, "camera_matrix", "K", "k")
-    return matrix, values.get("depth_scale"), coefficients
-
-
-def _of_bop(values: Mapping[Any, Any]) -> _Parts:
-    scale = values.get("depth_scale")
-    if scale is not None and not (_is_number(scale) and scale > 0):
-        raise InputError(f"intrinsics.depth_scale is {scale!r}; expected a positive number")
-    return values["cam_K"], None if scale is None else 1000 / scale, ()
-
-
-def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
-    matrix = values["intrinsic_matrix"]
-    try:
-        transposed = np.asarray(matrix, dtype=object).reshape(3, 3).T
-    except ValueError:
-        raise InputError(
-            f"intrinsics.intrinsic_matrix is {str(matrix)[:200]}; expected fx, 0, 0, 0, fy, 0, cx, cy, 1"
-        ) from None
-    return transposed, values.get("depth_scale"), ()
+def _units_per_metre(scale: Any, units: int, most: float, expected: str) -> float | None:
+    """Return depth units per metre from the inverse in a file, with `units` in a metre; None without a scale."""
+    if scale is not None and not (_is_number(scale) and 0 < scale < most):
+        raise InputError(f"intrinsics.depth_scale is {scale!r}; expected {expected}")
+    return None if scale is None else units / scale
 
 
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:
@@ -319,15 +312,6 @@ def _entry(values: Mapping[Any, Any], *names: str) -> Any:
 
 
 _MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
-
-_FORMATS: Sequence[tuple[Sequence[str], Callable[[Mapping[Any, Any]], _Parts]]] = (
-    (("cam_K",), _of_bop),
-    (("intrinsic_matrix",), _of_open3d),
-    (("ppx", "ppy"), _of_realsense),
-    (("camera_matrix", "K", "k"), _of_camera_info),
-    (_PINHOLE, _of_pinhole),
-)
-"""Entries that identify a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
 
 
 def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:

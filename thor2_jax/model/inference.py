@@ -10,7 +10,8 @@ while the host prepares the next one.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -56,22 +57,17 @@ def compute_by_chunks(
         All instances, and the arrays of the usable ones on the host, padded with zeros to whole batch buckets.
     """
     prepared: list[PreparedInstance] = []
-    chunk: list[PreparedInstance] = []
-    results: list[T] = []
 
-    def compute_chunk() -> None:
+    def usable() -> Iterator[PreparedInstance]:
+        for instance in instances:
+            prepared.append(instance)
+            if instance.reason is None:
+                yield instance
+
+    remaining, results = usable(), list[T]()
+    while (chunk := list(itertools.islice(remaining, size))) or not results:
         capacity = batch_points(len(instance.points) for instance in chunk) if size > MIN_PART else None
         results.append(compute(pack_instances(chunk, padded_rows(len(chunk), size), capacity)))
-        chunk.clear()
-
-    for instance in instances:
-        prepared.append(instance)
-        if instance.reason is None:
-            chunk.append(instance)
-            if len(chunk) == size:
-                compute_chunk()
-    if chunk or not results:
-        compute_chunk()
     n_rows = padded_rows(sum(instance.reason is None for instance in prepared), size)
 
     def concatenate(*arrays: jax.Array) -> NDArray[Any]:

@@ -20,12 +20,9 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.recognition import Detection, Recognition
 
 __all__ = [
-    "BOP_HEADER",
     "RESULT_FILES",
     "ResultTables",
-    "category_numbers",
     "check_no_foreign_results",
-    "image_numbers",
     "is_bop_file",
     "is_coco_file",
     "write_recognitions",

@@ -54,9 +54,7 @@ def image_kind(message: Any) -> str:
         encoding = message.encoding.lower()
         return "color" if encoding in _COLOR_CHANNELS else "depth" if encoding in _DEPTH_TYPES else "other"
     encoding, _, transport = message.format.lower().partition(";")
-    if "compresseddepth" in transport:
-        return "depth"
-    if encoding.strip() in _DEPTH_TYPES:
+    if "compresseddepth" in transport or encoding.strip() in _DEPTH_TYPES:
         return "depth"
     try:
         with Image.open(io.BytesIO(bytes(message.data)), formats=_FORMATS) as image:

@@ -25,14 +25,7 @@ from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
 
-__all__ = [
-    "adaptation_answer",
-    "calibrated_confidence",
-    "explained_frame",
-    "instance_answer",
-    "object_answers",
-    "why_answer",
-]
+__all__ = ["adaptation_answer", "explained_frame", "instance_answer", "object_answers", "why_answer"]
 
 MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""

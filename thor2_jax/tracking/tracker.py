@@ -132,7 +132,7 @@ class FusedEvidence:
         self.weight = 0.0
         self.logs: dict[str, NDArray[np.float64]] = {}
         self.score_weight = 0.0
-        self.scores: Mapping[str, float] | None = None
+        self.scores: dict[str, float] | None = None
 
     def add(
         self, weight: float, probabilities: Mapping[str, NDArray[np.floating]], scores: Mapping[str, float] | None
@@ -151,13 +151,13 @@ class FusedEvidence:
             name: decay * self.logs.get(name, np.zeros(len(p) + 1)) + weight * _log_with_rest(p)
             for name, p in probabilities.items()
         }
-        earlier = self.scores or {}
-        if set(scores or {}) != set(earlier):
-            self.score_weight, earlier = 0.0, dict.fromkeys(scores or {}, 0.0)
+        if scores is None:
+            self.scores = None
+            return
+        if self.scores is None or self.scores.keys() != scores.keys():
+            self.score_weight, self.scores = 0.0, dict.fromkeys(scores, 0.0)
         self.score_weight = decay * self.score_weight + weight
-        if scores is not None:
-            scores = {name: decay * earlier[name] + weight * value for name, value in scores.items()}
-        self.scores = scores
+        self.scores = {name: decay * self.scores[name] + weight * value for name, value in scores.items()}
 
     def fused(self) -> tuple[dict[str, NDArray[np.float64]], dict[str, float] | None]:
         """Return classifier -> fused class probabilities [C], and object -> fused score; None without a gallery."""

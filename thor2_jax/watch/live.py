@@ -1,13 +1,13 @@
 """The live view: a loop that recognizes each frame and publishes it, and the local web server of its page.
 
 with serve_live(broadcast, port=0) as url:
-    view = LiveView(recognizer.recognize, load_segmenter("table"), broadcast)
+    view = LiveView(recognizer.recognize, partial(load_segmenter, "table"), broadcast)
     for recorded in frames:
         view.show(recorded)
 
 A message is JSON and a server-sent event. It has `state` (waiting, live, ended or failed), `message`, and the values of
 the last frame: `frame` (its name), `number`, `image` (JPEG in base64), `fps`, `milliseconds` for segmentation and
-recognition, `error`, and `objects` with name, confidence, track, frames, position, color and reason of each object.
+recognition, `error`, and `objects`: the fields of the answer, box, position and color of each object.
 """
 
 import base64
@@ -25,8 +25,8 @@ from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
-from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
-from thor2_jax.model.recognition import Detection, Recognition, detections_of
+from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
+from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.service.hosts import check_host_names, is_allowed_host, listening, page_headers
 
@@ -39,8 +39,6 @@ LONGEST_PAUSE = 2.0
 """Largest time, seconds, that a frame may be late or early before the clock of the recording is reset."""
 
 _JPEG_QUALITY = 80
-
-_ANSWER_FIELDS = ("label", "name", "confidence", "occluded", "reason", "track", "frames")
 
 
 def paced(
@@ -95,22 +93,26 @@ class LiveView:
 
     Attributes:
         n_frames: number of recognized frames.
+        n_unlabelled: number of frames that had no labels.
     """
 
     def __init__(
-        self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: Segmenter, broadcast: Broadcast
+        self,
+        recognize: Callable[[RGBDFrame], Sequence[Recognition]],
+        load_segmenter: Callable[[], Segmenter],
+        broadcast: Broadcast,
     ) -> None:
         """Publish the state "waiting" for the first frame.
 
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
-            segmenter: segmenter of frames without labels.
+            load_segmenter: function that returns the segmenter of frames without labels.
             broadcast: receiver of the messages.
         """
-        self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
+        self._recognize, self._load_segmenter, self._broadcast = recognize, load_segmenter, broadcast
         self._times: deque[float] = deque(maxlen=FPS_FRAMES)
         self._last: dict[str, Any] = {}
-        self.n_frames = 0
+        self.n_frames = self.n_unlabelled = 0
         self.publish_state("waiting", "Waiting for the first frame; the model is being compiled.")
 
     def publish_state(self, state: str, message: str) -> None:
@@ -124,7 +126,8 @@ class LiveView:
         try:
             frame = recorded.read()
             if frame.labels is None:
-                frame = segmented(frame, self._segmenter)
+                self.n_unlabelled += 1
+                frame = segmented(frame, self._load_segmenter())
             recognitions = self._recognize(frame)
         except InputError as error:
             self._last = {**self._last, **values, "error": str(error)}
@@ -132,7 +135,10 @@ class LiveView:
             milliseconds = 1000 * (time.perf_counter() - start)
             detections = sorted(detections_of(frame, recognitions), key=_order)
             annotations = [_annotation(one.recognition, number) for number, one in enumerate(detections)]
-            values["objects"] = [_object(one, note.paint) for one, note in zip(detections, annotations, strict=True)]
+            values["objects"] = [
+                {"track": None, **one, "color": "#{:02x}{:02x}{:02x}".format(*note.paint)}
+                for one, note in zip(detections_as_json(detections), annotations, strict=True)
+            ]
             self._last = {**values, "milliseconds": milliseconds, "image": _picture(frame, annotations)}
             self.n_frames += 1
         self._times.append(time.perf_counter())
@@ -155,15 +161,6 @@ def _annotation(answer: Recognition, number: int) -> Annotation:
         return Annotation(answer.label, UNRECOGNIZED, "unknown")
     track = getattr(answer, "track", None)
     return Annotation(answer.label, COLORS[(number if track is None else track - 1) % len(COLORS)], answer.name)
-
-
-def _object(detection: Detection, paint: Paint) -> dict[str, Any]:
-    answer = detection.recognition
-    return {
-        **{name: getattr(answer, name, None) for name in _ANSWER_FIELDS},
-        "position": detection.position,
-        "color": "#{:02x}{:02x}{:02x}".format(*paint),
-    }
 
 
 def _picture(frame: RGBDFrame, annotations: Sequence[Annotation]) -> str:

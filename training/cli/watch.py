@@ -46,10 +46,9 @@ def watch(
     """
     # `main` repeats a KeyboardInterrupt that was lost in a finalizer or in a callback of JAX.
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
-        from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
+        from thor2_jax.frames.frames import RecordedFrame
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.segmentation.segmenters import segment as segment_frame
         from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
         from training.frame_recognition import RecognizerArguments, read_source
 
@@ -63,18 +62,6 @@ def watch(
         load = functools.cache(functools.partial(load_segmenter, segment or TABLE))
         if folder is None or segment:
             load()  # raises InputError if its package is missing, which frames with labels do not need
-        segments = ["--segment", segment] if segment else []
-        not_loaded: list[InputError] = []
-
-        def segment_unlabelled(frame: RGBDFrame) -> Any:
-            segments[:] = "--segment", segment or TABLE
-            try:
-                segmenter = load()
-            except InputError as error:
-                not_loaded.append(error)
-                raise
-            return segment_frame(frame, segmenter)  # names the segmenter in its errors
-
         frames: Iterator[RecordedFrame]
         if folder is not None:
             numbered = enumerate(given_frames.sources(segment))
@@ -91,19 +78,20 @@ def watch(
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
         print_note(f"watch at {url}")
-        view = LiveView(recognizer.track().update if track else recognizer.recognize, segment_unlabelled, broadcast)
+        view = LiveView(recognizer.track().update if track else recognizer.recognize, load, broadcast)
         n_shown = 0
         try:
             for recorded in frames:
                 view.show(recorded)
                 n_shown += 1
-                if not_loaded:  # no other frame without labels could be segmented
-                    raise not_loaded[0]
+                if view.n_unlabelled:
+                    load()  # raises InputError again, since no other frame without labels could be segmented
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)
             raise
         recognized = f"{view.n_frames} of {n_shown} were recognized"
+        segments = ["--segment", segment or TABLE] if segment or view.n_unlabelled else []
         recognize = *(given_frames.arguments or ["FRAME"]), *segments, *options.given_options(arguments)
         shown = f"no more frames, {recognized}; Ctrl-C ends"
         finish(shown, "store the answers", "recognize", *recognize, "--out", "answers", file=sys.stderr)

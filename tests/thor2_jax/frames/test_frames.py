@@ -180,8 +180,8 @@ def test_missing_files(files: dict[str, Path], name: str) -> None:
 @pytest.mark.parametrize("name", ["color", "depth", "labels"])
 def test_damaged_images(files: dict[str, Path], name: str) -> None:
     raw = files[name].read_bytes()
-    flipped = raw[:45] + bytes([raw[45] ^ 0xFF]) + raw[46:]
-    for content in (b"", b"not an image", raw[:20], raw[: len(raw) // 2], flipped):
+    flipped = (raw[:k] + bytes([raw[k] ^ 0xFF]) + raw[k + 1 :] for k in (45, len(raw) - 14))  # pixels, checksum
+    for content in (b"", b"not an image", raw[:20], raw[: len(raw) // 2], *flipped):
         files[name].write_bytes(content)
         assert_refused(f"^{name}: {files[name]} [^<>]*$", read_frame, **files)  # without the name of an object
 

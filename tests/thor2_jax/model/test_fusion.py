@@ -105,13 +105,10 @@ def test_damaged_records_are_refused(record: Any) -> None:
     assert Model.of_run(untrained_run("ab")).calibration is None
 
 
-def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
+def test_the_recognizer_uses_the_calibration_of_its_run() -> None:
     run = untrained_embedding_run(("a", "b", "c"), ("tops", "tops2"))
     recognizer = thor2.Recognizer(dataclasses.replace(run, record={"calibration": RECORD}))
     assert recognizer.model.chosen_classifiers() == ("tops", "tops2", "embedding")
-    np.testing.assert_array_equal(recognizer.model.thresholds(), [0.3] * 3)
-    np.testing.assert_array_equal(thor2.Recognizer(recognizer.run, 0.0).model.thresholds(), [0] * 3)
-    np.testing.assert_array_equal(thor2.Recognizer(run).model.thresholds(), [0] * 3)
     probabilities = {"tops": FUSED, "tops2": FUSED, "embedding": EMBEDDED}
     np.testing.assert_allclose(recognizer.model.fused(probabilities), CALIBRATION.calibrated(FUSED, EMBEDDED))
     # The embedding of another run is no classifier.

@@ -22,6 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.segmentation.table import segment_table
+from thor2_jax.tracking.tracker import TrackedRecognition
 from thor2_jax.watch import live
 from thor2_jax.watch.live import LONGEST_PAUSE, Broadcast, LiveView, paced, serve_live
 
@@ -81,7 +82,7 @@ def latest(broadcast: Broadcast) -> dict[str, Any]:
 def test_messages_of_a_view() -> None:
     broadcast = Broadcast()
     message = functools.partial(latest, broadcast)
-    view = LiveView(recognize, segment_table, broadcast)
+    view = LiveView(recognize, lambda: segment_table, broadcast)
     assert message()["state"] == "waiting" and "image" not in message()
     view.show(recorded(1))
     one = message()
@@ -102,12 +103,11 @@ def test_messages_of_a_view() -> None:
 
 
 def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
-    class Tracked(Recognition):
-        track, frames = 2, 5
-
     broadcast, labels = Broadcast(), np.zeros((240, 320), np.uint8)
     labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
-    view = LiveView(lambda f: [Tracked(label, f"name {label}") for label in f.instances], segment_table, broadcast)
+    view = LiveView(
+        lambda f: [TrackedRecognition(k, f"name {k}", track=2, frames=5) for k in f.instances], fail, broadcast
+    )
     view.show(recorded(1, lambda: dataclasses.replace(table_frame(), labels=labels)))
     objects = latest(broadcast)["objects"]
     assert sorted(one["name"] for one in objects) == ["name 3", "name 7"]
@@ -148,7 +148,7 @@ def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.Monk
     monkeypatch.setattr(live, "KEEP_ALIVE", 0.05)
     broadcast, page, errors = Broadcast(), browser.new_page(), []
     page.set_default_timeout(1000 * HANG)
-    view = LiveView(recognize, segment_table, broadcast)
+    view = LiveView(recognize, lambda: segment_table, broadcast)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:
