@@ -25,7 +25,7 @@ from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
-__all__ = ["Attributions", "Faithfulness", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
+__all__ = ["Attributions", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
 
 RELAXATION = Relaxation(slice=0.001, strip=0.00025, extremum=0.005, color=0.1)
 """Temperatures, chosen on tuning frames. They are small except for the extremes, since the weights of points have
@@ -46,16 +46,20 @@ most."""
 RANDOM_TENTHS = 20
 
 
-@dataclasses.dataclass(frozen=True)
-class Faithfulness:
-    """Losses of the exact margin without a tenth of the points, for which recognition is repeated completely.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Attributions:
+    """The attributions of a cloud's points to its answer, with an exact check.
+
+    For the check, recognition is repeated completely without a tenth of the points.
 
     Attributes:
+        values: [n] float32, loss of margin without each point, to first order; negative values oppose the answer.
         margin: margin with all points.
-        most_attributed: loss without the most attributed tenth.
-        random: mean loss without random tenths.
+        most_attributed: loss of margin without the most attributed tenth.
+        random: mean loss of margin without random tenths.
     """
 
+    values: NDArray[np.float32]
     margin: float
     most_attributed: float
     random: float
@@ -64,19 +68,6 @@ class Faithfulness:
     def holds(self) -> bool:
         """Whether the most attributed tenth matters more than random ones."""
         return self.most_attributed > self.random
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Attributions:
-    """The attributions of a cloud's points to its answer.
-
-    Attributes:
-        values: [n] float32, loss of margin without each point, to first order; negative values oppose the answer.
-        faithfulness: exact check of the values.
-    """
-
-    values: NDArray[np.float32]
-    faithfulness: Faithfulness
 
 
 def tenth_of(n_points: int) -> int:
@@ -166,7 +157,7 @@ def attribute_points(scores: ClassScores, looks: PointClouds, instance: Prepared
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
-    return Attributions(candidates[best], Faithfulness(float(margins[0]), float(losses[best]), random))
+    return Attributions(candidates[best], float(margins[0]), float(losses[best]), random)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ __all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_t
 _COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "8uc3": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8uc4": "bgra"}
 """Encoding in lower case -> channels; the order of 8UC3 and 8UC4 is that of cv_bridge."""
 
-_DEPTH_TYPES = {"16uc1": np.uint16, "mono16": np.uint16, "32fc1": np.float32}
+_DEPTH_TYPES = {"16uc1": "uint16", "mono16": "uint16", "32fc1": "float32"}
 """Encoding in lower case -> type of a pixel: millimetres as integers, metres as floats (REP 118)."""
 
 _FORMATS = ("PNG", "JPEG")
@@ -69,7 +69,7 @@ def color_image(message: Any) -> NDArray[np.uint8]:
             f"color: an image has the encoding {message.encoding!r}; expected rgb8, bgr8, rgba8, bgra8 or a compressed "
             "image"
         )
-    pixels = _rows(message, np.uint8, len(channels)).reshape(message.height, message.width, len(channels))
+    pixels = _rows(message, "uint8", len(channels)).reshape(message.height, message.width, len(channels))
     return np.ascontiguousarray(pixels[..., [channels.index(color) for color in "rgb"]])
 
 
@@ -90,7 +90,7 @@ def depth_image(message: Any) -> NDArray[Any]:
     return _rows(message, kind, 1)
 
 
-def _rows(message: Any, kind: type[np.number], channels: int) -> NDArray[Any]:
+def _rows(message: Any, kind: str, channels: int) -> NDArray[Any]:
     """Return the pixels [H, W * channels] of an Image, without the padding of its rows."""
     data, dtype = np.frombuffer(message.data, np.uint8), np.dtype(kind)
     height, step, used = int(message.height), int(message.step), int(message.width) * channels * dtype.itemsize
