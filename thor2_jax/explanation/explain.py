@@ -34,16 +34,13 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
-    "DescribedSlices",
     "Explanation",
-    "NearestView",
     "compile_explanations",
     "explain",
     "explain_instance",
     "explained_by_classifiers",
     "pixel_attributions",
 ]
-
 
 OBJECTS = 3
 """Number of objects whose nearest view is shown."""
