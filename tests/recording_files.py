@@ -16,11 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 import thor2_jax as thor2
 
-COLOR, DEPTH, CAMERA = (
-    "/camera/color/image_raw",
-    "/camera/aligned_depth_to_color/image_raw",
-    "/camera/color/camera_info",
-)
+COLOR = "/camera/color/image_raw"
+DEPTH = "/camera/aligned_depth_to_color/image_raw"
+CAMERA = "/camera/color/camera_info"
 START = 1_700_000_000 * 10**9
 PERIOD = 33_333_333
 

@@ -23,7 +23,7 @@ from thor2_jax.frames.overlay import annotate, answer_paints
 from thor2_jax.model.recognition import Detection
 from thor2_jax.recordings.messages import detection_array, ros_time
 
-__all__ = ["COMPRESSED_IMAGE", "DetectionBag", "MessageBag", "RerunFile", "detection_types", "ros_message"]
+__all__ = ["COMPRESSED_IMAGE", "DetectionBag", "MessageBag", "RerunFile"]
 
 DETECTIONS_TOPIC = "/thor2/detections"
 OVERLAY_TOPIC = "/thor2/overlay/compressed"

@@ -3,6 +3,7 @@
 import struct
 import tracemalloc
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ RNG = np.random.default_rng(0)
 COLOR = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 3000, (5, 7), dtype=np.uint16)
 PNG = encode_image(COLOR, "PNG")
+RGB = image(COLOR, "rgb8")
 
 
 @pytest.mark.parametrize("padding", [0, 3])
@@ -79,20 +81,13 @@ def test_compressed_float_depth() -> None:
     np.testing.assert_allclose(read.ravel()[1:], metres.ravel()[1:], rtol=2e-4)
 
 
-def resized(**fields: int) -> Any:
-    """Return a message of a colour image whose size does not fit its data."""
-    message = image(COLOR, "rgb8")
-    vars(message).update(fields)
-    return message
-
-
 @pytest.mark.parametrize(
     ("read", "message"),
     [
-        *((color_image, resized(**{name: value})) for name, value in (("step", 4), ("height", 50), ("width", 0))),
+        *((color_image, SimpleNamespace(**vars(RGB) | size)) for size in ({"step": 4}, {"height": 50}, {"width": 0})),
         (color_image, image(DEPTH.astype(np.uint8), "mono8")),
         (color_image, image(COLOR, "bayer_rggb8")),
-        (depth_image, image(COLOR, "rgb8")),
+        (depth_image, RGB),
         (color_image, compressed(PNG[:40], "png")),
         (color_image, compressed(PNG[:-16] + bytes(4) + PNG[-12:], "png")),  # a wrong checksum
         (color_image, compressed(encode_image(DEPTH, "PNG"), "png")),

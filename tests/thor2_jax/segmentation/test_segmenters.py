@@ -88,7 +88,7 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )
 def test_labels_that_are_not_labels(result: Any, message: str) -> None:
-    assert_refused(f"^segmenter <lambda> returned .*{message}", segment, FRAME, lambda frame: result)
+    assert_refused(rf"^segmenter <lambda> returned .*{message}", segment, FRAME, lambda frame: result)
 
 
 def test_a_segmenter_that_raises_without_a_message() -> None:
