@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thor2_jax.explanation.attributions import Faithfulness, attribute_points
+from thor2_jax.explanation.attributions import Attributions, attribute_points
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores
 from thor2_jax.files import write_text
 from thor2_jax.frames.prepared_instance import prepare_instance
@@ -23,19 +23,18 @@ from training.readers.frames import find_frames
 __all__ = ["faithfulness_of", "summary"]
 
 
-def faithfulness_of(scores: ClassScores, directory: Path, sigma_s: float) -> Iterator[tuple[str, int, Faithfulness]]:
-    """Yield, for every instance that can be described, the name of the frame, the label and the faithfulness check."""
+def faithfulness_of(scores: ClassScores, directory: Path, sigma_s: float) -> Iterator[tuple[str, int, Attributions]]:
+    """Yield, for every instance that can be described, the name of the frame, the label and the attributions."""
     for source in find_frames([directory]):
         frame = source.read()
         for label in frame.instances:
             instance = prepare_instance(frame, label, sigma_s)
             if instance.reason is None:
                 index = int(scores.of_instances([instance])[0].argmax())
-                attributions = attribute_points(scores, scores.orient(instance), instance, index)
-                yield source.name, label, attributions.faithfulness
+                yield source.name, label, attribute_points(scores, scores.orient(instance), instance, index)
 
 
-def summary(checks: list[Faithfulness]) -> dict[str, float]:
+def summary(checks: list[Attributions]) -> dict[str, float]:
     """Return the number of instances, the fraction of faithful attributions, and the median losses."""
     return {
         "instances": len(checks),

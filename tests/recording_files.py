@@ -4,6 +4,7 @@ import contextlib
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 
 import thor2_jax as thor2
 
-TYPES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
 COLOR = "/camera/color/image_raw"
 DEPTH = "/camera/aligned_depth_to_color/image_raw"
 CAMERA = "/camera/color/camera_info"
@@ -23,19 +23,19 @@ START = 1_700_000_000 * 10**9
 PERIOD = 33_333_333
 
 
-def header(stamp: int, frame_id: str = "camera_color_optical_frame", ros: int = 2) -> Any:
-    types = TYPES[ros].types
-    time = types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
-    fields = {"stamp": time, "frame_id": frame_id, **({"seq": 0} if ros == 1 else {})}
-    return types["std_msgs/msg/Header"](**fields)
+def header(stamp: int, frame_id: str = "camera_color_optical_frame") -> Any:
+    """Return a Header of both versions of ROS; the writers take any object that has the fields of a message."""
+    time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return SimpleNamespace(seq=0, stamp=time, frame_id=frame_id)
 
 
-def image(pixels: np.ndarray, encoding: str, stamp: int = START, ros: int = 2, padding: int = 0, **more: Any) -> Any:
+def image(pixels: np.ndarray, encoding: str, stamp: int = START, padding: int = 0, **more: Any) -> Any:
     """Return an Image with `padding` unused bytes behind each row."""
     rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
     data = np.pad(rows, ((0, 0), (0, padding)))
-    return TYPES[ros].types["sensor_msgs/msg/Image"](
-        header=header(stamp, ros=ros, **more),
+    return SimpleNamespace(
+        __msgtype__="sensor_msgs/msg/Image",
+        header=header(stamp, **more),
         height=pixels.shape[0],
         width=pixels.shape[1],
         encoding=encoding,
@@ -45,34 +45,33 @@ def image(pixels: np.ndarray, encoding: str, stamp: int = START, ros: int = 2, p
     )
 
 
-def compressed(content: bytes, described: str, stamp: int = START, ros: int = 2) -> Any:
-    return TYPES[ros].types["sensor_msgs/msg/CompressedImage"](
-        header=header(stamp, ros=ros), format=described, data=np.frombuffer(content, np.uint8)
-    )
+def compressed(content: bytes, described: str, stamp: int = START) -> Any:
+    data, kind = np.frombuffer(content, np.uint8), "sensor_msgs/msg/CompressedImage"
+    return SimpleNamespace(__msgtype__=kind, header=header(stamp), format=described, data=data)
 
 
-def compressed_depth(depth: np.ndarray, stamp: int = START, ros: int = 2) -> Any:
+def compressed_depth(depth: np.ndarray, stamp: int = START) -> Any:
     """Return depth as compressed_depth_image_transport writes it: a header of 12 bytes, then a PNG."""
     content = struct.pack("<iff", 0, 0.0, 0.0) + encode_image(depth, "PNG")
-    return compressed(content, "16UC1; compressedDepth png", stamp, ros)
+    return compressed(content, "16UC1; compressedDepth png", stamp)
 
 
-def camera_info(camera: thor2.Intrinsics, size: tuple[int, int], stamp: int = START, ros: int = 2) -> Any:
-    matrix = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1.0])
-    projection = np.zeros((3, 4))
-    projection[:, :3] = matrix.reshape(3, 3)
-    types = TYPES[ros].types
-    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    arrays = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": projection.ravel()}
-    return types["sensor_msgs/msg/CameraInfo"](
-        header=header(stamp, ros=ros),
+def camera_info(camera: thor2.Intrinsics, size: tuple[int, int], stamp: int = START) -> Any:
+    """Return a CameraInfo, whose arrays have the names of ROS 1 and of ROS 2."""
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    projection = np.pad(matrix, ((0, 0), (0, 1)))
+    arrays = {"d": np.zeros(5), "k": matrix.ravel(), "r": np.eye(3).ravel(), "p": projection.ravel()}
+    return SimpleNamespace(
+        __msgtype__="sensor_msgs/msg/CameraInfo",
+        header=header(stamp),
         height=size[0],
         width=size[1],
         distortion_model="plumb_bob",
-        **{name.upper() if ros == 1 else name: value for name, value in arrays.items()},
+        **arrays,
+        **{name.upper(): value for name, value in arrays.items()},
         binning_x=0,
         binning_y=0,
-        roi=region,
+        roi=SimpleNamespace(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )
 
 
@@ -83,7 +82,7 @@ def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
     The compression is a format of ROS 1 (bz2, lz4) or a mode of ROS 2 (message, storage).
     """
     ros = 1 if path.suffix == ".bag" else 2
-    types, connections = TYPES[ros], {}
+    types, connections = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE), {}
     folder = path.with_suffix(".folder") if path.suffix == ".mcap" else path
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
     unopened: Any = Writer1(path) if ros == 1 else Writer2(folder, version=8, storage_plugin=plugin)
@@ -124,18 +123,17 @@ def write_recording(
     compression: str = "",
 ) -> Path:
     """Write a recording of frames at 30 Hz, whose depth is taken `gap` nanoseconds after colour."""
-    ros = 1 if path.suffix == ".bag" else 2
     with bag_writer(path, compression) as write:
         for number, frame in enumerate(frames):
             stamp = START + number * PERIOD
             if is_compressed:
                 jpeg = encode_image(frame.color, "JPEG", quality=95)
-                write(f"{COLOR}/compressed", compressed(jpeg, "rgb8; jpeg compressed bgr8", stamp, ros), stamp)
-                write(f"{DEPTH}/compressedDepth", compressed_depth(frame.depth, stamp + gap, ros), stamp + gap)
+                write(f"{COLOR}/compressed", compressed(jpeg, "rgb8; jpeg compressed bgr8", stamp), stamp)
+                write(f"{DEPTH}/compressedDepth", compressed_depth(frame.depth, stamp + gap), stamp + gap)
             else:
-                write(COLOR, image(frame.color, "rgb8", stamp, ros), stamp)
-                write(DEPTH, image(frame.depth, "16UC1", stamp + gap, ros), stamp + gap)
-            write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp, ros), stamp)
+                write(COLOR, image(frame.color, "rgb8", stamp), stamp)
+                write(DEPTH, image(frame.depth, "16UC1", stamp + gap), stamp + gap)
+            write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), stamp)
     return path
 
 

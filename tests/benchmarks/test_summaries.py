@@ -12,13 +12,14 @@ import thor2_jax as thor2
 from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
 from benchmarks.doctor import DAMAGES, run
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
-from thor2_jax.explanation.attributions import Faithfulness
+from thor2_jax.explanation.attributions import Attributions
 from training.readers.frames import frame_files
 from training.readers.labelled import LabelledFrame
 
 
 def test_faithful_instances_are_counted() -> None:
-    checks = [Faithfulness(5.0, 2.0, 0.5), Faithfulness(5.0, 0.1, 0.5), Faithfulness(1.0, -0.1, -0.4)]
+    values = np.zeros(3, np.float32)
+    checks = [Attributions(values, *one) for one in ((5.0, 2.0, 0.5), (5.0, 0.1, 0.5), (1.0, -0.1, -0.4))]
     assert explanation.summary(checks) == {
         "instances": 3,
         "faithful": 2 / 3,

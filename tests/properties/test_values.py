@@ -119,26 +119,6 @@ def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) ->
     assert share <= 1 / math.sqrt(5) + 0.01
 
 
-def test_the_stability_bound_is_tight() -> None:
-    """The change approaches 1 / sqrt(5) of the bound for large persistences; the remainder allows for moving births."""
-
-    def share(height: float) -> float:
-        both = [
-            thor2.PointClouds.pack([(np.array([[0.4, 0, 0.05], [0.4, y, 0.05]]), np.zeros((2, 3)))], 512)
-            for y in (height, height + 0.002)
-        ]
-        return laws.assert_stable(
-            lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG),
-            lambda clouds: thor2.diagrams(clouds, CONFIG),
-            *both,
-            0.001,
-            CONFIG,
-        )
-
-    shares = [share(height) for height in (0.05, 0.2, 0.5)]
-    assert shares == sorted(shares) and 0.38 < shares[-1] < 1 / math.sqrt(5), shares
-
-
 @pytest.mark.slow
 @given(aligned=batches(laws.aligned_clouds(CONFIG, max_points=256, margin=0.2)), factor=st.sampled_from([0.02, 0.01]))
 def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:

@@ -25,7 +25,7 @@ from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
-__all__ = ["Attributions", "Faithfulness", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
+__all__ = ["Attributions", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
 
 RELAXATION = Relaxation(slice=0.001, strip=0.00025, extremum=0.005, color=0.1)
 """Temperatures, chosen on tuning frames. They are small except for the extremes, since the weights of points have
@@ -37,8 +37,8 @@ STEPS = 8
 PATHS = (8, 3, 1)
 """Numbers of last steps over which gradients are averaged: from weights of 1/2, from weights of 4/5, and at the end."""
 
-SMOOTHING = (0.0, 0.005, 0.015)
-"""Standard deviations of the Gaussians with which attributions are averaged over neighbouring points, metres. A strip
+SMOOTHING = (0.005, 0.015)
+"""Standard deviations of the Gaussians with which attributions are also averaged over neighbours, metres. A strip
 depends only on its outermost points, but without them the next points replace them, so smoothing spreads attributions
 over patches of the surface. The path and smoothing are chosen whose most attributed tenth lowers the exact margin
 most."""
@@ -46,16 +46,20 @@ most."""
 RANDOM_TENTHS = 20
 
 
-@dataclasses.dataclass(frozen=True)
-class Faithfulness:
-    """Losses of the exact margin without a tenth of the points, for which recognition is repeated completely.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Attributions:
+    """The attributions of a cloud's points to its answer, with an exact check.
+
+    For the check, recognition is repeated completely without a tenth of the points.
 
     Attributes:
+        values: [n] float32, loss of margin without each point, to first order; negative values oppose the answer.
         margin: margin with all points.
-        most_attributed: loss without the most attributed tenth.
-        random: mean loss without random tenths.
+        most_attributed: loss of margin without the most attributed tenth.
+        random: mean loss of margin without random tenths.
     """
 
+    values: NDArray[np.float32]
     margin: float
     most_attributed: float
     random: float
@@ -66,26 +70,13 @@ class Faithfulness:
         return self.most_attributed > self.random
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Attributions:
-    """The attributions of a cloud's points to its answer.
-
-    Attributes:
-        values: [n] float32, loss of margin without each point, to first order; negative values oppose the answer.
-        faithfulness: exact check of the values.
-    """
-
-    values: NDArray[np.float32]
-    faithfulness: Faithfulness
-
-
 def tenth_of(n_points: int) -> int:
     """Return the number of points in a tenth of a cloud, at least one."""
     return max(1, round(n_points / 10))
 
 
-def select_points(instance: PreparedInstance, kept: NDArray[np.bool_]) -> PreparedInstance:
-    """Return the instance with only the points in the mask `kept` [n]."""
+def select_points(instance: PreparedInstance, kept: NDArray[np.bool_ | np.intp]) -> PreparedInstance:
+    """Return the instance with only some points, which are given by a mask [n] or by their numbers."""
     points, colors = instance.points[kept], instance.colors[kept]
     rim = None if instance.rim is None else instance.rim[kept]
     return dataclasses.replace(instance, points=points, colors=colors, boundary=instance.boundary[kept], rim=rim)
@@ -130,10 +121,8 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     Args:
         points: [n, 3] metres.
         values: [m, n].
-        deviation: standard deviation of the Gaussian, metres; neighbours are at most twice as far. 0: no average.
+        deviation: standard deviation of the Gaussian, metres; neighbours are at most twice as far.
     """
-    if deviation == 0:
-        return values
     tree = KDTree(points)
     near = tree.sparse_distance_matrix(tree, 2 * deviation, output_type="coo_matrix").tocsr()
     # The distance of each point to itself, 0, is stored, too.
@@ -154,19 +143,18 @@ def attribute_points(scores: ClassScores, looks: PointClouds, instance: Prepared
     n = len(instance.points)
     gradients = path_gradients(scores, looks, index)[:, :n]
     averages = np.stack([gradients[-count:].mean(axis=0) for count in PATHS])
-    candidates = np.concatenate([smooth(instance.points, averages, deviation) for deviation in SMOOTHING])
-    kept = np.ones((1 + len(candidates) + RANDOM_TENTHS, n), bool)
-    for row, values in enumerate(candidates, 1):
-        kept[row, np.argsort(-values, kind="stable")[: tenth_of(n)]] = False
+    smoothed = [smooth(instance.points, averages, deviation) for deviation in SMOOTHING]
+    candidates = np.concatenate([averages, *smoothed])
+    tenths = [np.argsort(-values, kind="stable")[: tenth_of(n)] for values in candidates]
     rng = np.random.default_rng(0)
-    for row in range(1 + len(candidates), len(kept)):
-        kept[row, rng.choice(n, tenth_of(n), replace=False)] = False
-    exact = scores.of_instances([select_points(instance, row) for row in kept])
+    tenths += [rng.choice(n, tenth_of(n), replace=False) for _ in range(RANDOM_TENTHS)]
+    rests = [select_points(instance, np.delete(np.arange(n), tenth)) for tenth in tenths]
+    exact = scores.of_instances([instance, *rests])
     margins = np.asarray(scores.margin(jnp.asarray(exact), index))
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
-    return Attributions(candidates[best], Faithfulness(float(margins[0]), float(losses[best]), random))
+    return Attributions(candidates[best], float(margins[0]), float(losses[best]), random)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

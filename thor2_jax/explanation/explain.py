@@ -34,16 +34,13 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
-    "DescribedSlices",
     "Explanation",
-    "NearestView",
     "compile_explanations",
     "explain",
     "explain_instance",
-    "explained_kinds",
+    "explained_by_classifiers",
     "pixel_attributions",
 ]
-
 
 OBJECTS = 3
 """Number of objects whose nearest view is shown."""
@@ -123,7 +120,7 @@ class Explanation:
 
     def as_json(self) -> dict[str, Any]:
         """Return the explanation as JSON values, with lengths in metres and colours in 0..255."""
-        answer, check, left = self.recognition, self.attributions.faithfulness, self.left_out
+        answer, check, left = self.recognition, self.attributions, self.left_out
         cells = np.argwhere(np.isfinite(left.strips))
         return {
             "label": answer.label,
@@ -171,8 +168,9 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
 
 def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
     """Explain the answer for a usable instance; see `explain`."""
-    recognition, name = _answer(model, instance)
-    scores = _scores_of(model, name)
+    recognition, number = _answer(model, instance)
+    name = model.names[number]
+    scores = _scores(model, explained_by_classifiers(model)[number])
     parts = dict(_parts(model, scores, instance, scores.names.index(name)))
     return Explanation(recognition=recognition, name=name, scores=scores, instance=instance, **parts)
 
@@ -200,48 +198,38 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     Args:
         model: the model.
         n_points: padded size.
-        by_classifiers: kind of scores, a key of `explained_kinds`.
+        by_classifiers: whether the classifiers are explained, otherwise the gallery; see `explained_by_classifiers`.
         is_stopped: function that returns whether to end early; called between steps, which take seconds.
     """
+    if by_classifiers not in explained_by_classifiers(model):  # The last object of this kind has been forgotten.
+        return
     rng = np.random.default_rng(0)
     points = rng.uniform(0, (0.12, 0.08, 0.05), (n_points, 3)).astype(np.float32)
     instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
-    name = explained_kinds(model).get(by_classifiers)
-    if name is None:  # The last object of this kind has been forgotten.
-        return
     _answer(model, instance)
-    scores = _scores_of(model, name)
-    index = int(scores.of_instances([instance])[0].argmax())
-    parts = _parts(model, scores, instance, index)
+    scores = _scores(model, by_classifiers)
+    parts = _parts(model, scores, instance, int(scores.of_instances([instance])[0].argmax()))
     while not is_stopped() and next(parts, None) is not None:
         pass
 
 
-def explained_kinds(model: Model) -> dict[bool, str]:
-    """Return a name that the classifiers explain (key True) and a name that the gallery explains (key False).
-
-    A key without such a name is left out.
-    """
-    return dict(zip(_by_classifiers(model).tolist(), model.names, strict=True))
+def explained_by_classifiers(model: Model) -> list[bool]:
+    """Return for each of the model's names whether the classifiers explain it, otherwise the gallery."""
+    return (model.gallery.has_output & (model.answers_by() != "gallery")).tolist()
 
 
-def _by_classifiers(model: Model) -> NDArray[np.bool_]:
-    """Return which names are explained by the classifiers."""
-    return model.gallery.has_output & (model.answers_by() != "gallery")
+def _scores(model: Model, by_classifiers: bool) -> ClassScores:
+    return classifier_scores(model) if by_classifiers else gallery_scores(model)
 
 
-def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:
-    """Return the answer of the model and the most probable name."""
+def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, int]:
+    """Return the answer of the model and the number of the most probable name."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
     inference = jax.tree.map(np.asarray, infer_clouds(model, packed(instance)))
     (recognition,) = answers(model, [instance], inference)
     values = model.combined(inference.probabilities, object_scores(model, inference))
-    return recognition, model.names[int(values[0].argmax())]
-
-
-def _scores_of(model: Model, name: str) -> ClassScores:
-    return classifier_scores(model) if _by_classifiers(model)[model.names.index(name)] else gallery_scores(model)
+    return recognition, int(values[0].argmax())
 
 
 def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlices:

@@ -19,9 +19,6 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["ExplanationPicture", "change_text", "main_pictures", "pictures"]
 
-_SIZE = (5.2, 4.4)
-"""Size in inches; with 130 pixels per inch, a picture is legible on a telephone, too."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExplanationPicture:
@@ -42,9 +39,13 @@ class ExplanationPicture:
     figure: Figure
 
 
-def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, Any]:
+def _figure(width: float = 5.2, height: float = 4.4, rows: int = 1, columns: int = 1, **options: Any) -> Any:
+    """Return a figure, whose size is in inches, and its axes; the other arguments are those of `subplots`.
+
+    With 130 pixels per inch, a picture of the default size is legible on a telephone, too.
+    """
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.add_subplot()
+    return figure, figure.subplots(rows, columns, **options)
 
 
 def main_pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[ExplanationPicture]:
@@ -97,7 +98,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     colored = plot.attribution_colors(explanation.attributions.values).to_rgba(np.where(high > -low, high, low))
     shown[known] = colored[:, :3]
     wide = color.shape[1] > 1.5 * color.shape[0]
-    figure = Figure(figsize=(_SIZE[0], 5.4 if wide else 3.8), layout="compressed")
+    figure = Figure(figsize=(5.2, 5.4 if wide else 3.8), layout="compressed")
     first, second = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
     first.imshow(color)
     second.imshow(shown)
@@ -131,8 +132,7 @@ def _check(explanation: Explanation) -> ExplanationPicture:
     left = explanation.left_out
     used = np.isfinite(left.strips)
     rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
-    figure = Figure(figsize=_SIZE, layout="constrained")
-    panels = figure.subplots(2, 1, sharex=True)
+    figure, panels = _figure(rows=2, sharex=True)
     titles = ("exact: loss of the answer without the strip", "predicted: sum of the attributions in the strip")
     for axes, values, title in zip(panels, (left.strips, left.predicted), titles, strict=True):
         shown = values[:rows, :columns]
@@ -197,9 +197,9 @@ def _clouds(
 ) -> Figure:
     """Draw clouds with titles in rows of the given height in inches, around their means or at their own scales."""
     rows = math.ceil(len(shown) / columns)
-    figure = Figure(figsize=(_SIZE[0], rows * height), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=not own_scales, sharey=not own_scales).flat
-    for axes, (title, instance) in zip(grid, shown, strict=False):
+    is_shared = not own_scales
+    figure, grid = _figure(5.2, rows * height, rows, columns, squeeze=False, sharex=is_shared, sharey=is_shared)
+    for axes, (title, instance) in zip(grid.flat, shown, strict=False):
         points = instance.points if own_scales else instance.points - instance.points.mean(axis=0)
         plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
         axes.set_title(plain_text(title), fontsize=9, **name_style())
@@ -244,8 +244,7 @@ def _diagrams(explanation: Explanation) -> ExplanationPicture:
 def _slice(explanation: Explanation, number: int) -> ExplanationPicture:
     described, network = explanation.described, explanation.scores.network
     regions = np.flatnonzero(described.colors.any(axis=(0, 1)))
-    figure = Figure(figsize=(3.6, 6.6), layout="constrained")
-    upper, lower = figure.subplots(2, 1)
+    figure, (upper, lower) = _figure(3.6, 6.6, rows=2)
     image, colors = described.images[number], described.colors[number]
     plot.persistence_image(upper, image, explanation.config, largest=float(described.images.max()))
     plot.color_matrix(lower, colors, network, regions=regions.tolist(), largest=float(described.colors.max()))

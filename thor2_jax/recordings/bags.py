@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -131,13 +131,14 @@ class Bag:
                 if not isinstance(files, list | None):
                     raise ValueError("files of metadata.yaml is no list")
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
-            source: Any = _CompleteRecords(self.path) if self.is_truncated else self.path
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":
-                reader: Any = Reader1(source)
+                reader: Any = Reader1(self.path)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
-                reader = Reader2(source)
+                reader = Reader2(self.path)
+                if self.is_truncated:
+                    reader.storage.path = SimpleNamespace(open=lambda mode: _CompleteRecords(io.FileIO(self.path)))
                 self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
             reader.open()
         with contextlib.ExitStack() as stack:
@@ -352,16 +353,11 @@ def _is_truncated(path: Path) -> bool:
         return stream.read() != _MAGIC or stream.tell() == len(_MAGIC)
 
 
-class _CompleteRecords(type(Path())):  # type: ignore[misc]  # Path itself cannot be derived from before Python 3.12
-    """A path to a truncated MCAP file, which opens as a file with all complete records but without an index."""
+class _CompleteRecords(io.BufferedReader):
+    """The complete records of a truncated MCAP file, followed by the end of a file without an index.
 
-    def open(self, mode: str = "rb") -> BinaryIO:
-        """Open the complete records for reading."""
-        return _OpenRecords(io.FileIO(self, mode))
-
-
-class _OpenRecords(io.BufferedReader):
-    """A truncated MCAP file that looks complete to rosbags, which reads only `_TAIL` without a size and at the end."""
+    The end, `_TAIL`, is the only thing that rosbags reads without a size.
+    """
 
     def __init__(self, stream: io.FileIO) -> None:
         size = os.fstat(stream.fileno()).st_size

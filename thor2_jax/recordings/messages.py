@@ -14,25 +14,14 @@ from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.frames.frames import MAX_IMAGE_PIXELS, decode_image
-from thor2_jax.model.recognition import Box, Detection
+from thor2_jax.model.recognition import Detection
 
 __all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_of"]
 
-_COLOR_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "8uc3": (3, (2, 1, 0)),  # as cv_bridge reads it
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "8uc4": (4, (2, 1, 0)),
-}
-"""Encoding in lower case -> number of channels, and indices of the red, green and blue channels."""
+_COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "8uc3": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8uc4": "bgra"}
+"""Encoding in lower case -> channels; the order of 8UC3 and 8UC4 is that of cv_bridge."""
 
-_DEPTH_TYPES: dict[str, np.dtype[Any]] = {
-    "16uc1": np.dtype(np.uint16),
-    "mono16": np.dtype(np.uint16),
-    "32fc1": np.dtype(np.float32),
-}
+_DEPTH_TYPES = {"16uc1": "uint16", "mono16": "uint16", "32fc1": "float32"}
 """Encoding in lower case -> type of a pixel: millimetres as integers, metres as floats (REP 118)."""
 
 _FORMATS = ("PNG", "JPEG")
@@ -74,14 +63,14 @@ def color_image(message: Any) -> NDArray[np.uint8]:
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
             raise InputError(f"color: a compressed image has the format {message.format!r}; expected 8-bit RGB")
         return np.ascontiguousarray(pixels[..., :3])
-    if message.encoding.lower() not in _COLOR_CHANNELS:
+    channels = _COLOR_CHANNELS.get(message.encoding.lower())
+    if channels is None:
         raise InputError(
             f"color: an image has the encoding {message.encoding!r}; expected rgb8, bgr8, rgba8, bgra8 or a compressed "
             "image"
         )
-    channels, order = _COLOR_CHANNELS[message.encoding.lower()]
-    pixels = _rows(message, np.dtype(np.uint8), channels)
-    return np.ascontiguousarray(pixels.reshape(message.height, message.width, channels)[..., order])
+    pixels = _rows(message, "uint8", len(channels)).reshape(message.height, message.width, len(channels))
+    return np.ascontiguousarray(pixels[..., [channels.index(color) for color in "rgb"]])
 
 
 def depth_image(message: Any) -> NDArray[Any]:
@@ -95,15 +84,15 @@ def depth_image(message: Any) -> NDArray[Any]:
     """
     if hasattr(message, "format"):
         return _compressed_depth(bytes(message.data), message.format)
-    dtype = _DEPTH_TYPES.get(message.encoding.lower())
-    if dtype is None:
+    kind = _DEPTH_TYPES.get(message.encoding.lower())
+    if kind is None:
         raise InputError(f"depth: an image has the encoding {message.encoding!r}; expected 16UC1, mono16 or 32FC1")
-    return _rows(message, dtype, 1)
+    return _rows(message, kind, 1)
 
 
-def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+def _rows(message: Any, kind: str, channels: int) -> NDArray[Any]:
     """Return the pixels [H, W * channels] of an Image, without the padding of its rows."""
-    data = np.frombuffer(message.data, np.uint8)
+    data, dtype = np.frombuffer(message.data, np.uint8), np.dtype(kind)
     height, step, used = int(message.height), int(message.step), int(message.width) * channels * dtype.itemsize
     if height * int(message.width) > MAX_IMAGE_PIXELS:
         raise InputError(f"an image has {message.width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
@@ -124,23 +113,19 @@ def _decoded(content: bytes, described: str) -> NDArray[Any]:
 
 def _compressed_depth(content: bytes, described: str) -> NDArray[Any]:
     encoding, _, transport = described.lower().partition(";")
-    if "compresseddepth" not in transport:
-        return _as_depth(_decoded(content, described), described)
-    if "rvl" in transport or len(content) < _DEPTH_HEADER.size:
+    start = _DEPTH_HEADER.size if "compresseddepth" in transport else 0
+    if start and ("rvl" in transport or len(content) < start):
         raise InputError(f"depth: a compressed image has the format {described!r}; expected compressedDepth png")
-    _, scale, offset = _DEPTH_HEADER.unpack_from(content)
-    pixels = _as_depth(_decoded(content[_DEPTH_HEADER.size :], described), described)
-    if encoding.strip() != "32fc1":
-        return pixels
-    # compressed_depth_image_transport quantizes inverse depth: depth = scale / (value - offset).
-    with np.errstate(divide="ignore"):
-        return np.where(pixels > 0, scale / (pixels - np.float32(offset)), 0).astype(np.float32)
-
-
-def _as_depth(pixels: NDArray[Any], described: str) -> NDArray[np.uint16]:
+    pixels = _decoded(content[start:], described)
     if pixels.ndim != 2 or pixels.dtype == np.uint8 or not np.issubdtype(pixels.dtype, np.integer):
         raise InputError(f"depth: a compressed image has the format {described!r}; expected 16-bit PNG")
-    return pixels.astype(np.uint16)
+    depth = pixels.astype(np.uint16)
+    if not start or encoding.strip() != "32fc1":
+        return depth
+    # compressed_depth_image_transport quantizes inverse depth: depth = scale / (value - offset).
+    _, scale, offset = _DEPTH_HEADER.unpack_from(content)
+    with np.errstate(divide="ignore"):
+        return np.where(depth > 0, scale / (depth - np.float32(offset)), 0).astype(np.float32)
 
 
 def ros_time(stamp: int) -> dict[str, int]:
@@ -161,33 +146,19 @@ def detection_array(detections: Sequence[Detection], *, stamp: int, frame_id: st
         frame_id: coordinate frame of the colour camera.
     """
     header = {"stamp": ros_time(stamp), "frame_id": frame_id}
-    return {
-        "header": header,
-        "detections": [
-            {"header": header, "results": [_hypothesis(one)], "bbox": _bounding_box(one.box), "id": _identifier(one)}
-            for one in detections
-        ],
-    }
+    return {"header": header, "detections": [{"header": header, **_detection_fields(one)} for one in detections]}
 
 
-def _identifier(detection: Detection) -> str:
-    if not hasattr(detection.recognition, "track"):
-        return str(detection.recognition.label)
-    track = detection.recognition.track
-    return "" if track is None else str(track)
-
-
-def _hypothesis(detection: Detection) -> dict[str, Any]:
-    recognition = detection.recognition
+def _detection_fields(detection: Detection) -> dict[str, Any]:
+    answer, box = detection.recognition, detection.box
     x, y, z = detection.position or (0.0, 0.0, 0.0)
     pose = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    hypothesis = {"class_id": answer.name or "", "score": float(answer.confidence or 0.0)}
+    middle = {"x": box.left + (box.width - 1) / 2, "y": box.top + (box.height - 1) / 2}
+    center = {"position": middle, "theta": 0.0}
+    number = getattr(answer, "track", answer.label)
     return {
-        "hypothesis": {"class_id": recognition.name or "", "score": float(recognition.confidence or 0.0)},
-        "pose": {"pose": pose, "covariance": [0.0] * 36},
+        "results": [{"hypothesis": hypothesis, "pose": {"pose": pose, "covariance": [0.0] * 36}}],
+        "bbox": {"center": center, "size_x": float(box.width), "size_y": float(box.height)},
+        "id": "" if number is None else str(number),
     }
-
-
-def _bounding_box(box: Box) -> dict[str, Any]:
-    position = {"x": box.left + (box.width - 1) / 2, "y": box.top + (box.height - 1) / 2}
-    center = {"position": position, "theta": 0.0}
-    return {"center": center, "size_x": float(box.width), "size_y": float(box.height)}

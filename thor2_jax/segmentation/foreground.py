@@ -6,8 +6,6 @@ extrapolated from two and six pixels before it, and vice versa. At a step, the t
 fold, both are positive, since both surfaces bend towards the camera.
 """
 
-import dataclasses
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from thor2_jax.segmentation.pixels import Mask, components, grow, nearest_known, open_round, pixel_mask, shrink
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
-__all__ = ["UNIT", "Evidence", "find_foreground"]
+__all__ = ["UNIT", "Evidence"]
 
 HEIGHT = (0.006, 0.005)
 """Smallest height of an object over its plane: the first in metres, plus the second times squared depth in metres."""
@@ -60,12 +58,11 @@ SMOOTH = 0.5
 """Largest change of contrast, in `UNIT`, between neighbours in a smooth part of the plane, such as a soft shadow."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """Height and colour of each pixel relative to the planes, and depth edges; every field is an image [H, W].
+    """Height and colour of each pixel relative to the planes, and depth edges; every attribute is an image [H, W].
 
     Attributes:
-        heights: float32, metres over the support; 0 where depth is missing.
+        heights: float32, metres over the support, which is the first plane; 0 where depth is missing.
         high: pixels above a plane.
         contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable; 0 far from the support.
         colored: pixels on the support, or without depth in front of it, with another colour than the support.
@@ -75,44 +72,36 @@ class Evidence:
         folds: depth folds.
     """
 
-    heights: NDArray[np.float32]
-    high: Mask
-    contrast: NDArray[np.uint8]
-    colored: Mask
-    shade: Mask
-    region: Mask
-    steps: tuple[Mask, Mask]
-    folds: Mask
+    def __init__(self, color: NDArray[np.uint8], depth: DepthImage, planes: list[Plane]) -> None:
+        """Compare an image with its planes.
 
-
-def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Plane]) -> Evidence:
-    """Return height and colour of the pixels relative to the planes, and depth edges; the first plane is the support.
-
-    Args:
-        color: [H, W, 3] uint8, sRGB, slightly blurred.
-        depth: the depth image.
-        planes: at least one plane.
-    """
-    least = HEIGHT[1] * (depth.z * depth.z) + HEIGHT[0]
-    heights = planes[0].heights(depth)
-    on_support = (np.abs(heights) <= least) & depth.valid
-    high = (heights > least) & depth.valid
-    for plane in planes[1:]:
-        others = plane.heights(depth)
-        high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
-        on_support &= np.abs(heights) <= np.abs(others)
-    contrast, darker, near, known = _color_contrast(color, on_support)
-    region = shrink(planes[0].region(depth.z.shape), 3)
-    known = near | (known & depth.valid & region)  # far from the plane, pixels without depth are rarely objects on it
-    contrast = contrast * known
-    low = ((heights < FLAT) | ~depth.valid) & region & known
-    gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
-    smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
-    plain = _plain_parts(smooth, (contrast < UNIT) & on_support)
-    beside = on_support | (~depth.valid & region)
-    colored = open_round(beside & known & (contrast > UNIT) & ~plain)
-    shade = open_round(colored & on_support & darker)
-    return Evidence(heights, open_round(high), contrast, colored, shade, region, *_depth_edges(depth))
+        Args:
+            color: [H, W, 3] uint8, sRGB, slightly blurred.
+            depth: the depth image.
+            planes: at least one plane.
+        """
+        least = HEIGHT[1] * (depth.z * depth.z) + HEIGHT[0]
+        self.heights = planes[0].heights(depth)
+        on_support = (np.abs(self.heights) <= least) & depth.valid
+        high = (self.heights > least) & depth.valid
+        for plane in planes[1:]:
+            others = plane.heights(depth)
+            high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
+            on_support &= np.abs(self.heights) <= np.abs(others)
+        self.high = open_round(high)
+        contrast, darker, near, known = _color_contrast(color, on_support)
+        self.region = shrink(planes[0].region(depth.z.shape), 3)
+        # Far from the plane, pixels without depth are rarely objects on it.
+        known = near | (known & depth.valid & self.region)
+        self.contrast = contrast * known
+        low = ((self.heights < FLAT) | ~depth.valid) & self.region & known
+        gradient = np.asarray(cv2.morphologyEx(self.contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
+        smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
+        plain = _plain_parts(smooth, (self.contrast < UNIT) & on_support)
+        beside = on_support | (~depth.valid & self.region)
+        self.colored = open_round(beside & known & (self.contrast > UNIT) & ~plain)
+        self.shade = open_round(self.colored & on_support & darker)
+        self.steps, self.folds = _depth_edges(depth)
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:

@@ -5,7 +5,6 @@ colour edges. Near depth edges and where depth is missing, the colour image alon
 edge between them, and the inner and outer sides of hollow objects, are then merged.
 """
 
-import dataclasses
 from typing import Any
 
 import cv2
@@ -66,7 +65,6 @@ BEFORE, AFTER = 2, 2
 """Distances, pixels, from a border at which the two pieces are compared."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class _Pieces:
     """Pieces [n], and borders between pairs of neighbours [N], the smaller number first; the background is a piece.
 
@@ -86,17 +84,39 @@ class _Pieces:
         shade: [n] whether a piece is mostly in the shade.
     """
 
-    pairs: NDArray[np.int64]
-    length: NDArray[np.intp]
-    step: NDArray[np.float64]
-    contrast: NDArray[np.float64]
-    behind: NDArray[np.float64]
-    perimeter: NDArray[np.intp]
-    colored: Mask
-    tall: Mask
-    low: Mask
-    unknown: Mask
-    shade: Mask
+    def __init__(
+        self, labels: NDArray[np.int32], colored: Mask, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
+    ) -> None:
+        self.colored = colored
+        n, flat, pixels, z = len(colored), labels.ravel(), color.reshape(-1, 3), depth.z.ravel()
+        parts = []
+        for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
+            here = np.flatnonzero(flat[:-step] != flat[step:])
+            a, b = flat[here], flat[here + step]
+            before, after = np.maximum(here - BEFORE * step, 0), np.minimum(here + AFTER * step, flat.size - 1)
+            difference = np.abs(pixels[before].astype(np.int16) - pixels[after]).sum(axis=1)
+            farther = np.sign(z[after] - z[before]) * np.where(a < b, 1, -1)
+            behind = np.where((z[before] > 0) & (z[after] > 0), farther, 0)
+            parts.append((np.minimum(a, b), np.maximum(a, b), grow(steps, 5).ravel()[here], difference, behind))
+        a, b, *values = (np.concatenate(each) for each in zip(*parts, strict=True))
+        keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
+        self.length, self.pairs = np.bincount(pair, minlength=len(keys)), np.stack(np.divmod(keys, n), axis=1)
+        self.step, self.contrast, self.behind = (
+            np.bincount(pair, each, minlength=len(keys)) / self.length for each in values
+        )
+        ends = self.pairs.ravel()
+        self.perimeter = np.bincount(ends, np.repeat(self.length, 2), minlength=n).astype(np.intp)
+
+        every = labels[::2, ::2].ravel()
+        things = np.flatnonzero(every)
+        every, heights = every[things], evidence.heights[::2, ::2].ravel()[things]
+        size = np.maximum(np.bincount(every, minlength=n), 1)
+        self.tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
+        self.low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
+        self.unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
+        is_shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
+        to_plane = np.bincount(self.pairs[:, 1], self.length * (self.pairs[:, 0] == 0), minlength=n)
+        self.shade = is_shade & (to_plane > OPEN * self.perimeter)
 
 
 def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> NDArray[np.int32]:
@@ -108,7 +128,7 @@ def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence)
         evidence: height and colour relative to the planes, and depth edges.
     """
     labels, colored = _flood(color, depth, evidence)
-    pieces, n = _measure(labels, colored, color, depth, evidence), len(colored)
+    pieces, n = _Pieces(labels, colored, color, depth, evidence), len(colored)
     apart = pieces.length < LEAST_CONTACT * pieces.perimeter[pieces.pairs].min(axis=1)
     together = _belong_together(pieces, apart)
     for k, (a, b) in enumerate(pieces.pairs.tolist()):
@@ -236,37 +256,3 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     bend = fitted[3] * squared.mean()
     noise = np.sqrt(np.mean((terms @ fitted - inverse) ** 2))
     return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
-
-
-def _measure(
-    labels: NDArray[np.int32], colored: Mask, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
-) -> _Pieces:
-    n, flat, pixels, z = len(colored), labels.ravel(), color.reshape(-1, 3), depth.z.ravel()
-    parts = []
-    for step, steps in zip((1, labels.shape[1]), evidence.steps, strict=True):
-        here = np.flatnonzero(flat[:-step] != flat[step:])
-        a, b = flat[here], flat[here + step]
-        before, after = np.maximum(here - BEFORE * step, 0), np.minimum(here + AFTER * step, flat.size - 1)
-        difference = np.abs(pixels[before].astype(np.int16) - pixels[after]).sum(axis=1)
-        farther = np.sign(z[after] - z[before]) * np.where(a < b, 1, -1)
-        behind = np.where((z[before] > 0) & (z[after] > 0), farther, 0)
-        parts.append((np.minimum(a, b), np.maximum(a, b), grow(steps, 5).ravel()[here], difference, behind))
-    a, b, at_step, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
-    keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
-    length, pairs = np.bincount(pair, minlength=len(keys)), np.stack(np.divmod(keys, n), axis=1)
-    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
-    at_step, contrast, behind = (
-        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, difference, behind)
-    )
-
-    every = labels[::2, ::2].ravel()
-    things = np.flatnonzero(every)
-    every, heights = every[things], evidence.heights[::2, ::2].ravel()[things]
-    size = np.maximum(np.bincount(every, minlength=n), 1)
-    tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
-    low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
-    unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
-    shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-    to_plane = np.bincount(pairs[:, 1], length * (pairs[:, 0] == 0), minlength=n)
-    shade &= to_plane > OPEN * perimeter
-    return _Pieces(pairs, length, at_step, contrast, behind, perimeter, colored, tall, low, unknown, shade)

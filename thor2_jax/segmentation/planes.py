@@ -103,19 +103,23 @@ class Plane:
         return pixel_mask(cv2.fillConvexPoly(np.zeros(shape, np.uint8), self.hull, 1))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class _Points:
     """Points of a grid of pixels, `step` pixels apart.
 
-    The fields are positions [N], terms [N, 6] for the coefficients, inverse depth [N] and tolerance [N].
+    The attributes are positions [N], terms [N, 6] for the coefficients, inverse depth [N] and tolerance [N].
     """
 
-    step: int
-    columns: NDArray[np.intp]
-    rows: NDArray[np.intp]
-    terms: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    tolerance: NDArray[np.float64]
+    def __init__(self, depth: DepthImage) -> None:
+        height, width = depth.z.shape
+        self.step = step = max(1, round(math.sqrt(height * width / REFINED_POINTS)))
+        rows = np.arange((height - 1) % step // 2, height, step)
+        columns = np.arange((width - 1) % step // 2, width, step)
+        inverse = depth.inverse[np.ix_(rows, columns)].astype(np.float64)
+        row, column = np.nonzero(inverse)
+        self.rows, self.columns, self.inverse = rows[row], columns[column], inverse[row, column]
+        x, y = depth.x[self.columns].astype(np.float64), depth.y[self.rows].astype(np.float64)
+        self.terms = np.stack([x, y, np.ones_like(x), x * x, x * y, y * y], axis=1)
+        self.tolerance = TOLERANCE[0] * self.inverse * self.inverse + TOLERANCE[1]
 
 
 def dominant_planes(depth: DepthImage) -> list[Plane]:
@@ -124,7 +128,7 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
     Returns:
         The planes. The first one is the nearest plane of sufficient size, which is the likely support of the objects.
     """
-    points = _grid_points(depth)
+    points = _Points(depth)
     total = len(points.inverse)
     left = np.arange(total)
     rng = np.random.default_rng(0)
@@ -159,19 +163,6 @@ def _is_just_above(plane: NDArray[np.float64], other: NDArray[np.float64]) -> bo
     parallel = normals[0] @ normals[1] > PARALLEL * lengths.prod()
     # The distance of a plane from the camera is 1 / |(a, b, c)|.
     return bool(parallel and 0 < 1 / lengths[0] - 1 / lengths[1] < LARGEST_THING)
-
-
-def _grid_points(depth: DepthImage) -> _Points:
-    height, width = depth.z.shape
-    step = max(1, round(math.sqrt(height * width / REFINED_POINTS)))
-    rows = np.arange((height - 1) % step // 2, height, step)
-    columns = np.arange((width - 1) % step // 2, width, step)
-    inverse = depth.inverse[np.ix_(rows, columns)].astype(np.float64)
-    row, column = np.nonzero(inverse)
-    w = inverse[row, column]
-    x, y = depth.x[columns[column]].astype(np.float64), depth.y[rows[row]].astype(np.float64)
-    terms = np.stack([x, y, np.ones_like(x), x * x, x * y, y * y], axis=1)
-    return _Points(step, columns[column], rows[row], terms, w, TOLERANCE[0] * w * w + TOLERANCE[1])
 
 
 def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float64] | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.segmentation.foreground import find_foreground
+from thor2_jax.segmentation.foreground import Evidence
 from thor2_jax.segmentation.pieces import find_pieces
 from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed, window
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
@@ -65,7 +65,7 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
     planes = dominant_planes(depth)
     if not planes:
         return np.zeros(frame.depth.shape, np.int32)
-    evidence = find_foreground(color, depth, planes)
+    evidence = Evidence(color, depth, planes)
     labels = _cleaned(find_pieces(color, depth, evidence), depth, planes)
     return _refined(labels, frame.color, stride) if stride > 1 else labels
 

@@ -19,7 +19,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, MIN_BATCH_POINTS, POINT_BUCKETS, b
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.explain import explained_kinds
+from thor2_jax.explanation.explain import explained_by_classifiers
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import ObjectGallery
@@ -38,7 +38,7 @@ MIN_BATCH_BUCKET = 8
 """Smallest padded number of clouds of a batch; smaller sizes are hardly faster, and each takes seconds to compile."""
 
 ExplanationPrograms = tuple[int, bool]
-"""Padded number of points and kind of scores (`explained_kinds`) of programs for explanations."""
+"""Padded number of points and kind of scores (`explained_by_classifiers`) of programs for explanations."""
 
 
 class CloudResult(NamedTuple):
@@ -236,7 +236,7 @@ class InferenceEngine:
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain answers for clouds of `n_points` points."""
-        return [(batch_points([n_points]), by_classifiers) for by_classifiers in explained_kinds(self.model)]
+        return [(batch_points([n_points]), kind) for kind in dict.fromkeys(explained_by_classifiers(self.model))]
 
 
 def _load(settings: Settings) -> Recognizer:

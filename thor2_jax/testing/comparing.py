@@ -26,7 +26,6 @@ __all__ = [
     "assert_equal",
     "assert_near",
     "assert_within",
-    "cloud_of",
     "embedding_rounding",
     "image_lipschitz",
     "image_rounding",
@@ -117,13 +116,6 @@ def with_points(clouds: PointClouds, points: NDArray[np.floating]) -> PointCloud
     return dataclasses.replace(clouds, points=jnp.asarray(kept, jnp.float32))
 
 
-def cloud_of(clouds: PointClouds, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return points [n, 3] and 8-bit colours [n, 3] of one cloud, without padding."""
-    mask = np.asarray(clouds.mask[index])
-    colors = np.asarray(clouds.colors[index])[mask]
-    return np.asarray(clouds.points[index])[mask], np.floor(colors * 255 + 0.5).astype(np.uint8)
-
-
 def assert_equal(actual: Descriptors, expected: Descriptors) -> None:
     """Assert that descriptors are finite and equal bit by bit."""
     for field in dataclasses.fields(Descriptors):
@@ -140,7 +132,9 @@ def assert_within(
     assert (off <= bound).all(), f"{name}: off by {off.max():.3g}; expected at most {np.max(bound):.3g}"
 
 
-def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float = 0.0) -> None:
+def assert_near(
+    actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None = 0.0
+) -> None:
     """Assert that descriptors are equal up to rounding, if each aligned point moved by at most `drift` in its strip.
 
     Births and counts are then equal, and each persistence changes by at most 2 `drift`. The change of an image, summed
@@ -151,8 +145,10 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
         actual: descriptors.
         expected: descriptors with a non-negative similarity.
         config: the config of both.
-        drift: scaled units.
+        drift: scaled units; None to require equal bits, as `assert_equal`.
     """
+    if drift is None:
+        return assert_equal(actual, expected)
     np.testing.assert_array_equal(actual.overflow, expected.overflow, err_msg="overflow")
     images = np.asarray(expected.images, np.float64)
     persistence = images.sum(axis=(-2, -1)) / 0.47

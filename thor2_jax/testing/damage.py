@@ -5,8 +5,6 @@ def test_reader(content):
     ...
 """
 
-import functools
-
 import hypothesis.strategies as st
 import numpy as np
 
@@ -87,7 +85,6 @@ def _damage(content: bytes, seed: int, times: int) -> bytes:
     return bytes(damaged_content)
 
 
-@functools.lru_cache(maxsize=32)  # Hypothesis validates each new strategy.
 def damaged(content: bytes, times: int = 3) -> st.SearchStrategy[bytes]:
     """Generate the bytes of a file after one or more damages.
 

@@ -48,13 +48,6 @@ Describe = Callable[[PointClouds], Descriptors]
 InstanceClouds = Callable[[RGBDFrame], Sequence[PreparedInstance]]
 
 
-def _compare(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
-    if drift is None:
-        assert_equal(actual, expected)
-    else:
-        assert_near(actual, expected, config, drift)
-
-
 def assert_permutation_invariant(
     describe: Describe, clouds: PointClouds, seed: int, config: DescriptorConfig, drift: float | None = None
 ) -> None:
@@ -64,7 +57,7 @@ def assert_permutation_invariant(
     below 2^24, which are exact in any order. In view normalization, the order of sums changes the last bits.
     """
     order = np.argsort(np.random.default_rng(seed).random(clouds.mask.shape), axis=1)
-    _compare(describe(taken(clouds, order)), describe(clouds), config, drift)
+    assert_near(describe(taken(clouds, order)), describe(clouds), config, drift)
 
 
 def assert_padding_invariant(
@@ -114,6 +107,13 @@ def assert_company_invariant(describe: Describe, clouds: PointClouds, others: Po
         assert_equal(*(jax.tree.map(lambda a, b=b: a[b], d) for d in (describe(mixed), expected)))
 
 
+def _moved(clouds: PointClouds, rotation: NDArray[np.float64], shift: ArrayLike) -> PointClouds:
+    """Return clouds and cameras after a rotation [3, 3] and a shift [3] in float64, rounded to float32."""
+    places = (np.asarray(array, np.float64) for array in (clouds.points, clouds.camera))
+    points, camera = (place @ rotation.T + np.asarray(shift) for place in places)
+    return dataclasses.replace(with_points(clouds, points), camera=jnp.asarray(camera, jnp.float32))
+
+
 def assert_translation_invariant(describe: Describe, clouds: PointClouds, shift: ArrayLike) -> None:
     """Assert that a translation of cloud and camera together changes nothing.
 
@@ -125,9 +125,7 @@ def assert_translation_invariant(describe: Describe, clouds: PointClouds, shift:
         clouds: `lattice_clouds`.
         shift: [3] metres, a multiple of `LATTICE`.
     """
-    moved = with_points(clouds, np.asarray(clouds.points) + np.asarray(shift, np.float32))
-    moved = dataclasses.replace(moved, camera=clouds.camera + jnp.asarray(shift, jnp.float32))
-    assert_equal(describe(moved), describe(clouds))
+    assert_equal(describe(_moved(clouds, np.eye(3), shift)), describe(clouds))
 
 
 def assert_rigid_motion_invariant(
@@ -151,10 +149,7 @@ def assert_rigid_motion_invariant(
         config: config of the descriptor.
         drift: `alignment_drift` of the pose farther from the origin.
     """
-    points = np.asarray(clouds.points, np.float64) @ rotation.T + np.asarray(shift)
-    camera = np.asarray(clouds.camera, np.float64) @ rotation.T + np.asarray(shift)
-    moved = dataclasses.replace(with_points(clouds, points), camera=jnp.asarray(camera, jnp.float32))
-    assert_near(describe(moved), describe(clouds), config, drift)
+    assert_near(describe(_moved(clouds, rotation, shift)), describe(clouds), config, drift)
 
 
 def assert_scale_invariant(
@@ -197,7 +192,7 @@ def assert_duplicates_count_twice(
     first = taken(clouds, np.arange(half))
     once, twice = describe(clouds), describe(joined(first, first))
     halved = dataclasses.replace(twice, embeddings=twice.embeddings / 2, overflow=once.overflow)
-    _compare(halved, once, config, drift)
+    assert_near(halved, once, config, drift)
 
 
 def assert_backends_agree(first: Describe, second: Describe, clouds: PointClouds) -> None:

@@ -17,7 +17,6 @@ from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.testing.comparing import (
     UNIT,
     assert_within,
-    cloud_of,
     embedding_rounding,
     image_lipschitz,
     image_rounding,
@@ -242,7 +241,8 @@ def assert_stable(
 
 
 def _references(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> list[Reference]:
-    return [reference_descriptor(*cloud_of(aligned, b), network, config) for b in range(aligned.mask.shape[0])]
+    clouds = [(xyz, np.floor(rgb * 255 + 0.5).astype(np.uint8)) for xyz, rgb in aligned.unpack()]
+    return [reference_descriptor(xyz, rgb, network, config) for xyz, rgb in clouds]
 
 
 def assert_follows_equations(

@@ -93,7 +93,7 @@ def _lead(explanation: Explanation, name: str) -> str:
 
 
 def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]]) -> list[Section]:
-    check, is_odds = explanation.attributions.faithfulness, explanation.scores.unit == "log-odds"
+    check, is_odds = explanation.attributions, explanation.scores.unit == "log-odds"
     if is_odds:
         margin = (
             f"The classifiers' log-odds of {explanation.name} are {check.margin:.1f}. Log-odds compare a class with "

@@ -1,6 +1,5 @@
 """RealSense cameras: the library's own software device, and sources that fail."""
 
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,11 +12,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.recordings.realsense import RealSenseCamera
 
 WIDTH, HEIGHT = 64, 48
-
-
-def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    assert_refused(r"\.\[realsense\]", RealSenseCamera().__enter__)
 
 
 @pytest.fixture

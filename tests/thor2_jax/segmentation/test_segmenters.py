@@ -91,15 +91,8 @@ def test_labels_that_are_not_labels(result: Any, message: str) -> None:
     assert_refused(rf"^segmenter <lambda> returned .*{message}", segment, FRAME, lambda frame: result)
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (RuntimeError("no weights\nin this folder"), "RuntimeError: no weights in this folder"),
-        (NotImplementedError(), "NotImplementedError"),
-    ],
-)
-def test_a_segmenter_that_raises(error: Exception, reason: str) -> None:
+def test_a_segmenter_that_raises_without_a_message() -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
-        raise error
+        raise NotImplementedError
 
-    assert_refused(rf"^segmenter failing failed .*\({reason}\);", segment, FRAME, failing)
+    assert_refused(r"^segmenter failing failed .*\(NotImplementedError\);", segment, FRAME, failing)

@@ -165,12 +165,12 @@ def test_borders_are_refined_as_in_the_whole_image() -> None:
 def test_the_rim_of_thick_things_is_trimmed() -> None:
     labels = np.zeros((80, 120), np.int32)
     labels[5:65, 10:70] = 1
-    labels[5:65, 70:110] = 2  # beside it
+    labels[5:65, 70:110] = 257  # beside it
     labels[70:73, 10:110] = 3  # thin
     trimmed = _trimmed(labels, 3)
     expected = np.zeros_like(labels)
     expected[6:64, 11:69] = 1
-    expected[6:64, 71:109] = 2
+    expected[6:64, 71:109] = 257
     expected[70:73, 10:110] = 3
     np.testing.assert_array_equal(trimmed, expected)
     np.testing.assert_array_equal(_trimmed(labels, 1), labels)

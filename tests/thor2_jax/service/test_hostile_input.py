@@ -20,7 +20,8 @@ from image_files import deep_png, encode_image, png_file, with_checksums
 from processes import HANG
 from service_requests import check_refused
 
-from thor2_jax.service.decoding import MAX_BODY
+from thor2_jax.service.decoding import MAX_BODY, decode_frame
+from thor2_jax.service.problem import RequestError
 
 from .conftest import Files
 

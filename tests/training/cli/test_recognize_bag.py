@@ -132,12 +132,6 @@ def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pyt
     assert r"color in a\n\x1b[2J" in note
 
 
-def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) -> None:
-    path = write_recording(tmp_path / "a.mcap", FRAMES[:2])
-    error = refused("recognize", "--model", model, "--bag", path, "--depth-scale", 10, at_once=False)
-    assert "is depth_scale right? It is 10 units" in error
-
-
 def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, refused: Command) -> None:
     path, late = tmp_path / "a.mcap", 2**31 * 10**9
     with bag_writer(path) as write:  # images without a time stamp have the time at which they were recorded
