@@ -22,14 +22,7 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
-__all__ = [
-    "FrameAnswer",
-    "RecognizerArguments",
-    "read_source",
-    "recognize_frames",
-    "segmentation_failure",
-    "track_frames",
-]
+__all__ = ["RecognizerArguments", "read_source", "recognize_frames", "segmentation_failure", "track_frames"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,12 +31,7 @@ from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
 from thor2_jax.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
-from training.embedding.distractors import (
-    Distractors,
-    distractor_samples,
-    held_out_clouds,
-    with_fitted_distractors,
-)
+from training.embedding.distractors import Distractors, distractor_samples, held_out_clouds, with_fitted_distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit

@@ -26,16 +26,7 @@ from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.vit import VIT_BASE, VIT_TINY_4, RGBDViT
 
-__all__ = [
-    "ARCHITECTURES",
-    "Architecture",
-    "load_backbone",
-    "load_weights",
-    "network_inputs",
-    "resampled_positions",
-    "tensor_shapes",
-    "weights_file",
-]
+__all__ = ["ARCHITECTURES", "load_weights", "network_inputs", "weights_file"]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 """Last part of an NNX path -> last part of the tensor's name."""

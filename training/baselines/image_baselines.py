@@ -38,7 +38,6 @@ __all__ = [
     "TEMPLATES",
     "check_backbone",
     "check_weights",
-    "compare",
     "crop_size",
     "fit_image_network",
     "fit_templates",

@@ -10,14 +10,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.architectures import ARCHITECTURES, weights_file
-from training.baselines.baseline import (
-    FitTask,
-    Predictor,
-    StoredBaseline,
-    baseline_file,
-    read_baseline,
-    write_baseline,
-)
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
 from training.baselines.image_baselines import (
     TEMPLATES,
@@ -33,7 +26,6 @@ from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
 __all__ = [
-    "BASELINES",
     "CLOUD_BASELINES",
     "NETWORKS",
     "TITLES",

@@ -49,7 +49,6 @@ __all__ = [
     "ObjectSource",
     "distractor_samples",
     "held_out_clouds",
-    "render_clouds",
     "sample_objects",
     "samples_record",
     "with_fitted_distractors",

@@ -13,12 +13,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.runs import Run, scratch_networks
 from training.evaluation.scores import summarize_runs
 
-__all__ = [
-    "compare_with_published",
-    "published_attributes",
-    "published_seconds",
-    "published_tables",
-]
+__all__ = ["compare_with_published", "published_seconds"]
 
 _LIGHTS = {"1": "bright", "2": "dim"}
 """Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not state this; see the note in

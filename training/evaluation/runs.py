@@ -30,14 +30,7 @@ from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
 
-__all__ = [
-    "Run",
-    "SequenceRun",
-    "all_predictors",
-    "load_runs",
-    "load_sequence_runs",
-    "scratch_networks",
-]
+__all__ = ["Run", "all_predictors", "load_runs", "load_sequence_runs", "scratch_networks"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -34,7 +34,6 @@ from training.fitting.samples import Batch, Samples, describe_batch
 __all__ = [
     "FitContext",
     "FitState",
-    "count_correct",
     "fit",
     "initial_state",
     "network_step",

@@ -22,12 +22,10 @@ from training.readers.bop import BOP
 from training.readers.labelled import LabelledFrames, named_labels, named_path
 
 __all__ = [
-    "FILE_NAMES",
     "FrameFiles",
     "FrameFolder",
     "FrameSource",
     "find_frames",
-    "frame_files",
     "read_names",
     "recorded_sources",
     "segmented_source",

@@ -31,7 +31,6 @@ from thor2_jax.files import (
 )
 
 __all__ = [
-    "LOCK",
     "MANIFEST",
     "Progress",
     "add_prefix",

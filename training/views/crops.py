@@ -33,18 +33,7 @@ from training.views.mesh_views import RenderJob, ViewTask, all_views
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from training.views.dataset import ViewDataset
 
-__all__ = [
-    "CROPS",
-    "CROP_SIZE",
-    "Crop",
-    "ViewCrops",
-    "fill_depth",
-    "read_crops",
-    "render_crops",
-    "rgbd_crop",
-    "stacked",
-    "surface_normals",
-]
+__all__ = ["CROPS", "Crop", "ViewCrops", "read_crops", "render_crops", "rgbd_crop", "stacked"]
 
 CROP_SIZE = 224
 """Side of a crop, pixels."""
