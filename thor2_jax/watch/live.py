@@ -23,7 +23,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
 from thor2_jax.model.recognition import Detection, Recognition, detections_of
@@ -126,8 +126,8 @@ class LiveView:
             if frame.labels is None:
                 frame = segmented(frame, self._segmenter)
             recognitions = self._recognize(frame)
-        except InputError as error:
-            self._last = {**self._last, **values, "error": str(error)}
+        except (InputError, OSError) as error:
+            self._last = {**self._last, **values, "error": reason_of(error)}
         else:
             milliseconds = 1000 * (time.perf_counter() - start)
             detections = sorted(detections_of(frame, recognitions), key=_order)

@@ -51,7 +51,7 @@ def watch(
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
         from thor2_jax.segmentation.segmenters import segment as segment_frame
         from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
-        from training.frame_recognition import RecognizerArguments, read_source
+        from training.frame_recognition import RecognizerArguments
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in sources.items() if value is not None]
@@ -78,7 +78,7 @@ def watch(
         frames: Iterator[RecordedFrame]
         if folder is not None:
             numbered = enumerate(given_frames.sources(segment))
-            frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in numbered)
+            frames = (RecordedFrame(each.name, each.read, number) for number, each in numbered)
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:
