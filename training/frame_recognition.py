@@ -136,14 +136,14 @@ def track_frames(
             the frame.
     """
     tracker = recognizer.track()
-    answered: list[tuple[FrameAnswer, Sequence[TrackedRecognition]]] = []
+    answered: list[tuple[FrameAnswer, list[TrackedRecognition]]] = []
     last: dict[int | None, TrackedRecognition] = {}
     for number, source in enumerate(sources):
         try:
             frame = source.read()
             _ = frame.instance_pixels  # raises InputError without labels
         except (InputError, OSError) as error:
-            answered.append((FrameAnswer(source.name, error=reason_of(error)), ()))
+            answered.append((FrameAnswer(source.name, error=reason_of(error)), []))
             continue
         start = time.perf_counter()
         with with_context(source.name):

@@ -98,13 +98,13 @@ class LiveView:
     """
 
     def __init__(
-        self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: Segmenter, broadcast: Broadcast
+        self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: str | Segmenter, broadcast: Broadcast
     ) -> None:
         """Publish the state "waiting" for the first frame.
 
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
-            segmenter: segmenter of frames without labels.
+            segmenter: segmenter of frames without labels, or its name.
             broadcast: receiver of the messages.
         """
         self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast

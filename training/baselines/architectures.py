@@ -1,4 +1,4 @@
-"""Table of the image networks with which the paper compares THOR2: architecture, image size and pretrained weights.
+"""Table of the image networks with which THOR2 is compared: architecture, image size and pretrained weights.
 
 Weights of backbones are read from local safetensors files of PyTorch models:
 
@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
-from training.baselines.vit import VIT_BASE, VIT_TINY_4, RGBDViT
+from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY_4, RGBDViT, ViT
 
-__all__ = ["ARCHITECTURES", "load_weights", "network_inputs", "weights_file"]
+__all__ = ["ARCHITECTURES", "TEMPLATES", "load_weights", "network_inputs", "weights_file"]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 """Last part of an NNX path -> last part of the tensor's name."""
@@ -149,13 +149,21 @@ class Architecture:
     size: int
     weights: Mapping[str, str]
 
-    def build(self, n_classes: int, seed: int) -> nnx.Module:
+    def build(self, n_classes: int, seed: int) -> Any:
         """Return the network with random weights."""
         return self.create(n_classes, rngs=nnx.Rngs(seed))
 
     def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
         """Return the backbones of a network with their files."""
         return [(getattr(network, backbone), file) for backbone, file in self.weights.items()]
+
+
+TEMPLATES = "templates"
+"""The nearest template by features of a frozen backbone, which may be the backbone of a network of the same run."""
+
+
+def _dinov2(n_classes: int, *, rngs: nnx.Rngs) -> Any:
+    return nnx.Dict(color=ViT(VIT_DINOV2_SMALL, _LARGE, rngs=rngs))
 
 
 _LARGE, _SMALL = 224, 96
@@ -183,8 +191,9 @@ ARCHITECTURES: dict[str, Architecture] = {
     "rgbd-vit-small": Architecture(
         partial(RGBDViT, vit=VIT_TINY_4, size=_SMALL), _SMALL, {"color": _TINY, "normals": _TINY}
     ),
+    TEMPLATES: Architecture(_dinov2, _LARGE, {"color": "vit_small_patch14_dinov2"}),
 }
-"""Name of the baseline -> its network."""
+"""Name of the baseline -> its network; for the templates, the backbone that is read from a file of weights."""
 
 
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.architectures import ARCHITECTURES, weights_file
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, weights_file
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
 from training.baselines.image_baselines import (
-    TEMPLATES,
     fit_image_network,
     fit_templates,
     load_image_network,
@@ -38,7 +37,7 @@ __all__ = [
 CLOUD_BASELINES = ("thor", "forest", "pointnet")
 """Baselines on point clouds."""
 
-NETWORKS = tuple(ARCHITECTURES)
+NETWORKS = tuple(name for name in ARCHITECTURES if name != TEMPLATES)
 """Image networks on crops of colour and surface normals."""
 
 BASELINES = (*CLOUD_BASELINES, *NETWORKS, TEMPLATES)

@@ -46,7 +46,6 @@ from training.views.normalized_views import padded_batches
 __all__ = [
     "AUGMENTATIONS",
     "Distractors",
-    "ObjectSource",
     "distractor_samples",
     "held_out_clouds",
     "sample_objects",
@@ -108,7 +107,6 @@ def samples_record(
 
     This includes a digest of the code, since code may change within a version in a checkout.
     """
-    digests = {each: load_mesh(each).digest if isinstance(each, Path) else each for each in dict.fromkeys(sources)}
     root = Path(training.__file__).parent
     folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
     files = (file for folder in folders for file in sorted(folder.glob("*.py")))
@@ -116,7 +114,7 @@ def samples_record(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
-        "objects": [digests[each] for each in sources],
+        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
         "views": views,
         "copies": OF_EMBEDDING.orientations,
         "seed": SEED,
@@ -140,8 +138,7 @@ def sample_objects(
     """Render views of objects and sample them.
 
     Args:
-        sources: objects; labels are indices into this sequence. An object that occurs n times gets n times as many
-            views, all with the label of its first occurrence.
+        sources: objects; labels are indices into this sequence.
         network: colour network.
         config: descriptor. Static.
         views: number of views of each object.
@@ -155,7 +152,6 @@ def sample_objects(
         OSError: the directory cannot be written.
     """
     numbered = list(enumerate(sources))
-    label_of = {source: index for index, source in reversed(numbered)}
     tasks = {
         directory / f"{first:06d}.safetensors": dict(numbered[first : first + OBJECTS_PER_TASK])
         for first in range(0, len(sources), OBJECTS_PER_TASK)
@@ -176,7 +172,7 @@ def sample_objects(
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
             rng = np.random.default_rng([SEED, len(sources), min(task)])
             rendered = sorted(rendered, key=lambda view: len(view[1][0]))  # for batches with little padding
-            label = np.array([label_of[sources[index]] for index, _ in rendered], np.int32)
+            label = np.array([index for index, _ in rendered], np.int32)
             batches = padded_batches([cloud for _, cloud in rendered])
             normal = ((count, view_normalize(clouds, config)) for count, clouds in batches)
             view = np.zeros_like(label)

@@ -23,8 +23,8 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks import EMBEDDING
 from thor2_jax.recognizer import DescribedFrame, Recognizer
+from training.baselines.architectures import TEMPLATES
 from training.baselines.baseline import BaselineInputs, baseline_file
-from training.baselines.image_baselines import TEMPLATES
 from training.baselines.job import NETWORKS, TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
