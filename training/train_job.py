@@ -165,22 +165,14 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     Only views of this job are removed, since another training may read other views.
     """
     record = finished_record(job.out)
-    dataset = job.protocol.render_job(_find_meshes(job)).record()
-    frames = labelled.digest if labelled else None
-    requested = {
-        "seed": job.protocol.fit.seed,
-        "dataset": dataset,
-        "frames": frames,
-        "leave_out": sorted(set(job.leave_out)),
+    stored = record["dataset"]
+    values = {  # of the finished run, and of the job
+        "seed": (record["seed"], job.protocol.fit.seed),
+        "dataset": (stored.get("job"), job.protocol.render_job(_find_meshes(job)).record()),
+        "frames": (stored.get("frames", {}).get("digest"), labelled.digest if labelled else None),
+        "leave_out": (stored.get("classes_left_out", []), sorted(set(job.leave_out))),
     }
-    stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
-    trained = {
-        "seed": record["seed"],
-        "dataset": stored.get("job"),
-        "frames": of_frames,
-        "leave_out": stored.get("classes_left_out", []),
-    }
-    check_same_job(job.out, trained, requested)
+    check_same_job(job.out, *({name: pair[side] for name, pair in values.items()} for side in (0, 1)))
     if job.baselines:
         return
     check_trained(stored["digest"], job.out, job.protocol)
@@ -191,9 +183,8 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
-    assert job.meshes is not None
     if not isinstance(job.meshes, Path):
-        return dict(job.meshes)
+        return dict(job.meshes or {})
     return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
 
 
@@ -252,7 +243,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:
     """Open the dataset, or render the meshes to `out`/views; add the labelled instances."""
-    meshes = {} if job.meshes is None else _find_meshes(job)
+    meshes = _find_meshes(job)
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:

@@ -135,18 +135,23 @@ def train_run(
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
-        samples: Samples | _Views
+        samples: Samples | None = None
         if settings.classifiers:
             check_classes(source)
             form, show = Form(settings.mirrors, settings.orientation_copies), of_stage(progress, DESCRIBE, "views")
             samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
+            label, view = samples.label, samples.view
         else:  # only the distribution of the views among the folds is needed here
-            samples = _labelled_views(source)
+            views = [source.read(index).view for index in range(len(source.shards))]
+            label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
+            view = np.concatenate(views)
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
-        n_classes = len(source.classes)
-        parts = _held_out_parts(samples, n_classes) if folds == 1 and is_held_out else folds
-        fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
+        parts = folds
+        if folds == 1 and is_held_out:  # fewer parts if a class has few views
+            fewest = min(len(np.unique(view[label == index])) for index in range(len(source.classes)))
+            parts = max(2, min(HELD_OUT, fewest))
+        fold_of = fold_of_views(label, view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:
             if not resumed:
@@ -156,7 +161,9 @@ def train_run(
             begin_job(out, job, JOB)
         wait_for_all("begun")
         runs = [
-            _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()
+            _Fold(
+                settings, source, out, fold, samples, label, view, fold_of == fold if is_held_out else None, progress
+            ).train()
             for fold in range(folds)
         ]
         wait_for_all("trained")
@@ -165,33 +172,20 @@ def train_run(
         return runs
 
 
-class _Views(NamedTuple):
-    """The views of a source: the class of each view [V] and its number among the views of this class [V]."""
-
-    label: NDArray[np.integer[Any]]
-    view: NDArray[np.integer[Any]]
-
-
-def _labelled_views(source: ViewSource) -> _Views:
-    views = [source.read(index).view for index in range(len(source.shards))]
-    labels = np.repeat([shard.label for shard in source.shards], [len(view) for view in views])
-    return _Views(labels, np.concatenate(views))
-
-
-def _held_out_parts(samples: Samples | _Views, n_classes: int) -> int:
-    """Return into how many parts the views are split to hold out one part; fewer if a class has few views."""
-    fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(n_classes))
-    return max(2, min(HELD_OUT, fewest))
-
-
 class _Fold(NamedTuple):
-    """One fold of a training: the arguments of `train_run`, the fold's number, all samples and the held-out mask."""
+    """One fold of a training: the arguments of `train_run`, the fold's number, and all samples.
+
+    The last are the samples of the classifiers (None without classifiers), and for each sample or view its class, its
+    view and whether it is held out.
+    """
 
     settings: Protocol
     source: ViewSource
     out: Path
     number: int
-    samples: Samples | _Views
+    samples: Samples | None
+    label: NDArray[np.integer[Any]]
+    view: NDArray[np.integer[Any]]
     held_out: NDArray[np.bool_] | None
     progress: Progress
 
@@ -214,12 +208,11 @@ class _Fold(NamedTuple):
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
         """Fit the classifiers; return the classifiers, the epoch of each, and their temperatures."""
         settings, samples = self.settings, self.samples
-        if not isinstance(samples, Samples):
-            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         temperatures: dict[str, float] = {}
         for name in settings.classifiers:
+            assert samples is not None
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
@@ -251,7 +244,7 @@ class _Fold(NamedTuple):
         names = dict.fromkeys(row["classifier"] for row in rows)
         draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, self.out / CURVES)
         record = settings.record(self.source.digest)
-        record |= {"dataset": self.source.record, "samples": len(self.samples.label), "fold": self.number}
+        record |= {"dataset": self.source.record, "samples": len(self.label), "fold": self.number}
         record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
         record["held_out_accuracy"] |= accuracy
         record |= {"temperatures": temperatures, **confidence}
@@ -264,12 +257,12 @@ class _Fold(NamedTuple):
             The embedding, which recognizes the classes; and the label and the cloud, in metres, of each view in the
             held-out set. Labels of distractors start at the number of classes.
         """
-        settings, views, held_out, checkpoints = self.settings, self.samples, self.held_out, self.checkpoints(EMBEDDING)
+        settings, label, held_out, checkpoints = self.settings, self.label, self.held_out, self.checkpoints(EMBEDDING)
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
         scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
         others = distractor_samples(distractors, scratch, network, config, shown)
-        kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(len(classes))}
+        kept = {index: np.unique(self.view[held_out & (label == index)]) for index in range(len(classes))}
         shown = of_stage(self.report, DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
         unknown = held_out_clouds(distractors, len(classes))

@@ -320,15 +320,14 @@ def _store(samples: Samples, file: Path) -> None:
     """Store samples, unless a file of the user has this name or another process is writing."""
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with locked(file.parent):
+        # Another process that is writing usually writes the same file.
+        with contextlib.suppress(InputError), locked(file.parent):
             if file.exists() and not _is_own(file):
                 return
             save_arrays(file, samples.arrays(), {"format": FORMAT})
             own = [path for path in file.parent.iterdir() if _is_own(path)]
             for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
                 path.unlink(missing_ok=True)
-    except InputError:
-        return  # another process is writing, usually the same file
     except OSError as error:
         log.warning("the distractors cannot be stored for the next training: %s", error)
 

@@ -23,7 +23,7 @@ from training.evaluation.answers import (
 )
 from training.evaluation.published import compare_with_published
 from training.evaluation.runs import Run, all_predictors, scratch_networks
-from training.evaluation.scores import summarize_rows, summarize_runs
+from training.evaluation.scores import Flags, Floats, summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
 __all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
@@ -31,8 +31,6 @@ __all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
 CURVE = tuple(k / 100 for k in range(101))
 """Fractions of the correct answers at which the known/unknown curve is computed."""
 
-Floats = NDArray[np.floating[Any]]
-Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
 
 MAX_LISTED = 20
@@ -275,10 +273,7 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     """Return the bins of the reliability diagram, all runs together."""
     confidence, correct = zip(*(_judged(each, truth) for each in predictions), strict=True)
     bins = scores.reliability(np.concatenate(confidence), np.concatenate(correct))
-    return {
-        name: [None if np.isnan(value) else value for value in values.tolist()]
-        for name, values in bins._asdict().items()
-    }
+    return {name: [None if np.isnan(value) else value for value in values.tolist()] for name, values in bins.items()}
 
 
 def _answers(

@@ -283,12 +283,6 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
     return sources, recording.notes
 
 
-def _frames(bag: Bag, every: int) -> Iterator[RecordedFrame]:
-    """Open the recording and yield every `every`-th frame; closing the iterator closes the recording."""
-    with bag:
-        yield from itertools.islice(bag.frames(), 0, None, every)
-
-
 class _Recording:
     """Reader of frames by number; it starts again from the beginning if a number is lower than the previous one."""
 
@@ -299,9 +293,10 @@ class _Recording:
         self.notes: list[str] = []
 
     def frames(self) -> Iterator[RecordedFrame]:
-        bag = self._open()
-        self.notes = bag.notes
-        return _frames(bag, self._every)
+        """Open the recording and yield its frames; closing the iterator closes the recording."""
+        with self._open() as bag:
+            self.notes = bag.notes
+            yield from itertools.islice(bag.frames(), 0, None, self._every)
 
     def read(self, number: int) -> RGBDFrame:
         if self._last is None or self._last[0] > number:

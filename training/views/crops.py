@@ -15,7 +15,7 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -210,24 +210,8 @@ def _encode(crops: ViewCrops) -> bytes:
     return stream.getvalue()
 
 
-def _write_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
-    """Write the manifest of a directory of crops.
-
-    Args:
-        directory: the directory.
-        size: side of the crops, pixels.
-        dataset: digest of the dataset.
-        files: file name -> SHA-256 of the finished files.
-
-    Raises:
-        OSError: the manifest cannot be written.
-    """
-    content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset, "files": files}
-    write_text(directory / MANIFEST, json.dumps(content) + "\n")
-
-
 def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
-    """Return size, dataset and files of the manifest in a directory of crops, see `_write_manifest`.
+    """Return the manifest in a directory of crops: their size, the digest of their dataset, and file name -> SHA-256.
 
     Raises:
         InputError: the manifest is missing, damaged or of another format.
@@ -308,7 +292,9 @@ def render_crops(
                 views, name = dataset.read(index), _crop_file(dataset.shards[index].file)
                 of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
                 done[name] = write_checked(directory / name, _encode(stacked(of_shard, size)))
-                _write_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
+                files = dict(sorted(done.items()))
+                content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset.digest, "files": files}
+                write_text(directory / MANIFEST, json.dumps(content) + "\n")
                 n_done += len(views)
                 progress(n_done, len(dataset))
 
