@@ -182,9 +182,5 @@ DEFAULT = Protocol(
 QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
 """The default with fewer distractors and networks, which takes half of the time."""
 
-PAPER = Protocol(
-    classifiers=FEATURES,
-    fit=FitOptions(epochs=100, batch_size=128),
-    mirrors=PAPER_MIRRORS,
-)
+PAPER = Protocol(classifiers=FEATURES, fit=FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS)
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -99,10 +99,7 @@ def finished_record(out: Path) -> Mapping[str, Any]:
 
 
 def train_run(
-    source: ViewSource,
-    out: str | Path,
-    settings: Protocol,
-    progress: Progress = lambda stage, done, total, note: None,
+    source: ViewSource, out: str | Path, settings: Protocol, progress: Progress = lambda stage, done, total, note: None
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
 
@@ -224,10 +221,7 @@ class _Fold(NamedTuple):
         return classifiers, best_epochs, temperatures
 
     def complete_run(
-        self,
-        classifiers: Mapping[Feature, MLP],
-        best_epochs: Mapping[Feature, int],
-        temperatures: Mapping[str, float],
+        self, classifiers: Mapping[Feature, MLP], best_epochs: Mapping[Feature, int], temperatures: Mapping[str, float]
     ) -> TrainedRun:
         """Return the run: classifiers, the embedding if there are distractors, calibrated confidence and record."""
         settings = self.settings

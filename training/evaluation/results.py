@@ -1,5 +1,6 @@
 """Computation of all values of a report from the answers, as one JSON table."""
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -100,15 +101,14 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     classes = runs[0].classes
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = [instance.truth in classes for instance, _ in labelled]
-    instances = [instance for instance, _ in labelled if instance.truth in classes]
+    known = list(itertools.compress(labelled, is_known))
+    instances = [instance for instance, _ in known]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
     check_known({instance.truth for instance, _ in labelled}, classes)
     seconds = [frame.seconds for frame in frames]
     # One table of OCID is by sequence, which is the directory of the frame.
     attributes = [
-        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
-        for instance, frame in labelled
-        if instance.truth in classes
+        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})} for _, frame in known
     ]
     placement = np.concatenate(scores.find_placements(frames))[is_known]
     truth = np.array([classes.index(i.truth) for i in instances], np.intp)

@@ -116,10 +116,7 @@ class WithLabelledViews:
     """
 
     def __init__(
-        self,
-        instances: LabelledInstances,
-        config: DescriptorConfig,
-        rendered: ViewSource | None = None,
+        self, instances: LabelledInstances, config: DescriptorConfig, rendered: ViewSource | None = None
     ) -> None:
         """Store the instances; nothing is computed yet.
 

@@ -128,14 +128,10 @@ class ViewTask:
     seed: int = 0
 
 
-def _seed_of(name: str) -> int:
-    """Return a seed that depends on the object's name only."""
-    return int.from_bytes(hashlib.sha256(name.encode(errors="surrogatepass")).digest()[:8], "little")
-
-
 def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
     """Yield the number of the view, the number of the copy and the image of each view, ordered by view and copy."""
-    caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
+    caster, centre = RayCaster([task.mesh]), task.mesh.centre
+    name = int.from_bytes(hashlib.sha256(task.name.encode(errors="surrogatepass")).digest()[:8], "little")
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
         yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
         if task.augmentations:
@@ -226,12 +222,13 @@ class RenderJob:
         """Check the job and return it in JSON types.
 
         Raises:
-            InputError: there are no meshes, a mesh is unreadable or never visible, or a step or the seed is invalid.
+            InputError: there are no meshes, a mesh is unreadable, too large or never visible, or a step or the seed is
+                invalid.
         """
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be at least 0")
         augmentations, camera = self.augmentations, TRAINING_CAMERA
-        checked = _checked_meshes(self.meshes, self.angles)
+        checked = (_checked_size(*each) for each in _checked_meshes(self.meshes, self.angles))
         # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
         intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
         return {
@@ -256,6 +253,17 @@ class RenderJob:
             for _, views in group:
                 of_views = angles[views.start : views.stop]
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
+
+
+def _checked_size(name: str, mesh: TexturedMesh) -> tuple[str, TexturedMesh]:
+    """Return an object; raise InputError if its views may be too large to be stored."""
+    diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if SIGMA_S * diameter > MAX_VIEW_LENGTH:
+        raise InputError(
+            f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
+            "stored; scale the mesh to metres"
+        )
+    return name, mesh
 
 
 def render_views(
