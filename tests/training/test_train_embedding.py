@@ -84,7 +84,7 @@ def test_a_run_without_classifiers(whole: Whole, cache: Path) -> None:
     assert [epoch for *_, epoch, _ in logged] == [1, 2, 3] and 0 <= record["held_out_accuracy"]["embedding"] <= 1
     recognizer = Recognizer.load(out)
     assert recognizer.model.chosen_classifiers() == ("embedding",) and recognizer.model.answers_by() == "classifiers"
-    assert len(list(cache.glob("distractors-*.safetensors"))) == 1
+    assert len(list(cache.glob("distractors-*"))) == 1
 
 
 def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:

@@ -8,8 +8,9 @@ embedding is used for new objects, while a classifier is fitted on its own objec
 Distractors are procedural objects, or meshes of other objects. An embedding is fitted on them, too, so that it rejects
 unknown objects. A tenth of them is held out, to calibrate the confidence on unknown objects that no network has seen.
 
-Their samples are stored in the user's cache, since all runs use the same samples and rendering takes minutes. A file
-holds the samples for one record of everything that determines them, and its name contains the digest of the record.
+Their samples are stored in the user's cache, since all runs use the same samples and rendering takes minutes. A
+directory holds the samples for one record of everything that determines them, and its name contains the digest of the
+record.
 """
 
 import contextlib
@@ -31,14 +32,14 @@ from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, json_digest
+from thor2_jax.files import content_digest, json_digest, remove_written
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.fitting.samples import OF_EMBEDDING, Samples, sample_normalized
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
-from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, processor, save_arrays
+from training.storage.jobs import cache_directory, load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool, local_workers
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import padded_batches
@@ -54,6 +55,9 @@ __all__ = [
 ]
 
 OBJECTS_PER_TASK = 32
+
+SAMPLES = r"[0-9]{6}\.safetensors"
+"""Names of the files with the samples of a task."""
 
 SEED = 0
 """Seed of the views of objects and of their orientations: all runs share the distractors in the user's cache."""
@@ -244,13 +248,13 @@ def distractor_samples(
     config: DescriptorConfig,
     progress: Callable[[int, int], object],
 ) -> Samples:
-    """Return the samples of all distractors; render them unless they are in the user's cache or in `directory`.
+    """Return the samples of all distractors; render those that are not in the user's cache.
 
     A warning is logged if the cache cannot be used.
 
     Args:
         distractors: the distractors; labels are indices into `sources`.
-        directory: directory of the training for finished samples, so that an interrupted training resumes.
+        directory: directory of the training, which takes the place of a cache that is disabled or cannot be used.
         network: colour network.
         config: descriptor. Static.
         progress: called with (distractors done, number of distractors).
@@ -259,19 +263,37 @@ def distractor_samples(
         InputError: a mesh is unreadable or visible in none of its views.
         OSError: the directory cannot be written.
     """
-    sources = distractors.sources
-    arguments = sources, network, config, distractors.views
+    arguments = distractors.sources, network, config, distractors.views
+    sample = functools.partial(sample_objects, *arguments, local_workers(distractors.workers), progress)
     name = f"distractors-{json_digest(samples_record(*arguments))}"
     cache = cache_directory("distractors")
-    file = None if cache is None else cache / f"{name}.safetensors"
-    samples = None if file is None else _read_stored(file)
-    if samples is None:
-        pool = local_workers(distractors.workers)
-        samples = sample_objects(*arguments, pool, progress, directory=directory / name)
-        if file is not None:
-            _store(samples, file)
-    progress(len(sources), len(sources))
-    return samples
+    if cache is not None:
+        try:
+            samples = sample(directory=cache / name)
+            _keep_newest(cache, name)
+            return samples
+        except ChildProcessError:
+            raise
+        except OSError as error:
+            log.warning("the distractors cannot be stored for the next training: %s", error)
+    return sample(directory=directory / name)
+
+
+MAX_STORED = 3
+"""Number of directories of samples that are kept in the cache: those used most recently."""
+
+NAME = re.compile(r"distractors-[0-9a-f]{64}")
+
+log = logging.getLogger(__name__)
+
+
+def _keep_newest(cache: Path, used: str) -> None:
+    """Remove the samples in a cache that have not been used for the longest time."""
+    with contextlib.suppress(OSError):  # the cache may be read-only
+        os.utime(cache / used)
+        stored = [path for path in cache.iterdir() if NAME.fullmatch(path.name)]
+        for path in sorted(stored, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_STORED:]:
+            remove_written(path, SAMPLES)
 
 
 def with_fitted_distractors(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
@@ -291,50 +313,3 @@ def held_out_clouds(distractors: Distractors, first: int) -> list[tuple[int, Clo
     """
     objects = dict(list(enumerate(distractors.sources))[::ONE_HELD_OUT_OF])
     return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views)]
-
-
-MAX_FILES = 3
-"""Number of files that are kept: those used most recently."""
-
-FORMAT = "thor2 samples of distractors"
-NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
-
-log = logging.getLogger(__name__)
-
-
-def _read_stored(file: Path) -> Samples | None:
-    """Return the samples of a file in the cache; None if it does not exist or, with a warning, cannot be used."""
-    try:
-        if not file.is_file():
-            return None
-        samples = Samples(**load_arrays(file))
-    except (OSError, ValueError, TypeError) as error:
-        log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
-        return None
-    with contextlib.suppress(OSError):  # the cache may be read-only
-        os.utime(file)
-    return samples
-
-
-def _store(samples: Samples, file: Path) -> None:
-    """Store samples, unless a file of the user has this name or another process is writing."""
-    try:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Another process that is writing usually writes the same file.
-        with contextlib.suppress(InputError), locked(file.parent):
-            if file.exists() and not _is_own(file):
-                return
-            save_arrays(file, samples.arrays(), {"format": FORMAT})
-            own = [path for path in file.parent.iterdir() if _is_own(path)]
-            for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        log.warning("the distractors cannot be stored for the next training: %s", error)
-
-
-def _is_own(path: Path) -> bool:
-    """Return whether a file holds samples of distractors (of any version) and may be replaced or removed."""
-    try:
-        return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
-    except (ValueError, KeyError, AttributeError):
-        return False

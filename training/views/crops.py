@@ -170,14 +170,9 @@ class ViewCrops:
     def __len__(self) -> int:
         return len(self.color)
 
-    @property
-    def size(self) -> int:
-        """Side of a crop, pixels."""
-        return int(self.color.shape[1])
-
     def reduced(self, size: int) -> "ViewCrops":
         """Return the crops area-filtered to sides of `size` pixels; the same record if they already have this size."""
-        if size == self.size:
+        if size == self.color.shape[1]:
             return self
 
         def smaller(images: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
