@@ -23,12 +23,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+import safetensors
 from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.run_record import run_directories
-from training.storage.jobs import Progress, load_arrays, load_metadata, save_arrays
+from training.storage.jobs import Progress, load_arrays, save_arrays
 
 __all__ = [
     "BEGUN",
@@ -162,8 +163,8 @@ class Checkpoints:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._scores: dict[int, float] = {}
         for path in self.directory.glob("[0-9]*.safetensors"):
-            with self._readable(path):
-                self._scores[int(path.stem)] = float(load_metadata(path)["score"])
+            with self._readable(path), safetensors.safe_open(path, "numpy") as file:
+                self._scores[int(path.stem)] = float(file.metadata()["score"])
 
     @property
     def last_epoch(self) -> int:
@@ -218,7 +219,7 @@ class Checkpoints:
         """Raise InputError if reading a checkpoint in the block fails."""
         try:
             yield
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
             raise InputError(
                 f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
             ) from None
