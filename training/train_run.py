@@ -47,7 +47,7 @@ from training.fitting.loop import (
     wait_for_all,
 )
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
-from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
+from training.protocol import Protocol, Stage
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource, fold_of_views
@@ -135,7 +135,8 @@ def train_run(
         samples: Samples | None = None
         if settings.classifiers:
             check_classes(source)
-            form, show = Form(settings.mirrors, settings.orientation_copies), of_stage(progress, DESCRIBE, "views")
+            form = Form(settings.mirrors, settings.orientation_copies)
+            show = of_stage(progress, Stage.DESCRIBE, "views")
             samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
             label, view = samples.label, samples.view
         else:  # only the distribution of the views among the folds is needed here
@@ -230,9 +231,9 @@ class _Fold(NamedTuple):
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
             run = dataclasses.replace(run, embedding=embedding)
-            self.report(CALIBRATE, 0, 1)
+            self.report(Stage.CALIBRATE, 0, 1)
             calibration, accuracy[EMBEDDING] = fit_calibration(run, held_out)
-            self.report(CALIBRATE, 1, 1)
+            self.report(Stage.CALIBRATE, 1, 1)
             confidence = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
         rows = read_metrics(self.out / METRICS)
         names = dict.fromkeys(row["classifier"] for row in rows)
@@ -254,10 +255,10 @@ class _Fold(NamedTuple):
         settings, label, held_out, checkpoints = self.settings, self.label, self.held_out, self.checkpoints(EMBEDDING)
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
-        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
+        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, Stage.RENDER_DISTRACTORS)
         others = distractor_samples(distractors, scratch, network, config, shown)
         kept = {index: np.unique(self.view[held_out & (label == index)]) for index in range(len(classes))}
-        shown = of_stage(self.report, DESCRIBE_EMBEDDED)
+        shown = of_stage(self.report, Stage.DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
         unknown = held_out_clouds(distractors, len(classes))
         samples = with_fitted_distractors(samples, others, len(classes))
@@ -269,7 +270,7 @@ class _Fold(NamedTuple):
             distractors.epochs,
             checkpoints,
             RUN_SIZES,
-            fit_progress(self.report, FIT_NETWORKS, distractors.epochs),
+            fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs),
             classes,
             networks=distractors.networks,
             seed=seed,

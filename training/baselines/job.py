@@ -124,28 +124,25 @@ def train_baselines(
                 "give the dataset of that run"
             )
         for name in names:
-            if not baseline_file(directory, name).is_file():
-                _train(FitTask(name, source, run, directory, weights, progress))
+            file = baseline_file(directory, name)
+            if not file.is_file():
+                task, start = FitTask(name, source, run, directory, weights, progress), time.perf_counter()
+                fitted = _METHODS[name][0](task)
+                write_baseline(file, fitted, run.classes, time.perf_counter() - start)
+                # Checkpoints, including those of earlier versions.
+                remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
             elif weights is not None and pretrained_files(name):
-                _check_pretrained(directory, run, name, weights)
+                _check_pretrained(file, run, name, weights)
 
 
-def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path) -> None:
+def _check_pretrained(file: Path, run: TrainedRun, name: str, weights: Path) -> None:
     """Raise InputError if an existing baseline was not trained from these weights files."""
-    file = baseline_file(directory, name)
     paths = [weights_file(weights, each) for each in pretrained_files(name)]
     if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
         raise InputError(
             f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
             "out weights"
         )
-
-
-def _train(task: FitTask) -> None:
-    file, start = baseline_file(task.directory, task.name), time.perf_counter()
-    fitted = _METHODS[task.name][0](task)
-    write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
-    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, including those of earlier versions
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
