@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, dataset_folder, path_ends, sequence_of
+from training.readers.labelled import LabelledFrames, path_ends, sequence_of
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
@@ -57,7 +57,7 @@ class OCID(LabelledFrames):
                 table of OCID-VLG without any of the frames.
             OSError: `names` cannot be opened.
         """
-        path = dataset_folder(path)
+        path = self.dataset_folder(path)
         root = path / "YCB10" if (path / "YCB10").is_dir() else path
         images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):

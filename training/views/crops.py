@@ -17,7 +17,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,8 +205,8 @@ def _encode(crops: ViewCrops) -> bytes:
     return stream.getvalue()
 
 
-def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
-    """Return the manifest in a directory of crops: their size, the digest of their dataset, and file name -> SHA-256.
+def _read_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the job of a directory of crops (their size, and the digest of their dataset) and file name -> SHA-256.
 
     Raises:
         InputError: the manifest is missing, damaged or of another format.
@@ -216,7 +216,7 @@ def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
         content = json.loads(path.read_bytes())
         if content["format"] != CROPS_FORMAT:
             raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
-        return int(content["size"]), str(content["dataset"]), dict(content["files"])
+        return {"crops": int(content["size"]), "dataset": str(content["dataset"])}, dict(content["files"])
     except OSError:
         raise InputError(
             f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
@@ -249,9 +249,8 @@ def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
-    stored_size, digest, files = _read_manifest(directory)
-    requested = {"crops": size, "dataset": dataset.digest}
-    check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
+    stored, files = _read_manifest(directory)
+    check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
     return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
 
 
@@ -297,13 +296,13 @@ def render_crops(
 def read_crops(dataset: "ViewDataset", index: int, size: int) -> ViewCrops:
     """Read the crops of a shard; arguments and exceptions as `ViewDataset.read_crops`."""
     directory, name = dataset.directory / CROPS, _crop_file(dataset.shards[index].file)
-    stored, digest, files = _read_manifest(directory)
-    if digest != dataset.digest:
+    stored, files = _read_manifest(directory)
+    if stored["dataset"] != dataset.digest:
         raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
-    if stored < size:
+    if stored["crops"] < size:
         raise InputError(
-            f"dataset: {directory} has crops of {stored} pixels; expected at least {size}; delete it and render "
-            f"with --crops {size}"
+            f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
+            f"render with --crops {size}"
         )
     content = intact_content(directory, name, files.get(name, ""))
     if content is None:
