@@ -11,7 +11,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.image_baselines import check_backbone, check_weights, crop_size, pretrained_files
+from training.baselines.architectures import check_weights, crop_size, pretrained_files
+from training.baselines.image_baselines import check_backbone
 from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
@@ -23,7 +24,6 @@ from training.train_run import VIEWS, check_out, check_trained, finished_record,
 from training.views.crops import render_crops
 from training.views.dataset import ViewDataset, remove_views, render_dataset
 from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
-from training.views.mesh_views import RenderJob
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
@@ -150,15 +150,6 @@ def _check_batch_size(protocol: Protocol, n_views: int) -> None:
         )
 
 
-def _check_folds(job: TrainJob, rendering: RenderJob, labelled: LabelledInstances | None) -> None:
-    """Raise InputError if a class has fewer views than folds even if all of its views can be used."""
-    folds, n_rendered = job.protocol.folds, len(rendering.angles)
-    for name in rendering.meshes:
-        n_views = n_rendered + (len(labelled.views.get(name, ())) if labelled else 0)
-        if n_views < folds and name not in job.leave_out:
-            raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
-
-
 def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
     """Raise InputError if a finished run is of another job; without baselines, remove leftovers of a killed process.
 
@@ -248,10 +239,15 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
-        _check_folds(job, rendering, labelled)
-        n_instances = sum(map(len, labelled.views.values())) if labelled else 0
-        n_views = len(rendering.meshes) * len(rendering.angles) * rendering.copies + n_instances * (1 + MAX_COPIES)
-        _check_batch_size(job.protocol, n_views)  # later again, since some views may have too few points
+        # Folds and batches are checked later again, since some views may have too few points.
+        folds, n_rendered = job.protocol.folds, len(rendering.angles)
+        labelled_views = {name: len(views) for name, views in labelled.views.items()} if labelled else {}
+        for name in meshes:
+            n_views = n_rendered + labelled_views.get(name, 0)
+            if n_views < folds and name not in job.leave_out:
+                raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
+        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
+        _check_batch_size(job.protocol, n_clouds)
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

@@ -3,7 +3,7 @@
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
-RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold
+RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold, while the training runs
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only
@@ -14,6 +14,7 @@ An interrupted training resumes at the next call. run.json is written last: with
 import contextlib
 import dataclasses
 import functools
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,13 +26,13 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_written
+from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
 from thor2_jax.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
-from training.embedding.distractors import Distractors, distractor_samples, held_out_clouds, with_fitted_distractors
+from training.embedding.distractors import Distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
@@ -39,11 +40,9 @@ from training.fitting.loop import (
     BEGUN,
     CHECKPOINTS,
     Checkpoints,
-    append_metrics,
-    discard_later_epochs,
+    EpochMetrics,
     find_run_directories,
     fit_progress,
-    read_metrics,
     wait_for_all,
 )
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
@@ -52,7 +51,7 @@ from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource, fold_of_views
 
-__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "read_metrics", "train_run"]
 
 VIEWS = "views"
 JOB = f"{CHECKPOINTS}/{BEGUN}"
@@ -96,6 +95,37 @@ def finished_record(out: Path) -> Mapping[str, Any]:
         InputError: the run cannot be read.
     """
     return load_run(find_run_directories([out])[0]).record
+
+
+def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
+    """Append the metrics of one epoch."""
+    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Return the metrics of all epochs; a missing file has none, and a last line cut off by a crash is ignored.
+
+    Raises:
+        InputError: any other line is damaged.
+    """
+    content = path.read_bytes() if path.exists() else b""
+    try:
+        rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
+        for row in rows:
+            if not (isinstance(row["epoch"], int) and {"fold", "classifier"} <= row.keys()):
+                raise ValueError("a line has no fold, classifier and epoch")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"out: {path} is damaged ({error}); remove it, or choose another directory") from None
+    return rows
+
+
+def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> None:
+    """Remove the lines of a classifier after `epoch`, since its training resumes there and appends them again."""
+    rows = read_metrics(path)
+    kept = [r for r in rows if (r["fold"], r["classifier"]) != (fold, classifier) or r["epoch"] <= epoch]
+    write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def train_run(
@@ -256,12 +286,12 @@ class _Fold(NamedTuple):
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
         scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, Stage.RENDER_DISTRACTORS)
-        others = distractor_samples(distractors, scratch, network, config, shown)
+        others = distractors.samples(scratch, network, config, shown)
         kept = {index: np.unique(self.view[held_out & (label == index)]) for index in range(len(classes))}
         shown = of_stage(self.report, Stage.DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
-        unknown = held_out_clouds(distractors, len(classes))
-        samples = with_fitted_distractors(samples, others, len(classes))
+        unknown = distractors.held_out_clouds(len(classes))
+        samples = distractors.add_fitted(samples, others, len(classes))
         del others  # needs as much memory as the samples
         embedding = fit_embedding(
             samples,

@@ -22,9 +22,9 @@ from training import train_run as module
 from training.embedding import distractors, fit
 from training.embedding.distractors import Distractors, render_clouds
 from training.fitting.calibration import fit_calibration
-from training.fitting.loop import Checkpoints, FitOptions, read_metrics
+from training.fitting.loop import Checkpoints, FitOptions
 from training.protocol import Protocol
-from training.train_run import check_trained, train_run
+from training.train_run import check_trained, read_metrics, train_run
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)

@@ -8,7 +8,7 @@ The files have the tensor names of timm: `layer1.0.conv1.weight` is the kernel o
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,16 @@ from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY_4, RGBDViT, ViT
 
-__all__ = ["ARCHITECTURES", "TEMPLATES", "load_weights", "network_inputs", "weights_file"]
+__all__ = [
+    "ARCHITECTURES",
+    "TEMPLATES",
+    "check_weights",
+    "crop_size",
+    "load_weights",
+    "network_inputs",
+    "pretrained_files",
+    "weights_file",
+]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 """Last part of an NNX path -> last part of the tensor's name."""
@@ -210,3 +219,30 @@ def network_inputs(color: Any, normals: Any) -> tuple[jax.Array, jax.Array]:
     images = color.astype(jnp.float32) / 255, (normals.astype(jnp.float32) / 127 + 1) / 2
     first, second = (jnp.where(mask, (image - MEAN) / DEVIATION, 0) for image in images)
     return first, second
+
+
+def pretrained_files(name: str) -> list[str]:
+    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
+    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def crop_size(names: Sequence[str], weights: bool) -> int | None:
+    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
+
+    Args:
+        names: names of the baselines.
+        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
+    """
+    readers = (name if weights or name != TEMPLATES else "rgbd-vit-small" for name in names)
+    return max((ARCHITECTURES[name].size for name in readers if name in ARCHITECTURES), default=None)
+
+
+def check_weights(directory: Path, name: str) -> None:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    if name in ARCHITECTURES:
+        architecture = ARCHITECTURES[name]
+        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

@@ -33,16 +33,7 @@ from training.baselines.baseline import (
 )
 from training.views.crops import ViewCrops
 
-__all__ = [
-    "check_backbone",
-    "check_weights",
-    "crop_size",
-    "fit_image_network",
-    "fit_templates",
-    "load_image_network",
-    "load_templates",
-    "pretrained_files",
-]
+__all__ = ["check_backbone", "fit_image_network", "fit_templates", "load_image_network", "load_templates"]
 
 INFERENCE_BATCH = 8
 """Number of crops that a network reads at a time, about the instances of a frame, so that one program is compiled."""
@@ -234,22 +225,6 @@ def fit_templates(task: FitTask) -> StoredBaseline:
     return StoredBaseline(arrays, temperature, weights)
 
 
-def pretrained_files(name: str) -> list[str]:
-    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
-    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
-
-
-def crop_size(names: Sequence[str], weights: bool) -> int | None:
-    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
-
-    Args:
-        names: names of the baselines.
-        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
-    """
-    readers = (name if weights or name != TEMPLATES else "rgbd-vit-small" for name in names)
-    return max((ARCHITECTURES[name].size for name in readers if name in ARCHITECTURES), default=None)
-
-
 def check_backbone(names: Sequence[str], out: Path) -> None:
     """Raise InputError if templates without pretrained weights have no backbone in `names` or in the runs in `out`.
 
@@ -258,14 +233,3 @@ def check_backbone(names: Sequence[str], out: Path) -> None:
     files = [baseline_file(Path(), name) for name in BACKBONES]
     if TEMPLATES in names and not set(TRAINED) & set(names) and not any(any(out.rglob(str(file))) for file in files):
         raise InputError(NO_BACKBONE)
-
-
-def check_weights(directory: Path, name: str) -> None:
-    """Read the files of a baseline's pretrained weights, without keeping them.
-
-    Raises:
-        InputError: a file is missing, damaged or of another architecture.
-    """
-    if name in ARCHITECTURES:
-        architecture = ARCHITECTURES[name]
-        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

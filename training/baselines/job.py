@@ -9,38 +9,21 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.architectures import ARCHITECTURES, TEMPLATES, weights_file
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, pretrained_files, weights_file
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
-from training.baselines.image_baselines import (
-    fit_image_network,
-    fit_templates,
-    load_image_network,
-    load_templates,
-    pretrained_files,
-)
+from training.baselines.image_baselines import fit_image_network, fit_templates, load_image_network, load_templates
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = [
-    "CLOUD_BASELINES",
-    "NETWORKS",
-    "TITLES",
-    "TrainedBaseline",
-    "check_baselines",
-    "load_baselines",
-    "train_baselines",
-]
+__all__ = ["CLOUD_BASELINES", "TITLES", "TrainedBaseline", "check_baselines", "load_baselines", "train_baselines"]
 
 CLOUD_BASELINES = ("thor", "forest", "pointnet")
 """Baselines on point clouds."""
 
-NETWORKS = tuple(name for name in ARCHITECTURES if name != TEMPLATES)
-"""Image networks on crops of colour and surface normals."""
-
-BASELINES = (*CLOUD_BASELINES, *NETWORKS, TEMPLATES)
+BASELINES = (*CLOUD_BASELINES, *ARCHITECTURES)
 """Names on the command line and in run directories, in the order of training."""
 
 TITLES = {
@@ -63,7 +46,7 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
     "thor": (fit_thor, load_thor),
     "forest": (fit_forest, load_forest),
     "pointnet": (fit_pointnet, load_pointnet),
-    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in NETWORKS},
+    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in ARCHITECTURES},
     TEMPLATES: (fit_templates, load_templates),
 }
 """Name -> function that fits a baseline, and function that builds it from its arrays and run. The second one raises

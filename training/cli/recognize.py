@@ -149,8 +149,7 @@ def recognize(
                     result_files.write_recognitions(directory, answer.frame, answer.recognitions)
                 place = answer.recorded
                 if detection_bag is not None and place is not None:
-                    frame_id = place.frame_id
-                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=frame_id)
+                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
                 if rerun_file is not None:
                     stamp = None if place is None else place.stamp
                     rerun_file.write(answer.frame, answer.detections, name=answer.name, stamp=stamp)

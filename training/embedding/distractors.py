@@ -44,15 +44,7 @@ from training.storage.workers import IN_PROCESS, WorkerPool, local_workers
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import padded_batches
 
-__all__ = [
-    "AUGMENTATIONS",
-    "Distractors",
-    "distractor_samples",
-    "held_out_clouds",
-    "sample_objects",
-    "samples_record",
-    "with_fitted_distractors",
-]
+__all__ = ["AUGMENTATIONS", "Distractors", "sample_objects", "samples_record"]
 
 OBJECTS_PER_TASK = 32
 
@@ -240,43 +232,58 @@ class Distractors:
         named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
         return named | {"meshes": sorted(self.meshes)}
 
+    def samples(
+        self, directory: Path, network: ColorNetwork, config: DescriptorConfig, progress: Callable[[int, int], object]
+    ) -> Samples:
+        """Return the samples of all distractors; render those that are not in the user's cache.
 
-def distractor_samples(
-    distractors: Distractors,
-    directory: Path,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    progress: Callable[[int, int], object],
-) -> Samples:
-    """Return the samples of all distractors; render those that are not in the user's cache.
+        A warning is logged if the cache cannot be used.
 
-    A warning is logged if the cache cannot be used.
+        Args:
+            directory: directory of the training, which takes the place of a cache that is disabled or cannot be used.
+            network: colour network.
+            config: descriptor. Static.
+            progress: called with (distractors done, number of distractors).
 
-    Args:
-        distractors: the distractors; labels are indices into `sources`.
-        directory: directory of the training, which takes the place of a cache that is disabled or cannot be used.
-        network: colour network.
-        config: descriptor. Static.
-        progress: called with (distractors done, number of distractors).
+        Returns:
+            The samples; labels are indices into `sources`.
 
-    Raises:
-        InputError: a mesh is unreadable or visible in none of its views.
-        OSError: the directory cannot be written.
-    """
-    arguments = distractors.sources, network, config, distractors.views
-    sample = functools.partial(sample_objects, *arguments, local_workers(distractors.workers), progress)
-    name = f"distractors-{json_digest(samples_record(*arguments))}"
-    cache = cache_directory("distractors")
-    if cache is not None:
-        try:
-            samples = sample(directory=cache / name)
-            _keep_newest(cache, name)
-            return samples
-        except ChildProcessError:
-            raise
-        except OSError as error:
-            log.warning("the distractors cannot be stored for the next training: %s", error)
-    return sample(directory=directory / name)
+        Raises:
+            InputError: a mesh is unreadable or visible in none of its views.
+            OSError: the directory cannot be written.
+        """
+        arguments = self.sources, network, config, self.views
+        sample = functools.partial(sample_objects, *arguments, local_workers(self.workers), progress)
+        name = f"distractors-{json_digest(samples_record(*arguments))}"
+        cache = cache_directory("distractors")
+        if cache is not None:
+            try:
+                samples = sample(directory=cache / name)
+                _keep_newest(cache, name)
+                return samples
+            except ChildProcessError:
+                raise
+            except OSError as error:
+                log.warning("the distractors cannot be stored for the next training: %s", error)
+        return sample(directory=directory / name)
+
+    def held_out_clouds(self, first: int) -> list[tuple[int, Cloud]]:
+        """Return the label (from `first` on) and the cloud (in metres) of each view of the held-out distractors.
+
+        The views are rendered again, since samples are strips in random orientations, and the looks need the points.
+        """
+        objects = dict(list(enumerate(self.sources))[::ONE_HELD_OUT_OF])
+        return [(first + index, cloud) for index, cloud in render_clouds(objects, self.views)]
+
+    @staticmethod
+    def add_fitted(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
+        """Return the samples of the classes, followed by the samples of the distractors that are not held out.
+
+        The labels of the distractors follow the labels of the classes without gaps.
+        """
+        fitted = distractors.select(np.flatnonzero(distractors.label % ONE_HELD_OUT_OF))
+        label = n_classes + fitted.label - fitted.label // ONE_HELD_OUT_OF - 1
+        return Samples.concatenated([samples, dataclasses.replace(fitted, label=label.astype(np.int32))])
 
 
 MAX_STORED = 3
@@ -294,22 +301,3 @@ def _keep_newest(cache: Path, used: str) -> None:
         stored = [path for path in cache.iterdir() if NAME.fullmatch(path.name)]
         for path in sorted(stored, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_STORED:]:
             remove_written(path, SAMPLES)
-
-
-def with_fitted_distractors(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
-    """Return the samples of the classes, followed by the samples of the distractors that are not held out.
-
-    The labels of the distractors follow the labels of the classes without gaps.
-    """
-    fitted = distractors.select(np.flatnonzero(distractors.label % ONE_HELD_OUT_OF))
-    label = n_classes + fitted.label - fitted.label // ONE_HELD_OUT_OF - 1
-    return Samples.concatenated([samples, dataclasses.replace(fitted, label=label.astype(np.int32))])
-
-
-def held_out_clouds(distractors: Distractors, first: int) -> list[tuple[int, Cloud]]:
-    """Return the label (from `first` on) and the cloud (in metres) of each view of the held-out distractors.
-
-    The views are rendered again, since samples are strips in random orientations, and the looks need the points.
-    """
-    objects = dict(list(enumerate(distractors.sources))[::ONE_HELD_OUT_OF])
-    return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views)]

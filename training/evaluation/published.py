@@ -22,8 +22,7 @@ _LIGHTS = {"1": "bright", "2": "dim"}
 
 @functools.cache
 def _read() -> dict[str, Any]:
-    text = resources.files("training.evaluation").joinpath("published.json").read_text(encoding="utf-8")
-    return dict(json.loads(text))
+    return dict(json.loads(resources.files("training.evaluation").joinpath("published.json").read_bytes()))
 
 
 def published_tables(kind: str) -> list[dict[str, Any]]:

@@ -23,9 +23,9 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks import EMBEDDING
 from thor2_jax.recognizer import DescribedFrame, Recognizer
-from training.baselines.architectures import TEMPLATES
+from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
-from training.baselines.job import NETWORKS, TITLES, TrainedBaseline, load_baselines
+from training.baselines.job import TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
@@ -256,7 +256,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
     """Return the titles of image networks without pretrained weights, including templates with such a backbone."""
     names = {name for run in runs for name, baseline in run.baselines.items() if not baseline.weights}
-    return [TITLES[name] for name in (*NETWORKS, TEMPLATES) if name in names]
+    return [TITLES[name] for name in ARCHITECTURES if name in names]
 
 
 def _load(directory: Path) -> Run:

@@ -15,7 +15,7 @@ import colornet
 import thor2_jax as thor2
 import training
 from training.embedding import distractors as module
-from training.embedding.distractors import Distractors, distractor_samples, samples_record
+from training.embedding.distractors import Distractors, samples_record
 from training.fitting.samples import Samples
 
 NETWORK = colornet.load_default()
@@ -52,7 +52,7 @@ def counted(tmp_path: Path) -> Callable[..., int]:
             mock.patch.object(module, "render_clouds", lambda objects, views: [(index, cloud) for index in objects]),
             mock.patch.object(module, "sample_normalized", return_value=SAMPLES) as build,
         ):
-            samples = distractor_samples(distractors, tmp_path / "new", NETWORK, SMALL_CONFIG, lambda *values: None)
+            samples = distractors.samples(tmp_path / "new", NETWORK, SMALL_CONFIG, lambda *values: None)
         np.testing.assert_equal(vars(samples), vars(SAMPLES))
         assert (samples.length.dtype, samples.strip.dtype) == (np.float16, np.uint32)
         return build.call_count
@@ -114,7 +114,7 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     def key(config: thor2.DescriptorConfig = SMALL_CONFIG, box: float | None = None, **options: int) -> str:
         meshes = {} if box is None else {"box": write_box(tmp_path / "box.ply", (box, 0.1, 0.1))}
         distractors = Distractors(**{"procedural": 10, **options}, meshes=meshes)
-        distractor_samples(distractors, tmp_path / "new", NETWORK, config, lambda *values: None)
+        distractors.samples(tmp_path / "new", NETWORK, config, lambda *values: None)
         return str(sample.call_args.kwargs["directory"])
 
     same, box = key(), key(box=0.1)
