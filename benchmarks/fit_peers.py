@@ -58,7 +58,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     import colornet
     from thor2_jax import DescriptorConfig
     from thor2_jax.networks import HIDDEN, MLP
-    from training.fitting.fit import FitContext, initial_state, shard_batch, train_step
+    from training.fitting.fit import FitContext, FitState, shard_batch, train_step
     from training.fitting.samples import describe_batch, sample_views
     from training.objects.builtin_objects import builtin_objects
     from training.views.mesh_views import render_views
@@ -75,7 +75,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     for name, array in {"x": x, "y": samples.label[: len(rows)].astype(np.int64), "hidden": np.array(HIDDEN)}.items():
         np.save(folder / f"{name}.npy", array)
     model = MLP(x.shape[1], len(source.classes), rngs=nnx.Rngs(0))
-    graph, state = initial_state(model, optax.adam(0.0))
+    graph, state = FitState.initial(model, optax.adam(0.0))
     rng = np.random.default_rng(0)
 
     def epoch() -> None:

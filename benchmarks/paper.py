@@ -28,8 +28,8 @@ from benchmarks.paper_measurement import Dataset, compare_runs, recognition_seco
 from benchmarks.paper_report import draw_claims, report_text
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, write_text
+from training.baselines.architectures import check_weights, crop_size, pretrained_files
 from training.baselines.baseline import baseline_file
-from training.baselines.image_baselines import check_weights, crop_size, pretrained_files
 from training.baselines.job import check_baselines
 from training.evaluation.runs import load_runs
 from training.fitting.loop import find_run_directories

@@ -21,8 +21,9 @@ from thor2_jax.files import json_digest
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.recognizer import DescribedFrame
+from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import Predictor, baseline_inputs
-from training.baselines.job import CLOUD_BASELINES, NETWORKS, TITLES
+from training.baselines.job import CLOUD_BASELINES, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
 from training.evaluation.results import compute_results, fuse_answers
@@ -49,7 +50,7 @@ CLAIMS = (
     Claim("THOR2 above THOR", "THOR"),
     Claim("colour helps: THOR2 above TOPS", "TOPS"),
     Claim("THOR2 above CE + TOPS + TOPS2", "CE+TOPS+TOPS2"),
-    *(Claim(f"THOR2 above {TITLES[name]}", TITLES[name]) for name in (*NETWORKS, "templates", "forest", "pointnet")),
+    *(Claim(f"THOR2 above {TITLES[name]}", TITLES[name]) for name in (*ARCHITECTURES, "forest", "pointnet")),
 )
 """Claims of the paper, and comparisons with baselines that are not in the paper: templates, forest, PointNet."""
 

@@ -46,7 +46,6 @@ __all__ = [
     "read_table",
     "remove_leftovers",
     "remove_written",
-    "safetensors_metadata",
     "temporary_directory",
     "unpack_arrays",
     "write_text",
@@ -236,19 +235,11 @@ def unpack_arrays(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, st
     import safetensors.numpy
 
     try:
-        return safetensors.numpy.load(content), safetensors_metadata(content)
+        arrays = safetensors.numpy.load(content)
     except safetensors.SafetensorError as error:
         raise ValueError(str(error)) from None
-
-
-def safetensors_metadata(content: bytes) -> dict[str, str]:
-    """Return the metadata of a safetensors file from its content, or from its first part with the whole header.
-
-    Raises:
-        ValueError: the header is damaged.
-    """
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-    return dict(header.get("__metadata__", {}))
+    return arrays, dict(header.get("__metadata__", {}))
 
 
 def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:

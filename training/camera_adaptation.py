@@ -19,7 +19,7 @@ from training.readers.frames import FrameSource
 
 __all__ = ["adapt_run"]
 
-UNFINISHED = ("checkpoints", "views", ".*")
+UNFINISHED = shutil.ignore_patterns("checkpoints", "views", ".*")
 """Names in a run directory that are not copied."""
 
 
@@ -49,9 +49,8 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
 
     adaptation = recognizer.adapt(frames(), report)
     with atomic_directory(out) as run:
-        ignored = shutil.ignore_patterns(*UNFINISHED)
         try:
-            shutil.copytree(model, run, ignore=ignored, copy_function=_copy, dirs_exist_ok=True)
+            shutil.copytree(model, run, ignore=UNFINISHED, copy_function=_copy, dirs_exist_ok=True)
         except shutil.Error as error:
             raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
         finally:

@@ -5,6 +5,7 @@ summary.accuracy["all"]            # accuracy of CE, TOPS, TOPS2 and THOR2, in t
 """
 
 import dataclasses
+import itertools
 import json
 import resource
 import time
@@ -138,11 +139,10 @@ def run_demo(
 
 def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Progress) -> list[Scene]:
     # Each scene has its own random stream, so that a change to one scene does not affect the later ones.
-    seeds = np.random.SeedSequence(seed).spawn(N_SCENES)
+    seeds = zip(np.random.SeedSequence(seed).spawn(N_SCENES), itertools.cycle(CHOOSE), strict=False)
     scenes = []
-    for number, scene_seed in enumerate(seeds, 1):
+    for number, (scene_seed, camera) in enumerate(seeds, 1):
         scene = compose_scene(objects, np.random.default_rng(scene_seed))
-        camera = CHOOSE[(number - 1) % len(CHOOSE)]
         scenes.append(dataclasses.replace(scene, frame=through_camera(scene.frame, camera)))
         progress(COMPOSE, number, N_SCENES, "")
     return scenes

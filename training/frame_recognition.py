@@ -22,14 +22,7 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
-__all__ = [
-    "FrameAnswer",
-    "RecognizerArguments",
-    "read_source",
-    "recognize_frames",
-    "segmentation_failure",
-    "track_frames",
-]
+__all__ = ["RecognizerArguments", "recognize_frames", "segmentation_failure", "track_frames"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,17 +57,8 @@ class FrameAnswer:
             line["depth_gap"] = self.recorded.gap / 1e9
         if self.error is not None:
             return {**line, "error": self.error}
-        if self.recorded is not None:
-            return {**line, "instances": detections_as_json(self.detections)}
-        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
-
-
-def read_source(source: FrameSource | RecordedFrame) -> RGBDFrame:
-    """Read a frame; raise InputError if it is invalid or a file cannot be opened."""
-    try:
-        return source.read()
-    except OSError as error:
-        raise InputError(reason_of(error)) from None
+        answers = [dataclasses.asdict(answer) for answer in self.recognitions]
+        return {**line, "instances": detections_as_json(self.detections) if self.recorded else answers}
 
 
 def recognize_frames(
@@ -89,11 +73,11 @@ def recognize_frames(
     for source in sources:
         recorded = source if isinstance(source, RecordedFrame) else None
         try:
-            frame = read_source(source)
+            frame = source.read()
             start = time.perf_counter()
             recognitions = recognize(frame)
-        except InputError as error:
-            yield FrameAnswer(source.name, error=str(error), recorded=recorded)
+        except (InputError, OSError) as error:
+            yield FrameAnswer(source.name, error=reason_of(error), recorded=recorded)
         else:
             yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start, recorded=recorded)
 
@@ -151,29 +135,26 @@ def track_frames(
             the frame.
     """
     tracker = recognizer.track()
-    answered: list[tuple[list[TrackedRecognition], float, str | None]] = []
+    answered: list[tuple[FrameAnswer, list[TrackedRecognition]]] = []
     last: dict[int | None, TrackedRecognition] = {}
     for number, source in enumerate(sources):
         try:
-            frame = read_source(source)
+            frame = source.read()
             _ = frame.instance_pixels  # raises InputError without labels
-        except InputError as error:
-            answered.append(([], 0.0, str(error)))
+        except (InputError, OSError) as error:
+            answered.append((FrameAnswer(source.name, error=reason_of(error)), []))
             continue
         start = time.perf_counter()
         with with_context(source.name):
             recognitions = tracker.update(frame, None if poses is None else poses[number])
-        answered.append((recognitions, time.perf_counter() - start, None))
+        answered.append((FrameAnswer(source.name, seconds=time.perf_counter() - start), recognitions))
         last.update({each.track: each for each in recognitions})
-    for source, (recognitions, seconds, reason) in zip(sources, answered, strict=True):
-        if reason is not None:
-            yield FrameAnswer(source.name, error=reason)
-            continue
-        final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
-        # The frame is read a second time, since a long sequence of images does not fit into memory.
-        try:
-            frame = read_source(source)
-        except InputError as error:
-            yield FrameAnswer(source.name, error=str(error))
-        else:
-            yield FrameAnswer(source.name, frame, final, seconds)
+    for source, (answer, recognitions) in zip(sources, answered, strict=True):
+        if answer.error is None:
+            final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
+            # The frame is read a second time, since a long sequence of images does not fit into memory.
+            try:
+                answer = dataclasses.replace(answer, frame=source.read(), recognitions=final)
+            except (InputError, OSError) as error:
+                answer = FrameAnswer(source.name, error=reason_of(error))
+        yield answer

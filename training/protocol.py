@@ -1,6 +1,7 @@
 """Training protocols, from camera steps to learning rates: the paper's, a more accurate default and a quick one."""
 
 import dataclasses
+import enum
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,26 +16,18 @@ from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 from training.objects.mesh import TexturedMesh
 from training.views.mesh_views import RenderJob
 
-__all__ = [
-    "CALIBRATE",
-    "DEFAULT",
-    "DESCRIBE",
-    "DESCRIBE_EMBEDDED",
-    "FIT_NETWORKS",
-    "PAPER",
-    "QUICK",
-    "RENDER_DISTRACTORS",
-    "Protocol",
-]
+__all__ = ["DEFAULT", "PAPER", "QUICK", "Protocol", "Stage"]
 
-DESCRIBE = "describe"
-"""Name of the first stage."""
 
-CALIBRATE = "fit the confidence"
-"""Name of the last stage of a training with an embedding."""
+class Stage(enum.StrEnum):
+    """The stages of a training, in their order; the classifiers are fitted after the first one."""
 
-RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS = "render distractors", "describe for the embedding", "fit networks"
-"""Names of the stages of the embedding."""
+    DESCRIBE = "describe"
+    RENDER_DISTRACTORS = "render distractors"
+    DESCRIBE_EMBEDDED = "describe for the embedding"
+    FIT_NETWORKS = "fit networks"
+    CALIBRATE = "fit the confidence"
+
 
 DESCRIBE_SHARE = 0.3
 """Time to describe the views, divided by the time to render them; used to estimate the remaining time."""
@@ -95,14 +88,14 @@ class Protocol:
     @property
     def stages(self) -> dict[str, float]:
         """The stages of the training in order, and the time of each, divided by the time to render the views."""
-        of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.fit.epochs for name in self.classifiers}
+        of_fold: dict[str, float] = {f"fit {name}": EPOCH_SHARES[name] * self.fit.epochs for name in self.classifiers}
         if self.distractors is not None:
             fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
             # Rendering distractors takes no time if they are in the cache.
-            of_fold |= {RENDER_DISTRACTORS: 0.0, DESCRIBE_EMBEDDED: DESCRIBE_SHARE, FIT_NETWORKS: fit_share}
-            of_fold[CALIBRATE] = CALIBRATE_SHARE
+            of_fold |= {Stage.RENDER_DISTRACTORS: 0.0, Stage.DESCRIBE_EMBEDDED: DESCRIBE_SHARE}
+            of_fold |= {Stage.FIT_NETWORKS: fit_share, Stage.CALIBRATE: CALIBRATE_SHARE}
         folds = range(self.folds)
-        described = {DESCRIBE: DESCRIBE_SHARE} if self.classifiers else {}
+        described = {Stage.DESCRIBE: DESCRIBE_SHARE} if self.classifiers else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
 
     def of_fold(self, stage: str, fold: int) -> str:
@@ -182,9 +175,5 @@ DEFAULT = Protocol(
 QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
 """The default with fewer distractors and networks, which takes half of the time."""
 
-PAPER = Protocol(
-    classifiers=FEATURES,
-    fit=FitOptions(epochs=100, batch_size=128),
-    mirrors=PAPER_MIRRORS,
-)
+PAPER = Protocol(classifiers=FEATURES, fit=FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS)
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -11,7 +11,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.image_baselines import check_backbone, check_weights, crop_size, pretrained_files
+from training.baselines.architectures import check_weights, crop_size, pretrained_files
+from training.baselines.image_baselines import check_backbone
 from training.baselines.job import check_baselines, train_baselines
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
@@ -23,7 +24,6 @@ from training.train_run import VIEWS, check_out, check_trained, finished_record,
 from training.views.crops import render_crops
 from training.views.dataset import ViewDataset, remove_views, render_dataset
 from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
-from training.views.mesh_views import RenderJob
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
@@ -150,37 +150,20 @@ def _check_batch_size(protocol: Protocol, n_views: int) -> None:
         )
 
 
-def _check_folds(job: TrainJob, rendering: RenderJob, labelled: LabelledInstances | None) -> None:
-    """Raise InputError if a class has fewer views than folds even if all of its views can be used."""
-    folds, n_rendered = job.protocol.folds, len(rendering.angles)
-    for name in rendering.meshes:
-        n_views = n_rendered + (len(labelled.views.get(name, ())) if labelled else 0)
-        if n_views < folds and name not in job.leave_out:
-            raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
-
-
 def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
     """Raise InputError if a finished run is of another job; without baselines, remove leftovers of a killed process.
 
     Only views of this job are removed, since another training may read other views.
     """
     record = finished_record(job.out)
-    dataset = job.protocol.render_job(_find_meshes(job)).record()
-    frames = labelled.digest if labelled else None
-    requested = {
-        "seed": job.protocol.fit.seed,
-        "dataset": dataset,
-        "frames": frames,
-        "leave_out": sorted(set(job.leave_out)),
+    stored = record["dataset"]
+    values = {  # of the finished run, and of the job
+        "seed": (record["seed"], job.protocol.fit.seed),
+        "dataset": (stored.get("job"), job.protocol.render_job(_find_meshes(job)).record()),
+        "frames": (stored.get("frames", {}).get("digest"), labelled.digest if labelled else None),
+        "leave_out": (stored.get("classes_left_out", []), sorted(set(job.leave_out))),
     }
-    stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
-    trained = {
-        "seed": record["seed"],
-        "dataset": stored.get("job"),
-        "frames": of_frames,
-        "leave_out": stored.get("classes_left_out", []),
-    }
-    check_same_job(job.out, trained, requested)
+    check_same_job(job.out, *({name: pair[side] for name, pair in values.items()} for side in (0, 1)))
     if job.baselines:
         return
     check_trained(stored["digest"], job.out, job.protocol)
@@ -191,9 +174,8 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
-    assert job.meshes is not None
     if not isinstance(job.meshes, Path):
-        return dict(job.meshes)
+        return dict(job.meshes or {})
     return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
 
 
@@ -252,15 +234,20 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:
     """Open the dataset, or render the meshes to `out`/views; add the labelled instances."""
-    meshes = {} if job.meshes is None else _find_meshes(job)
+    meshes = _find_meshes(job)
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
-        _check_folds(job, rendering, labelled)
-        n_instances = sum(map(len, labelled.views.values())) if labelled else 0
-        n_views = len(rendering.meshes) * len(rendering.angles) * rendering.copies + n_instances * (1 + MAX_COPIES)
-        _check_batch_size(job.protocol, n_views)  # later again, since some views may have too few points
+        # Folds and batches are checked later again, since some views may have too few points.
+        folds, n_rendered = job.protocol.folds, len(rendering.angles)
+        labelled_views = {name: len(views) for name, views in labelled.views.items()} if labelled else {}
+        for name in meshes:
+            n_views = n_rendered + labelled_views.get(name, 0)
+            if n_views < folds and name not in job.leave_out:
+                raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
+        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
+        _check_batch_size(job.protocol, n_clouds)
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
         if size is not None:
             render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))

@@ -3,7 +3,7 @@
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
-RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold
+RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold, while the training runs
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only
@@ -14,6 +14,7 @@ An interrupted training resumes at the next call. run.json is written last: with
 import contextlib
 import dataclasses
 import functools
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,18 +26,13 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_written
+from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
 from thor2_jax.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
-from training.embedding.distractors import (
-    Distractors,
-    distractor_samples,
-    held_out_clouds,
-    with_fitted_distractors,
-)
+from training.embedding.distractors import Distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
@@ -44,20 +40,18 @@ from training.fitting.loop import (
     BEGUN,
     CHECKPOINTS,
     Checkpoints,
-    append_metrics,
-    discard_later_epochs,
+    EpochMetrics,
     find_run_directories,
     fit_progress,
-    read_metrics,
     wait_for_all,
 )
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
-from training.protocol import CALIBRATE, DESCRIBE, DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS, Protocol
+from training.protocol import Protocol, Stage
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource, fold_of_views
 
-__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "read_metrics", "train_run"]
 
 VIEWS = "views"
 JOB = f"{CHECKPOINTS}/{BEGUN}"
@@ -103,11 +97,39 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     return load_run(find_run_directories([out])[0]).record
 
 
+def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
+    """Append the metrics of one epoch."""
+    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Return the metrics of all epochs; a missing file has none, and a last line cut off by a crash is ignored.
+
+    Raises:
+        InputError: any other line is damaged.
+    """
+    content = path.read_bytes() if path.exists() else b""
+    try:
+        rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
+        for row in rows:
+            if not (isinstance(row["epoch"], int) and {"fold", "classifier"} <= row.keys()):
+                raise ValueError("a line has no fold, classifier and epoch")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"out: {path} is damaged ({error}); remove it, or choose another directory") from None
+    return rows
+
+
+def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> None:
+    """Remove the lines of a classifier after `epoch`, since its training resumes there and appends them again."""
+    rows = read_metrics(path)
+    kept = [r for r in rows if (r["fold"], r["classifier"]) != (fold, classifier) or r["epoch"] <= epoch]
+    write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
+
+
 def train_run(
-    source: ViewSource,
-    out: str | Path,
-    settings: Protocol,
-    progress: Progress = lambda stage, done, total, note: None,
+    source: ViewSource, out: str | Path, settings: Protocol, progress: Progress = lambda stage, done, total, note: None
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
 
@@ -140,18 +162,24 @@ def train_run(
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
-        samples: Samples | _Views
+        samples: Samples | None = None
         if settings.classifiers:
             check_classes(source)
-            form, show = Form(settings.mirrors, settings.orientation_copies), of_stage(progress, DESCRIBE, "views")
+            form = Form(settings.mirrors, settings.orientation_copies)
+            show = of_stage(progress, Stage.DESCRIBE, "views")
             samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
+            label, view = samples.label, samples.view
         else:  # only the distribution of the views among the folds is needed here
-            samples = _labelled_views(source)
+            views = [source.read(index).view for index in range(len(source.shards))]
+            label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
+            view = np.concatenate(views)
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
-        n_classes = len(source.classes)
-        parts = _held_out_parts(samples, n_classes) if folds == 1 and is_held_out else folds
-        fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
+        parts = folds
+        if folds == 1 and is_held_out:  # fewer parts if a class has few views
+            fewest = min(len(np.unique(view[label == index])) for index in range(len(source.classes)))
+            parts = max(2, min(HELD_OUT, fewest))
+        fold_of = fold_of_views(label, view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:
             if not resumed:
@@ -161,7 +189,9 @@ def train_run(
             begin_job(out, job, JOB)
         wait_for_all("begun")
         runs = [
-            _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()
+            _Fold(
+                settings, source, out, fold, samples, label, view, fold_of == fold if is_held_out else None, progress
+            ).train()
             for fold in range(folds)
         ]
         wait_for_all("trained")
@@ -170,33 +200,20 @@ def train_run(
         return runs
 
 
-class _Views(NamedTuple):
-    """The views of a source: the class of each view [V] and its number among the views of this class [V]."""
-
-    label: NDArray[np.integer[Any]]
-    view: NDArray[np.integer[Any]]
-
-
-def _labelled_views(source: ViewSource) -> _Views:
-    views = [source.read(index).view for index in range(len(source.shards))]
-    labels = np.repeat([shard.label for shard in source.shards], [len(view) for view in views])
-    return _Views(labels, np.concatenate(views))
-
-
-def _held_out_parts(samples: Samples | _Views, n_classes: int) -> int:
-    """Return into how many parts the views are split to hold out one part; fewer if a class has few views."""
-    fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(n_classes))
-    return max(2, min(HELD_OUT, fewest))
-
-
 class _Fold(NamedTuple):
-    """One fold of a training: the arguments of `train_run`, the fold's number, all samples and the held-out mask."""
+    """One fold of a training: the arguments of `train_run`, the fold's number, and all samples.
+
+    The last are the samples of the classifiers (None without classifiers), and for each sample or view its class, its
+    view and whether it is held out.
+    """
 
     settings: Protocol
     source: ViewSource
     out: Path
     number: int
-    samples: Samples | _Views
+    samples: Samples | None
+    label: NDArray[np.integer[Any]]
+    view: NDArray[np.integer[Any]]
     held_out: NDArray[np.bool_] | None
     progress: Progress
 
@@ -219,12 +236,11 @@ class _Fold(NamedTuple):
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
         """Fit the classifiers; return the classifiers, the epoch of each, and their temperatures."""
         settings, samples = self.settings, self.samples
-        if not isinstance(samples, Samples):
-            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         temperatures: dict[str, float] = {}
         for name in settings.classifiers:
+            assert samples is not None
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
@@ -236,10 +252,7 @@ class _Fold(NamedTuple):
         return classifiers, best_epochs, temperatures
 
     def complete_run(
-        self,
-        classifiers: Mapping[Feature, MLP],
-        best_epochs: Mapping[Feature, int],
-        temperatures: Mapping[str, float],
+        self, classifiers: Mapping[Feature, MLP], best_epochs: Mapping[Feature, int], temperatures: Mapping[str, float]
     ) -> TrainedRun:
         """Return the run: classifiers, the embedding if there are distractors, calibrated confidence and record."""
         settings = self.settings
@@ -248,15 +261,15 @@ class _Fold(NamedTuple):
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
             run = dataclasses.replace(run, embedding=embedding)
-            self.report(CALIBRATE, 0, 1)
+            self.report(Stage.CALIBRATE, 0, 1)
             calibration, accuracy[EMBEDDING] = fit_calibration(run, held_out)
-            self.report(CALIBRATE, 1, 1)
+            self.report(Stage.CALIBRATE, 1, 1)
             confidence = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
         rows = read_metrics(self.out / METRICS)
         names = dict.fromkeys(row["classifier"] for row in rows)
         draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, self.out / CURVES)
         record = settings.record(self.source.digest)
-        record |= {"dataset": self.source.record, "samples": len(self.samples.label), "fold": self.number}
+        record |= {"dataset": self.source.record, "samples": len(self.label), "fold": self.number}
         record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
         record["held_out_accuracy"] |= accuracy
         record |= {"temperatures": temperatures, **confidence}
@@ -269,16 +282,16 @@ class _Fold(NamedTuple):
             The embedding, which recognizes the classes; and the label and the cloud, in metres, of each view in the
             held-out set. Labels of distractors start at the number of classes.
         """
-        settings, views, held_out, checkpoints = self.settings, self.samples, self.held_out, self.checkpoints(EMBEDDING)
+        settings, label, held_out, checkpoints = self.settings, self.label, self.held_out, self.checkpoints(EMBEDDING)
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
-        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, RENDER_DISTRACTORS)
-        others = distractor_samples(distractors, scratch, network, config, shown)
-        kept = {label: np.unique(views.view[held_out & (views.label == label)]) for label in range(len(classes))}
-        shown = of_stage(self.report, DESCRIBE_EMBEDDED)
+        scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, Stage.RENDER_DISTRACTORS)
+        others = distractors.samples(scratch, network, config, shown)
+        kept = {index: np.unique(self.view[held_out & (label == index)]) for index in range(len(classes))}
+        shown = of_stage(self.report, Stage.DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
-        unknown = held_out_clouds(distractors, len(classes))
-        samples = with_fitted_distractors(samples, others, len(classes))
+        unknown = distractors.held_out_clouds(len(classes))
+        samples = distractors.add_fitted(samples, others, len(classes))
         del others  # needs as much memory as the samples
         embedding = fit_embedding(
             samples,
@@ -287,7 +300,7 @@ class _Fold(NamedTuple):
             distractors.epochs,
             checkpoints,
             RUN_SIZES,
-            fit_progress(self.report, FIT_NETWORKS, distractors.epochs),
+            fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs),
             classes,
             networks=distractors.networks,
             seed=seed,

@@ -20,7 +20,7 @@ from playwright.sync_api import Browser
 from processes import HANG
 
 from training.cli import app
-from training.readers.frames import read_names
+from training.readers.frames import frame_files
 
 PLACEHOLDER = "..."
 COMMANDS = [(page, words) for page in PAGES for words in thor2_commands(page)]
@@ -52,7 +52,7 @@ def test_documented_labels_json_is_read(tmp_path: Path) -> None:
     assert len(contents) == 2
     for content in contents:
         (tmp_path / "labels.json").write_text(content)
-        assert read_names(tmp_path / "labels.json") == {3: "mug"}
+        assert frame_files(tmp_path).read_names() == {3: "mug"}
 
 
 def test_every_documented_command_is_run_by_a_test() -> None:

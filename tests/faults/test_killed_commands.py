@@ -19,8 +19,8 @@ from small_runs import untrained_run
 
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.baseline import baseline_file, read_baseline
-from training.fitting.loop import read_metrics
 from training.storage.jobs import MANIFEST
+from training.train_run import read_metrics
 from training.views.dataset import Manifest
 
 pytestmark = pytest.mark.slow

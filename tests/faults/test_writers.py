@@ -23,8 +23,9 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fitting.loop import EpochMetrics, append_metrics, read_metrics
+from training.fitting.loop import EpochMetrics
 from training.storage.jobs import MANIFEST
+from training.train_run import append_metrics, read_metrics
 from training.views.dataset import Manifest
 
 

@@ -21,9 +21,9 @@ from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_int
 from thor2_jax.testing import damaged
 from training.baselines.baseline import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
-from training.fitting.loop import read_metrics
 from training.objects.meshes import read_names
 from training.readers.ocid import read_organized_points
+from training.train_run import read_metrics
 
 RNG = np.random.default_rng(0)
 SHAPE = (24, 17)

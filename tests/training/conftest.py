@@ -21,7 +21,7 @@ from training import train_run
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
-from training.protocol import DESCRIBE_EMBEDDED, FIT_NETWORKS, RENDER_DISTRACTORS
+from training.protocol import Stage
 
 SAVEFIG = Figure.savefig
 
@@ -53,7 +53,7 @@ def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
         return random_classifier(inputs, int(samples.label.max()) + 1, 0), 1
 
     def fit_embedding(fold: Any, distractors: Any) -> tuple[Embedding, list[Any]]:
-        for stage in (RENDER_DISTRACTORS, DESCRIBE_EMBEDDED, FIT_NETWORKS):
+        for stage in (Stage.RENDER_DISTRACTORS, Stage.DESCRIBE_EMBEDDED, Stage.FIT_NETWORKS):
             fold.report(stage, 1, 1)
         fold.checkpoints("embedding").log(metrics())
         given, classes = fold.settings, fold.source.classes

@@ -55,7 +55,7 @@ def names(folder: Path) -> list[str]:
 
 
 def logged_rows(path: Path) -> list[tuple[Any, ...]]:
-    rows = loop.read_metrics(path / "metrics.jsonl")
+    rows = module.read_metrics(path / "metrics.jsonl")
     return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
 
 

@@ -23,7 +23,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
@@ -93,26 +93,22 @@ class LiveView:
 
     Attributes:
         n_frames: number of recognized frames.
-        n_unlabelled: number of frames that had no labels.
     """
 
     def __init__(
-        self,
-        recognize: Callable[[RGBDFrame], Sequence[Recognition]],
-        load_segmenter: Callable[[], Segmenter],
-        broadcast: Broadcast,
+        self, recognize: Callable[[RGBDFrame], Sequence[Recognition]], segmenter: str | Segmenter, broadcast: Broadcast
     ) -> None:
         """Publish the state "waiting" for the first frame.
 
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
-            load_segmenter: function that returns the segmenter of frames without labels.
+            segmenter: segmenter of frames without labels, or its name.
             broadcast: receiver of the messages.
         """
-        self._recognize, self._load_segmenter, self._broadcast = recognize, load_segmenter, broadcast
+        self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
         self._times: deque[float] = deque(maxlen=FPS_FRAMES)
         self._last: dict[str, Any] = {}
-        self.n_frames = self.n_unlabelled = 0
+        self.n_frames = 0
         self.publish_state("waiting", "Waiting for the first frame; the model is being compiled.")
 
     def publish_state(self, state: str, message: str) -> None:
@@ -126,11 +122,10 @@ class LiveView:
         try:
             frame = recorded.read()
             if frame.labels is None:
-                self.n_unlabelled += 1
-                frame = segmented(frame, self._load_segmenter())
+                frame = segmented(frame, self._segmenter)
             recognitions = self._recognize(frame)
-        except InputError as error:
-            self._last = {**self._last, **values, "error": str(error)}
+        except (InputError, OSError) as error:
+            self._last = {**self._last, **values, "error": reason_of(error)}
         else:
             milliseconds = 1000 * (time.perf_counter() - start)
             detections = sorted(detections_of(frame, recognitions), key=_order)

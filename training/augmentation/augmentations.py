@@ -78,8 +78,7 @@ class Augmentations:
 
     def record(self) -> dict[str, Any]:
         """Return all settings in JSON types: None for a disabled augmentation, lists for ranges."""
-        record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
-        return record
+        return dict(json.loads(json.dumps(dataclasses.asdict(self))))
 
 
 def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:

@@ -1,4 +1,4 @@
-"""Table of the image networks with which the paper compares THOR2: architecture, image size and pretrained weights.
+"""Table of the image networks with which THOR2 is compared: architecture, image size and pretrained weights.
 
 Weights of backbones are read from local safetensors files of PyTorch models:
 
@@ -8,7 +8,7 @@ The files have the tensor names of timm: `layer1.0.conv1.weight` is the kernel o
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,16 +24,16 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
-from training.baselines.vit import VIT_BASE, VIT_TINY_4, RGBDViT
+from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY_4, RGBDViT, ViT
 
 __all__ = [
     "ARCHITECTURES",
-    "Architecture",
-    "load_backbone",
+    "TEMPLATES",
+    "check_weights",
+    "crop_size",
     "load_weights",
     "network_inputs",
-    "resampled_positions",
-    "tensor_shapes",
+    "pretrained_files",
     "weights_file",
 ]
 
@@ -158,13 +158,21 @@ class Architecture:
     size: int
     weights: Mapping[str, str]
 
-    def build(self, n_classes: int, seed: int) -> nnx.Module:
+    def build(self, n_classes: int, seed: int) -> Any:
         """Return the network with random weights."""
         return self.create(n_classes, rngs=nnx.Rngs(seed))
 
     def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
         """Return the backbones of a network with their files."""
         return [(getattr(network, backbone), file) for backbone, file in self.weights.items()]
+
+
+TEMPLATES = "templates"
+"""The nearest template by features of a frozen backbone, which may be the backbone of a network of the same run."""
+
+
+def _dinov2(n_classes: int, *, rngs: nnx.Rngs) -> Any:
+    return nnx.Dict(color=ViT(VIT_DINOV2_SMALL, _LARGE, rngs=rngs))
 
 
 _LARGE, _SMALL = 224, 96
@@ -192,8 +200,9 @@ ARCHITECTURES: dict[str, Architecture] = {
     "rgbd-vit-small": Architecture(
         partial(RGBDViT, vit=VIT_TINY_4, size=_SMALL), _SMALL, {"color": _TINY, "normals": _TINY}
     ),
+    TEMPLATES: Architecture(_dinov2, _LARGE, {"color": "vit_small_patch14_dinov2"}),
 }
-"""Name of the baseline -> its network."""
+"""Name of the baseline -> its network; for the templates, the backbone that is read from a file of weights."""
 
 
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)
@@ -210,3 +219,30 @@ def network_inputs(color: Any, normals: Any) -> tuple[jax.Array, jax.Array]:
     images = color.astype(jnp.float32) / 255, (normals.astype(jnp.float32) / 127 + 1) / 2
     first, second = (jnp.where(mask, (image - MEAN) / DEVIATION, 0) for image in images)
     return first, second
+
+
+def pretrained_files(name: str) -> list[str]:
+    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
+    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def crop_size(names: Sequence[str], weights: bool) -> int | None:
+    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
+
+    Args:
+        names: names of the baselines.
+        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
+    """
+    readers = (name if weights or name != TEMPLATES else "rgbd-vit-small" for name in names)
+    return max((ARCHITECTURES[name].size for name in readers if name in ARCHITECTURES), default=None)
+
+
+def check_weights(directory: Path, name: str) -> None:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    if name in ARCHITECTURES:
+        architecture = ARCHITECTURES[name]
+        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

@@ -27,7 +27,7 @@ from thor2_jax.networks import compiled
 from thor2_jax.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
-from training.fitting.fit import FitState, initial_state, network_step
+from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
 from training.storage.jobs import Progress
 from training.views.crops import ViewCrops, rgbd_crop, stacked
@@ -270,7 +270,7 @@ def fit_network(
     """
     batch_size = min(fit.batch_size, n_samples)
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
-    graph, state = initial_state(model, fit.optimizer(0.0))
+    graph, state = FitState.initial(model, fit.optimizer(0.0))
 
     def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, Any]]:
         rng = np.random.default_rng((task.options.seed, number - 1))

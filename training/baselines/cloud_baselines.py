@@ -37,17 +37,7 @@ from training.baselines.baseline import (
 from training.fitting.samples import MIRRORS
 from training.views.normalized_views import padded_batches
 
-__all__ = [
-    "POINTS",
-    "PointNet",
-    "fit_forest",
-    "fit_pointnet",
-    "forest_features",
-    "load_forest",
-    "load_pointnet",
-    "predict_forest",
-    "tree_arrays",
-]
+__all__ = ["fit_forest", "fit_pointnet", "load_forest", "load_pointnet"]
 
 
 @partial(jax.jit, static_argnums=2)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import model_arrays, model_from_arrays
-from training.baselines.architectures import ARCHITECTURES, load_weights, network_inputs
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, load_weights, network_inputs
 from training.baselines.baseline import (
     FitTask,
     NetworkFit,
@@ -31,24 +31,9 @@ from training.baselines.baseline import (
     in_batches,
     read_baseline,
 )
-from training.baselines.vit import VIT_DINOV2_SMALL, ViT
 from training.views.crops import ViewCrops
 
-__all__ = [
-    "TEMPLATES",
-    "check_backbone",
-    "check_weights",
-    "compare",
-    "crop_size",
-    "fit_image_network",
-    "fit_templates",
-    "load_image_network",
-    "load_templates",
-    "pretrained_files",
-]
-
-TEMPLATES = "templates"
-"""The nearest template by features of a frozen backbone, which may be the backbone of a network of the same run."""
+__all__ = ["check_backbone", "fit_image_network", "fit_templates", "load_image_network", "load_templates"]
 
 INFERENCE_BATCH = 8
 """Number of crops that a network reads at a time, about the instances of a frame, so that one program is compiled."""
@@ -150,30 +135,14 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
 SHARPNESS = 20.0
 """Factor of the similarities before the softmax."""
 
-DINOV2 = "vit_small_patch14_dinov2"
-"""File of DINOv2's weights, without the suffix."""
-
-DINOV2_SIZE = 224
-
 NO_BACKBONE = (
-    f"baselines: templates needs a backbone; expected --weights with {DINOV2}.safetensors, or the "
-    "baseline rgbd-vit or rgbd-vit-small in the same run"
+    f"baselines: templates needs a backbone; expected --weights with {ARCHITECTURES[TEMPLATES].weights['color']}"
+    ".safetensors, or the baseline rgbd-vit or rgbd-vit-small in the same run"
 )
 
-BACKBONES = (DINOV2, "rgbd-vit", "rgbd-vit-small")
+TRAINED = ("rgbd-vit", "rgbd-vit-small")
+BACKBONES = (TEMPLATES, *TRAINED)
 """DINOv2 from a file of weights, or the colour stream of a network that was trained on the same views."""
-
-
-def _create_backbone(source: str) -> ViT:
-    """Return a backbone from BACKBONES with random weights."""
-    if source == DINOV2:
-        return ViT(VIT_DINOV2_SMALL, DINOV2_SIZE, rngs=nnx.Rngs(0))
-    return ARCHITECTURES[source].create(1, rngs=nnx.Rngs(0)).color
-
-
-def _backbone_size(source: str) -> int:
-    """Return the side of the images that a backbone reads, pixels."""
-    return DINOV2_SIZE if source == DINOV2 else ARCHITECTURES[source].size
 
 
 def _color(color: Any, normals: Any) -> tuple[jax.Array]:
@@ -191,13 +160,15 @@ def load_templates(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predi
         KeyError, ValueError: an array is missing or has another shape.
     """
     name, n_classes = BACKBONES[int(arrays["number"][0])], len(run.classes)
-    embed = _crop_function(model_from_arrays(partial(_create_backbone, name), arrays, "backbone/"), _color, _unit)
+    architecture = ARCHITECTURES[name]
+    model = model_from_arrays(lambda: architecture.build(n_classes, 0).color, arrays, "backbone/")
+    embed = _crop_function(model, _color, _unit)
     features, label = arrays["features"], arrays["label"]
 
     def predict(crops: ViewCrops) -> NDArray[np.float32]:
         return compare(embed(crops), features, label, n_classes)
 
-    return lambda inputs: inputs.predicted(_backbone_size(name), n_classes, predict)
+    return lambda inputs: inputs.predicted(architecture.size, n_classes, predict)
 
 
 def compare(
@@ -216,21 +187,21 @@ def compare(
     return np.asarray(jax.nn.softmax(SHARPNESS * nearest, axis=1))
 
 
-def _backbone(task: FitTask) -> tuple[int, ViT, Mapping[str, str]]:
+def _backbone(task: FitTask) -> tuple[int, nnx.Module, Mapping[str, str]]:
     """Return the number of the backbone, the backbone, and the digests of its weights files.
 
     Raises:
         InputError: there is no backbone, or its file cannot be used.
     """
     if task.weights is not None:
-        model = _create_backbone(DINOV2)
-        return BACKBONES.index(DINOV2), model, load_weights(task.weights, [(model, DINOV2)])
-    for number, name in enumerate(BACKBONES):
+        architecture = ARCHITECTURES[TEMPLATES]
+        network = architecture.build(1, 0)
+        return 0, network.color, load_weights(task.weights, architecture.backbones(network))
+    for number, name in enumerate(TRAINED, 1):
         file = baseline_file(task.directory, name)
         if file.is_file():
             stored = read_baseline(file, task.source.classes)
-            create = partial(ARCHITECTURES[name].build, len(task.source.classes), 0)
-            network: Any = model_from_arrays(create, stored.arrays)
+            network = model_from_arrays(partial(ARCHITECTURES[name].build, len(task.source.classes), 0), stored.arrays)
             return number, network.color, stored.weights
     raise InputError(NO_BACKBONE)
 
@@ -242,7 +213,7 @@ def fit_templates(task: FitTask) -> StoredBaseline:
         InputError: there is no backbone, or the source has no crops.
     """
     number, model, weights = _backbone(task)
-    crops, label, view = _read_samples(task, _backbone_size(BACKBONES[number]))
+    crops, label, view = _read_samples(task, ARCHITECTURES[BACKBONES[number]].size)
     held_out = task.held_out(label, view)
     features = _crop_function(model, _color, _unit)(crops)
     task.progress("collect templates", 1, 1, f"{len(features)} crops")
@@ -254,44 +225,11 @@ def fit_templates(task: FitTask) -> StoredBaseline:
     return StoredBaseline(arrays, temperature, weights)
 
 
-def pretrained_files(name: str) -> list[str]:
-    """Return the files of pretrained weights that a baseline reads, without the suffix; most baselines read none."""
-    if name == TEMPLATES:
-        return [DINOV2]
-    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
-
-
-def crop_size(names: Sequence[str], weights: bool) -> int | None:
-    """Return the largest side in pixels of the crops on which baselines are trained; None if they need no crops.
-
-    Args:
-        names: names of the baselines.
-        weights: whether there are pretrained weights; templates then use DINOv2, which reads large crops.
-    """
-    sizes = [ARCHITECTURES[name].size for name in names if name in ARCHITECTURES]
-    if TEMPLATES in names:
-        sizes.append(DINOV2_SIZE if weights else ARCHITECTURES["rgbd-vit-small"].size)
-    return max(sizes, default=None)
-
-
 def check_backbone(names: Sequence[str], out: Path) -> None:
     """Raise InputError if templates without pretrained weights have no backbone in `names` or in the runs in `out`.
 
     Runs that have templates need none.
     """
-    files = [baseline_file(Path(), name) for name in (*BACKBONES, TEMPLATES)]
-    if TEMPLATES in names and not set(BACKBONES) & set(names) and not any(any(out.rglob(str(file))) for file in files):
+    files = [baseline_file(Path(), name) for name in BACKBONES]
+    if TEMPLATES in names and not set(TRAINED) & set(names) and not any(any(out.rglob(str(file))) for file in files):
         raise InputError(NO_BACKBONE)
-
-
-def check_weights(directory: Path, name: str) -> None:
-    """Read the files of a baseline's pretrained weights, without keeping them.
-
-    Raises:
-        InputError: a file is missing, damaged or of another architecture.
-    """
-    if name == TEMPLATES:
-        load_weights(directory, [(nnx.eval_shape(lambda: _create_backbone(DINOV2)), DINOV2)])
-    elif name in ARCHITECTURES:
-        architecture = ARCHITECTURES[name]
-        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

@@ -9,47 +9,21 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.architectures import ARCHITECTURES, weights_file
-from training.baselines.baseline import (
-    FitTask,
-    Predictor,
-    StoredBaseline,
-    baseline_file,
-    read_baseline,
-    write_baseline,
-)
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, pretrained_files, weights_file
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
-from training.baselines.image_baselines import (
-    TEMPLATES,
-    fit_image_network,
-    fit_templates,
-    load_image_network,
-    load_templates,
-    pretrained_files,
-)
+from training.baselines.image_baselines import fit_image_network, fit_templates, load_image_network, load_templates
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = [
-    "BASELINES",
-    "CLOUD_BASELINES",
-    "NETWORKS",
-    "TITLES",
-    "TrainedBaseline",
-    "check_baselines",
-    "load_baselines",
-    "train_baselines",
-]
+__all__ = ["CLOUD_BASELINES", "TITLES", "TrainedBaseline", "check_baselines", "load_baselines", "train_baselines"]
 
 CLOUD_BASELINES = ("thor", "forest", "pointnet")
 """Baselines on point clouds."""
 
-NETWORKS = tuple(ARCHITECTURES)
-"""Image networks on crops of colour and surface normals."""
-
-BASELINES = (*CLOUD_BASELINES, *NETWORKS, TEMPLATES)
+BASELINES = (*CLOUD_BASELINES, *ARCHITECTURES)
 """Names on the command line and in run directories, in the order of training."""
 
 TITLES = {
@@ -72,7 +46,7 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
     "thor": (fit_thor, load_thor),
     "forest": (fit_forest, load_forest),
     "pointnet": (fit_pointnet, load_pointnet),
-    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in NETWORKS},
+    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in ARCHITECTURES},
     TEMPLATES: (fit_templates, load_templates),
 }
 """Name -> function that fits a baseline, and function that builds it from its arrays and run. The second one raises
@@ -133,28 +107,25 @@ def train_baselines(
                 "give the dataset of that run"
             )
         for name in names:
-            if not baseline_file(directory, name).is_file():
-                _train(FitTask(name, source, run, directory, weights, progress))
+            file = baseline_file(directory, name)
+            if not file.is_file():
+                task, start = FitTask(name, source, run, directory, weights, progress), time.perf_counter()
+                fitted = _METHODS[name][0](task)
+                write_baseline(file, fitted, run.classes, time.perf_counter() - start)
+                # Checkpoints, including those of earlier versions.
+                remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
             elif weights is not None and pretrained_files(name):
-                _check_pretrained(directory, run, name, weights)
+                _check_pretrained(file, run, name, weights)
 
 
-def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path) -> None:
+def _check_pretrained(file: Path, run: TrainedRun, name: str, weights: Path) -> None:
     """Raise InputError if an existing baseline was not trained from these weights files."""
-    file = baseline_file(directory, name)
     paths = [weights_file(weights, each) for each in pretrained_files(name)]
     if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
         raise InputError(
             f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
             "out weights"
         )
-
-
-def _train(task: FitTask) -> None:
-    file, start = baseline_file(task.directory, task.name), time.perf_counter()
-    fitted = _METHODS[task.name][0](task)
-    write_baseline(file, fitted, task.run.classes, time.perf_counter() - start)
-    remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")  # checkpoints, including those of earlier versions
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:

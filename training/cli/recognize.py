@@ -53,8 +53,7 @@ def recognize(
         Path | None, typer.Option(metavar="FILE", help="Write an .rrd file for the Rerun viewer (extra rerun).")
     ] = None,
     out_bag: Annotated[
-        Path | None,
-        options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
+        Path | None, options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag.")
     ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
@@ -66,12 +65,7 @@ def recognize(
     from thor2_jax.model import result_files
     from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
     from thor2_jax.segmentation.segmenters import TABLE
-    from training.frame_recognition import (
-        RecognizerArguments,
-        recognize_frames,
-        segmentation_failure,
-        track_frames,
-    )
+    from training.frame_recognition import RecognizerArguments, recognize_frames, segmentation_failure, track_frames
     from training.readers.bop import read_object_names
     from training.readers.frames import segmented_source
 
@@ -155,8 +149,7 @@ def recognize(
                     result_files.write_recognitions(directory, answer.frame, answer.recognitions)
                 place = answer.recorded
                 if detection_bag is not None and place is not None:
-                    frame_id = place.frame_id
-                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=frame_id)
+                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
                 if rerun_file is not None:
                     stamp = None if place is None else place.stamp
                     rerun_file.write(answer.frame, answer.detections, name=answer.name, stamp=stamp)

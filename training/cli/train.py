@@ -167,7 +167,6 @@ def train(
             )
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.model.run_record import RUN_FILE
-    from thor2_jax.networks import check_features
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
@@ -178,9 +177,8 @@ def train(
     others = {} if distractors is None else find_meshes(distractors)
     protocol = protocol.with_distractors(embedding, others, workers)
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
-    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
-    if classifiers is not None:
-        protocol = protocol.replace(classifiers=check_features(options.split_names(classifiers)))
+    features = None if classifiers is None else options.split_names(classifiers)
+    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds, classifiers=features)
     job = TrainJob(
         out=out,
         protocol=protocol,

@@ -1,7 +1,6 @@
 """`thor2 watch`: a live page with the recognized objects of a recording, a folder or a camera."""
 
 import contextlib
-import functools
 import sys
 import time
 from collections.abc import Iterator
@@ -50,22 +49,24 @@ def watch(
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
         from thor2_jax.watch.live import Broadcast, LiveView, paced, serve_live
-        from training.frame_recognition import RecognizerArguments, read_source
+        from training.frame_recognition import RecognizerArguments
 
-        sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
-        given = [name for name, value in sources.items() if value is not None]
+        kinds = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
+        given = [name for name, value in kinds.items() if value is not None]
         if len(given) != 1:
-            raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
+            raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(kinds)}")
         topics: dict[str, Any] = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic}
         options.check_belongs("--bag", bag, **topics)
         given_frames = options.FrameOptions(None if folder is None else [folder], bag=bag, **topics)
-        load = functools.cache(functools.partial(load_segmenter, segment or TABLE))
-        if folder is None or segment:
-            load()  # raises InputError if its package is missing, which frames with labels do not need
+        segment = segment or (TABLE if folder is None else None)
+        segmenter = load_segmenter(segment) if segment else TABLE
+        sources = [] if folder is None else given_frames.sources(segment)
+        if any(each.files and each.files.labels is None for each in sources):
+            segment = TABLE
+            load_segmenter(TABLE)  # raises InputError if its package is missing, which frames with labels do not need
         frames: Iterator[RecordedFrame]
         if folder is not None:
-            numbered = enumerate(given_frames.sources(segment))
-            frames = (RecordedFrame(each.name, functools.partial(read_source, each), k) for k, each in numbered)
+            frames = (RecordedFrame(each.name, each.read, number) for number, each in enumerate(sources))
         elif bag is None:
             frames = stack.enter_context(RealSenseCamera()).frames()
         else:
@@ -78,20 +79,18 @@ def watch(
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
         print_note(f"watch at {url}")
-        view = LiveView(recognizer.track().update if track else recognizer.recognize, load, broadcast)
+        view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
         n_shown = 0
         try:
             for recorded in frames:
                 view.show(recorded)
                 n_shown += 1
-                if view.n_unlabelled:
-                    load()  # raises InputError again, since no other frame without labels could be segmented
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)
             raise
         recognized = f"{view.n_frames} of {n_shown} were recognized"
-        segments = ["--segment", segment or TABLE] if segment or view.n_unlabelled else []
+        segments = ["--segment", segment] if segment else []
         recognize = *(given_frames.arguments or ["FRAME"]), *segments, *options.given_options(arguments)
         shown = f"no more frames, {recognized}; Ctrl-C ends"
         finish(shown, "store the answers", "recognize", *recognize, "--out", "answers", file=sys.stderr)

@@ -76,8 +76,7 @@ def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[
 
 
 def _contrast(channel: NDArray[np.uint8]) -> float:
-    values = channel.astype(np.float64)
-    gradient = np.hypot(ndimage.gaussian_filter(values, 1, (0, 1)), ndimage.gaussian_filter(values, 1, (1, 0)))
+    gradient = ndimage.gaussian_gradient_magnitude(channel.astype(np.float64), 1)
     return float(np.mean(gradient**4) ** 0.25)
 
 

@@ -19,7 +19,7 @@ from training.diagnosis.checks import Diagnosis, check_camera, check_labels, che
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth
 from training.diagnosis.registration import check_labels_alignment, check_registration
-from training.readers.frames import FrameFiles, read_names
+from training.readers.frames import FrameFiles
 
 __all__ = ["diagnose"]
 
@@ -63,7 +63,7 @@ def diagnose(
         if files.labels is None:
             diagnosis.notes.append("labels: not given, so the sizes of the objects were not checked")
         elif files.names.is_file():
-            names = _read(diagnosis, "names", lambda: read_names(files.names)) or {}
+            names = _read(diagnosis, "names", files.read_names) or {}
     else:
         color, depth, labels, camera = files.color, files.depth, files.labels, files.intrinsics
     depth, labels = _aligned(diagnosis, "depth", depth, color), _aligned(diagnosis, "labels", labels, color)

@@ -8,8 +8,9 @@ embedding is used for new objects, while a classifier is fitted on its own objec
 Distractors are procedural objects, or meshes of other objects. An embedding is fitted on them, too, so that it rejects
 unknown objects. A tenth of them is held out, to calibrate the confidence on unknown objects that no network has seen.
 
-Their samples are stored in the user's cache, since all runs use the same samples and rendering takes minutes. A file
-holds the samples for one record of everything that determines them, and its name contains the digest of the record.
+Their samples are stored in the user's cache, since all runs use the same samples and rendering takes minutes. A
+directory holds the samples for one record of everything that determines them, and its name contains the digest of the
+record.
 """
 
 import contextlib
@@ -31,31 +32,24 @@ from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.files import content_digest, json_digest
+from thor2_jax.files import content_digest, json_digest, remove_written
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.fitting.samples import OF_EMBEDDING, Samples, sample_normalized
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
-from training.storage.jobs import cache_directory, load_arrays, load_metadata, locked, processor, save_arrays
+from training.storage.jobs import cache_directory, load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool, local_workers
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 from training.views.normalized_views import padded_batches
 
-__all__ = [
-    "AUGMENTATIONS",
-    "Distractors",
-    "ObjectSource",
-    "distractor_samples",
-    "held_out_clouds",
-    "render_clouds",
-    "sample_objects",
-    "samples_record",
-    "with_fitted_distractors",
-]
+__all__ = ["AUGMENTATIONS", "Distractors", "sample_objects", "samples_record"]
 
 OBJECTS_PER_TASK = 32
+
+SAMPLES = r"[0-9]{6}\.safetensors"
+"""Names of the files with the samples of a task."""
 
 SEED = 0
 """Seed of the views of objects and of their orientations: all runs share the distractors in the user's cache."""
@@ -109,7 +103,6 @@ def samples_record(
 
     This includes a digest of the code, since code may change within a version in a checkout.
     """
-    digests = {each: load_mesh(each).digest if isinstance(each, Path) else each for each in dict.fromkeys(sources)}
     root = Path(training.__file__).parent
     folders = [root / package for package in CODE] + [Path(thor2_jax.__file__).parent / each for each in LIBRARY_CODE]
     files = (file for folder in folders for file in sorted(folder.glob("*.py")))
@@ -117,7 +110,7 @@ def samples_record(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
-        "objects": [digests[each] for each in sources],
+        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
         "views": views,
         "copies": OF_EMBEDDING.orientations,
         "seed": SEED,
@@ -141,8 +134,7 @@ def sample_objects(
     """Render views of objects and sample them.
 
     Args:
-        sources: objects; labels are indices into this sequence. An object that occurs n times gets n times as many
-            views, all with the label of its first occurrence.
+        sources: objects; labels are indices into this sequence.
         network: colour network.
         config: descriptor. Static.
         views: number of views of each object.
@@ -156,7 +148,6 @@ def sample_objects(
         OSError: the directory cannot be written.
     """
     numbered = list(enumerate(sources))
-    label_of = {source: index for index, source in reversed(numbered)}
     tasks = {
         directory / f"{first:06d}.safetensors": dict(numbered[first : first + OBJECTS_PER_TASK])
         for first in range(0, len(sources), OBJECTS_PER_TASK)
@@ -177,7 +168,7 @@ def sample_objects(
                 raise InputError(f"object {sources[min(invisible)]} has no view with enough points; leave it out")
             rng = np.random.default_rng([SEED, len(sources), min(task)])
             rendered = sorted(rendered, key=lambda view: len(view[1][0]))  # for batches with little padding
-            label = np.array([label_of[sources[index]] for index, _ in rendered], np.int32)
+            label = np.array([index for index, _ in rendered], np.int32)
             batches = padded_batches([cloud for _, cloud in rendered])
             normal = ((count, view_normalize(clouds, config)) for count, clouds in batches)
             view = np.zeros_like(label)
@@ -241,106 +232,72 @@ class Distractors:
         named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
         return named | {"meshes": sorted(self.meshes)}
 
+    def samples(
+        self, directory: Path, network: ColorNetwork, config: DescriptorConfig, progress: Callable[[int, int], object]
+    ) -> Samples:
+        """Return the samples of all distractors; render those that are not in the user's cache.
 
-def distractor_samples(
-    distractors: Distractors,
-    directory: Path,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    progress: Callable[[int, int], object],
-) -> Samples:
-    """Return the samples of all distractors; render them unless they are in the user's cache or in `directory`.
+        A warning is logged if the cache cannot be used.
 
-    A warning is logged if the cache cannot be used.
+        Args:
+            directory: directory of the training, which takes the place of a cache that is disabled or cannot be used.
+            network: colour network.
+            config: descriptor. Static.
+            progress: called with (distractors done, number of distractors).
 
-    Args:
-        distractors: the distractors; labels are indices into `sources`.
-        directory: directory of the training for finished samples, so that an interrupted training resumes.
-        network: colour network.
-        config: descriptor. Static.
-        progress: called with (distractors done, number of distractors).
+        Returns:
+            The samples; labels are indices into `sources`.
 
-    Raises:
-        InputError: a mesh is unreadable or visible in none of its views.
-        OSError: the directory cannot be written.
-    """
-    sources = distractors.sources
-    arguments = sources, network, config, distractors.views
-    name = f"distractors-{json_digest(samples_record(*arguments))}"
-    cache = cache_directory("distractors")
-    file = None if cache is None else cache / f"{name}.safetensors"
-    samples = None if file is None else _read_stored(file)
-    if samples is None:
-        pool = local_workers(distractors.workers)
-        samples = sample_objects(*arguments, pool, progress, directory=directory / name)
-        if file is not None:
-            _store(samples, file)
-    progress(len(sources), len(sources))
-    return samples
+        Raises:
+            InputError: a mesh is unreadable or visible in none of its views.
+            OSError: the directory cannot be written.
+        """
+        arguments = self.sources, network, config, self.views
+        sample = functools.partial(sample_objects, *arguments, local_workers(self.workers), progress)
+        name = f"distractors-{json_digest(samples_record(*arguments))}"
+        cache = cache_directory("distractors")
+        if cache is not None:
+            try:
+                samples = sample(directory=cache / name)
+                _keep_newest(cache, name)
+                return samples
+            except ChildProcessError:
+                raise
+            except OSError as error:
+                log.warning("the distractors cannot be stored for the next training: %s", error)
+        return sample(directory=directory / name)
 
+    def held_out_clouds(self, first: int) -> list[tuple[int, Cloud]]:
+        """Return the label (from `first` on) and the cloud (in metres) of each view of the held-out distractors.
 
-def with_fitted_distractors(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
-    """Return the samples of the classes, followed by the samples of the distractors that are not held out.
+        The views are rendered again, since samples are strips in random orientations, and the looks need the points.
+        """
+        objects = dict(list(enumerate(self.sources))[::ONE_HELD_OUT_OF])
+        return [(first + index, cloud) for index, cloud in render_clouds(objects, self.views)]
 
-    The labels of the distractors follow the labels of the classes without gaps.
-    """
-    fitted = distractors.select(np.flatnonzero(distractors.label % ONE_HELD_OUT_OF))
-    label = n_classes + fitted.label - fitted.label // ONE_HELD_OUT_OF - 1
-    return Samples.concatenated([samples, dataclasses.replace(fitted, label=label.astype(np.int32))])
+    @staticmethod
+    def add_fitted(samples: Samples, distractors: Samples, n_classes: int) -> Samples:
+        """Return the samples of the classes, followed by the samples of the distractors that are not held out.
 
-
-def held_out_clouds(distractors: Distractors, first: int) -> list[tuple[int, Cloud]]:
-    """Return the label (from `first` on) and the cloud (in metres) of each view of the held-out distractors.
-
-    The views are rendered again, since samples are strips in random orientations, and the looks need the points.
-    """
-    objects = dict(list(enumerate(distractors.sources))[::ONE_HELD_OUT_OF])
-    return [(first + index, cloud) for index, cloud in render_clouds(objects, distractors.views)]
+        The labels of the distractors follow the labels of the classes without gaps.
+        """
+        fitted = distractors.select(np.flatnonzero(distractors.label % ONE_HELD_OUT_OF))
+        label = n_classes + fitted.label - fitted.label // ONE_HELD_OUT_OF - 1
+        return Samples.concatenated([samples, dataclasses.replace(fitted, label=label.astype(np.int32))])
 
 
-MAX_FILES = 3
-"""Number of files that are kept: those used most recently."""
+MAX_STORED = 3
+"""Number of directories of samples that are kept in the cache: those used most recently."""
 
-FORMAT = "thor2 samples of distractors"
-NAME = re.compile(r"distractors-[0-9a-f]{64}\.safetensors")
+NAME = re.compile(r"distractors-[0-9a-f]{64}")
 
 log = logging.getLogger(__name__)
 
 
-def _read_stored(file: Path) -> Samples | None:
-    """Return the samples of a file in the cache; None if it does not exist or, with a warning, cannot be used."""
-    try:
-        if not file.is_file():
-            return None
-        samples = Samples(**load_arrays(file))
-    except (OSError, ValueError, TypeError) as error:
-        log.warning("%s cannot be used (%s)%s", file, error, "" if _is_own(file) else "; delete this file")
-        return None
+def _keep_newest(cache: Path, used: str) -> None:
+    """Remove the samples in a cache that have not been used for the longest time."""
     with contextlib.suppress(OSError):  # the cache may be read-only
-        os.utime(file)
-    return samples
-
-
-def _store(samples: Samples, file: Path) -> None:
-    """Store samples, unless a file of the user has this name or another process is writing."""
-    try:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with locked(file.parent):
-            if file.exists() and not _is_own(file):
-                return
-            save_arrays(file, samples.arrays(), {"format": FORMAT})
-            own = [path for path in file.parent.iterdir() if _is_own(path)]
-            for path in sorted(own, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_FILES:]:
-                path.unlink(missing_ok=True)
-    except InputError:
-        return  # another process is writing, usually the same file
-    except OSError as error:
-        log.warning("the distractors cannot be stored for the next training: %s", error)
-
-
-def _is_own(path: Path) -> bool:
-    """Return whether a file holds samples of distractors (of any version) and may be replaced or removed."""
-    try:
-        return bool(NAME.fullmatch(path.name)) and load_metadata(path)["format"].startswith(FORMAT)
-    except (ValueError, KeyError, AttributeError):
-        return False
+        os.utime(cache / used)
+        stored = [path for path in cache.iterdir() if NAME.fullmatch(path.name)]
+        for path in sorted(stored, key=lambda path: path.stat().st_mtime, reverse=True)[MAX_STORED:]:
+            remove_written(path, SAMPLES)

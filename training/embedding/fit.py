@@ -26,7 +26,7 @@ from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, is_color
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks import EmbeddingSizes, class_cosines, projected_features
-from training.fitting.fit import FitState, initial_state, network_step
+from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 from training.fitting.samples import Batch, Samples, describe_batch
 
@@ -157,7 +157,7 @@ def fit_embedding(
     ]
     n_steps = len(samples) // BATCH_SIZE
     optimizer = _adamw(n_steps * epochs)
-    graphs, states = zip(*(initial_state(model, optimizer) for model in (embedding.model, *further)), strict=True)
+    graphs, states = zip(*(FitState.initial(model, optimizer) for model in (embedding.model, *further)), strict=True)
     # The other networks do not read the colour statistics, which differ most between renderings and cameras.
     seen = np.ones((networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0

@@ -13,12 +13,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.runs import Run, scratch_networks
 from training.evaluation.scores import summarize_runs
 
-__all__ = [
-    "compare_with_published",
-    "published_attributes",
-    "published_seconds",
-    "published_tables",
-]
+__all__ = ["compare_with_published", "published_seconds"]
 
 _LIGHTS = {"1": "bright", "2": "dim"}
 """Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not state this; see the note in
@@ -27,8 +22,7 @@ _LIGHTS = {"1": "bright", "2": "dim"}
 
 @functools.cache
 def _read() -> dict[str, Any]:
-    text = resources.files("training.evaluation").joinpath("published.json").read_text(encoding="utf-8")
-    return dict(json.loads(text))
+    return dict(json.loads(resources.files("training.evaluation").joinpath("published.json").read_bytes()))
 
 
 def published_tables(kind: str) -> list[dict[str, Any]]:

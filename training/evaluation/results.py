@@ -1,5 +1,6 @@
 """Computation of all values of a report from the answers, as one JSON table."""
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -23,7 +24,7 @@ from training.evaluation.answers import (
 )
 from training.evaluation.published import compare_with_published
 from training.evaluation.runs import Run, all_predictors, scratch_networks
-from training.evaluation.scores import summarize_rows, summarize_runs
+from training.evaluation.scores import Flags, Floats, summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
 __all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
@@ -31,8 +32,6 @@ __all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
 CURVE = tuple(k / 100 for k in range(101))
 """Fractions of the correct answers at which the known/unknown curve is computed."""
 
-Floats = NDArray[np.floating[Any]]
-Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
 
 MAX_LISTED = 20
@@ -102,15 +101,14 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
     classes = runs[0].classes
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = [instance.truth in classes for instance, _ in labelled]
-    instances = [instance for instance, _ in labelled if instance.truth in classes]
+    known = list(itertools.compress(labelled, is_known))
+    instances = [instance for instance, _ in known]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
     check_known({instance.truth for instance, _ in labelled}, classes)
     seconds = [frame.seconds for frame in frames]
     # One table of OCID is by sequence, which is the directory of the frame.
     attributes = [
-        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
-        for instance, frame in labelled
-        if instance.truth in classes
+        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})} for _, frame in known
     ]
     placement = np.concatenate(scores.find_placements(frames))[is_known]
     truth = np.array([classes.index(i.truth) for i in instances], np.intp)
@@ -275,10 +273,7 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     """Return the bins of the reliability diagram, all runs together."""
     confidence, correct = zip(*(_judged(each, truth) for each in predictions), strict=True)
     bins = scores.reliability(np.concatenate(confidence), np.concatenate(correct))
-    return {
-        name: [None if np.isnan(value) else value for value in values.tolist()]
-        for name, values in bins._asdict().items()
-    }
+    return {name: [None if np.isnan(value) else value for value in values.tolist()] for name, values in bins.items()}
 
 
 def _answers(

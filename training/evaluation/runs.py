@@ -23,21 +23,14 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.networks import EMBEDDING
 from thor2_jax.recognizer import DescribedFrame, Recognizer
+from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
-from training.baselines.image_baselines import TEMPLATES
-from training.baselines.job import NETWORKS, TITLES, TrainedBaseline, load_baselines
+from training.baselines.job import TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
 
-__all__ = [
-    "Run",
-    "SequenceRun",
-    "all_predictors",
-    "load_runs",
-    "load_sequence_runs",
-    "scratch_networks",
-]
+__all__ = ["Run", "all_predictors", "load_runs", "load_sequence_runs", "scratch_networks"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -233,12 +226,12 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         InputError: a sequence has no run, a run cannot be read, or runs differ in their classifiers, baselines, number
             of folds, descriptor or colour network.
     """
-    paths = {
-        sequence: next((directory / end for end in path_ends(sequence) if (directory / end).is_dir()), None)
+    found = {
+        sequence: [directory / end for end in path_ends(sequence) if (directory / end).is_dir()]
         for sequence in dict.fromkeys(map(sequence_of, frames))
     }
-    missing = [sequence for sequence, path in paths.items() if path is None]
-    loaded = {path: load_runs([path]) for path in dict.fromkeys(paths.values()) if path is not None}
+    loaded = {path: load_runs([path]) for path in dict.fromkeys(paths[0] for paths in found.values() if paths)}
+    missing = [sequence for sequence, paths in found.items() if not paths]
     if missing:
         raise InputError(
             f"model: {directory} has no run for {', '.join(missing)}; train the missing ones with "
@@ -253,7 +246,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         _check_same_descriptor(runs[0], first[0], path, first_path)
     result = []
     for fold, run in enumerate(first):
-        of_sequence = {sequence: loaded[path][fold] for sequence, path in paths.items() if path is not None}
+        of_sequence = {sequence: loaded[paths[0]][fold] for sequence, paths in found.items()}
         digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=of_sequence))
@@ -263,7 +256,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
     """Return the titles of image networks without pretrained weights, including templates with such a backbone."""
     names = {name for run in runs for name, baseline in run.baselines.items() if not baseline.weights}
-    return [TITLES[name] for name in (*NETWORKS, TEMPLATES) if name in names]
+    return [TITLES[name] for name in ARCHITECTURES if name in names]
 
 
 def _load(directory: Path) -> Run:

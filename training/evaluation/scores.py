@@ -7,7 +7,7 @@ show how steady a recognizer is.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,8 @@ from training.readers.labelled import sequence_of
 
 __all__ = [
     "COVERAGE",
+    "Flags",
+    "Floats",
     "accuracy_at_coverage",
     "attribute_tables",
     "auroc",
@@ -43,26 +45,16 @@ Floats = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
 
 
-class Reliability(NamedTuple):
-    """Accuracy by confidence.
-
-    Attributes:
-        answers: [bins] int, number of answers in each bin.
-        accuracy: [bins], fraction of these answers that are correct; NaN in empty bins.
-        confidence: [bins], mean confidence of these answers; NaN in empty bins.
-    """
-
-    answers: NDArray[np.intp]
-    accuracy: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-
-
-def reliability(confidence: Floats, correct: Flags) -> Reliability:
+def reliability(confidence: Floats, correct: Flags) -> dict[str, NDArray[Any]]:
     """Return accuracy and mean confidence of each bin; bin k holds k/15 < confidence <= (k+1)/15, the first also 0.
 
     Args:
         confidence: [N], from 0 to 1.
         correct: [N], whether the answer is correct.
+
+    Returns:
+        "answers" [bins] int, number of answers in each bin; and "accuracy" and "confidence" [bins], the fraction of
+        these answers that are correct and their mean confidence, NaN in empty bins.
     """
     values = np.asarray(confidence, np.float64)
     number = np.clip(np.ceil(values * BINS).astype(np.intp) - 1, 0, BINS - 1)
@@ -70,7 +62,7 @@ def reliability(confidence: Floats, correct: Flags) -> Reliability:
     with np.errstate(invalid="ignore"):
         accuracy = np.bincount(number, correct, BINS) / count
         mean = np.bincount(number, values, BINS) / count
-    return Reliability(count, accuracy, mean)
+    return {"answers": count, "accuracy": accuracy, "confidence": mean}
 
 
 def expected_calibration_error(confidence: Floats, correct: Flags) -> float:
@@ -79,10 +71,11 @@ def expected_calibration_error(confidence: Floats, correct: Flags) -> float:
     See Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments are as in `reliability`.
     """
     values = reliability(confidence, correct)
-    used = values.answers > 0
+    used = values["answers"] > 0
     if not used.any():
         return math.nan
-    return float(np.average(np.abs(values.accuracy - values.confidence)[used], weights=values.answers[used]))
+    differences = np.abs(values["accuracy"] - values["confidence"])
+    return float(np.average(differences[used], weights=values["answers"][used]))
 
 
 def auroc(confidence: Floats, positive: Flags) -> float:

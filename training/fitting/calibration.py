@@ -24,12 +24,7 @@ from training.fitting.fit import FitContext
 from training.fitting.samples import Batch, Samples, describe_batch
 from training.views.normalized_views import padded_batches
 
-__all__ = [
-    "KEPT",
-    "fit_calibration",
-    "fit_temperature",
-    "sample_probabilities",
-]
+__all__ = ["fit_calibration", "fit_temperature", "sample_probabilities"]
 
 SAMPLES_PER_BATCH = 256
 """Batch size of the predictions."""

@@ -31,17 +31,7 @@ from thor2_jax.networks import MLP, Feature, feature_of, input_size
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
 from training.fitting.samples import Batch, Samples, describe_batch
 
-__all__ = [
-    "FitContext",
-    "FitState",
-    "count_correct",
-    "fit",
-    "initial_state",
-    "network_step",
-    "scale_inputs",
-    "shard_batch",
-    "train_step",
-]
+__all__ = ["FitContext", "FitState", "fit", "network_step", "scale_inputs", "shard_batch", "train_step"]
 
 
 class FitState(NamedTuple):
@@ -56,6 +46,13 @@ class FitState(NamedTuple):
     params: Any
     rest: Any
     optimizer: Any
+
+    @classmethod
+    def initial(cls, model: nnx.Module, optimizer: Any) -> tuple[Any, "FitState"]:
+        """Return the graph of a network (the network without its arrays) and the state before the first step."""
+        split: Any = nnx.split(model, nnx.Param, ...)
+        graph, params, rest = split
+        return graph, cls(params, rest, optimizer.init(params))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,13 +71,6 @@ class FitContext:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "config", dataclasses.replace(self.config, homology="closed_form"))
-
-
-def initial_state(model: nnx.Module, optimizer: Any) -> tuple[Any, FitState]:
-    """Return the graph of a network (the network without its arrays) and the state before the first step."""
-    split: Any = nnx.split(model, nnx.Param, ...)
-    graph, params, rest = split
-    return graph, FitState(params, rest, optimizer.init(params))
 
 
 def shard_batch(batch: Batch) -> Batch:
@@ -138,7 +128,7 @@ def train_step(
 
     Args:
         context: constants of the fit. Static.
-        graph: the classifier without its arrays, from `initial_state`. Static.
+        graph: the classifier without its arrays, from `FitState.initial`. Static.
         state: state before the step; it is donated and cannot be used afterwards.
         batch: batch on the devices, from `shard_batch`.
         rate: learning rate.
@@ -231,7 +221,7 @@ def fit(
     model = MLP(n_inputs, int(samples.label.max()) + 1, rngs=nnx.Rngs(options.seed))
     chosen = train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES]
     model.input_scale[...] = scale_inputs(samples.take(chosen, network, config), context.feature, network, config)
-    graph, initial = initial_state(model, optax.adam(0.0))
+    graph, initial = FitState.initial(model, optax.adam(0.0))
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""

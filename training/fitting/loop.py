@@ -8,13 +8,11 @@
     state = checkpoints.best(state)
 
 Checkpoints of two epochs are kept: the last epoch and the epoch with the best score. A checkpoint is written atomically
-before an older one is removed, so the last complete checkpoint survives any crash. The metrics are logged as JSON
-lines, which can be read while the training runs.
+before an older one is removed, so the last complete checkpoint survives any crash.
 """
 
 import contextlib
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -23,12 +21,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+import safetensors
 from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.run_record import run_directories
-from training.storage.jobs import Progress, load_arrays, load_metadata, save_arrays
+from training.storage.jobs import Progress, load_arrays, save_arrays
 
 __all__ = [
     "BEGUN",
@@ -37,11 +35,8 @@ __all__ = [
     "EpochMetrics",
     "FitOptions",
     "Steps",
-    "append_metrics",
-    "discard_later_epochs",
     "find_run_directories",
     "fit_progress",
-    "read_metrics",
     "run_epochs",
     "wait_for_all",
 ]
@@ -106,37 +101,6 @@ def fit_progress(progress: Progress, stage: str, epochs: int) -> Callable[[int, 
     return show
 
 
-def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
-    """Append the metrics of one epoch."""
-    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    with errors_name(path), path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Return the metrics of all epochs; a missing file has none, and a last line cut off by a crash is ignored.
-
-    Raises:
-        InputError: any other line is damaged.
-    """
-    content = path.read_bytes() if path.exists() else b""
-    try:
-        rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
-        for row in rows:
-            if not (isinstance(row["epoch"], int) and {"fold", "classifier"} <= row.keys()):
-                raise ValueError("a line has no fold, classifier and epoch")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"out: {path} is damaged ({error}); remove it, or choose another directory") from None
-    return rows
-
-
-def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> None:
-    """Remove the lines of a classifier after `epoch`, since its training resumes there and appends them again."""
-    rows = read_metrics(path)
-    kept = [r for r in rows if (r["fold"], r["classifier"]) != (fold, classifier) or r["epoch"] <= epoch]
-    write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
-
-
 CHECKPOINTS = "checkpoints"
 """Directory of the checkpoints, inside the run directory of an unfinished training."""
 
@@ -162,8 +126,8 @@ class Checkpoints:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._scores: dict[int, float] = {}
         for path in self.directory.glob("[0-9]*.safetensors"):
-            with self._readable(path):
-                self._scores[int(path.stem)] = float(load_metadata(path)["score"])
+            with self._readable(path), safetensors.safe_open(path, "numpy") as file:
+                self._scores[int(path.stem)] = float(file.metadata()["score"])
 
     @property
     def last_epoch(self) -> int:
@@ -218,7 +182,7 @@ class Checkpoints:
         """Raise InputError if reading a checkpoint in the block fails."""
         try:
             yield
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
             raise InputError(
                 f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
             ) from None

@@ -29,7 +29,6 @@ from training.views.normalized_views import ViewSource, padded_batches, reorient
 
 __all__ = [
     "MIRRORS",
-    "OF_CLASSIFIERS",
     "OF_EMBEDDING",
     "PAPER_MIRRORS",
     "Batch",

@@ -19,16 +19,7 @@ from training.objects.mesh import TexturedMesh, merge_meshes
 if TYPE_CHECKING:  # takes 0.2 s to import, so it is imported where meshes are read
     import trimesh
 
-__all__ = [
-    "MAX_SIDE",
-    "MIN_SIDE",
-    "find_meshes",
-    "find_object_meshes",
-    "load_mesh",
-    "longest_side",
-    "read_names",
-    "scaled_meshes",
-]
+__all__ = ["MAX_SIDE", "MIN_SIDE", "find_meshes", "find_object_meshes", "load_mesh", "longest_side", "scaled_meshes"]
 
 # Without a handler, Python prints trimesh's log of a damaged file on standard error, also with a traceback.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())

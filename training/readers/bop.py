@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, dataset_folder, named_path
+from training.readers.labelled import LabelledFrames, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -49,7 +49,7 @@ class BOP(LabelledFrames):
             InputError: there are no frames, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
-        path = dataset_folder(named_path(path))
+        path = self.dataset_folder(named_path(path))
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
         self.sources = [image for scene in scenes for image in _images(scene / "rgb")]
         self.identifiers = [f"{_scene(image).name}/{image.stem}" for image in self.sources]

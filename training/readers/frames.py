@@ -21,17 +21,7 @@ from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
 from training.readers.labelled import LabelledFrames, named_labels, named_path
 
-__all__ = [
-    "FILE_NAMES",
-    "FrameFiles",
-    "FrameFolder",
-    "FrameSource",
-    "find_frames",
-    "frame_files",
-    "read_names",
-    "recorded_sources",
-    "segmented_source",
-]
+__all__ = ["FrameFiles", "FrameFolder", "FrameSource", "find_frames", "recorded_sources", "segmented_source"]
 
 FILE_NAMES = {
     "color": ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg"),
@@ -76,6 +66,13 @@ class FrameFiles:
     def names(self) -> Path:
         """The file with the names of the objects; it may not exist."""
         return (self.labels or self.color).with_name("labels.json")
+
+    def read_names(self) -> dict[int, str]:
+        """Read the names: label -> name of the object; raise InputError or OSError if they are unusable."""
+        content = read_file(self.names)
+        with decoding(f"{self.names} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
+            entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
+        return named_labels(self.names, entries)
 
     def source(self, name: str, depth_scale: float | None = None) -> "FrameSource":
         """Return these files as a frame to read."""
@@ -126,8 +123,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """
     if depth_scale is not None:
         Intrinsics(1.0, 1.0, 0.0, 0.0, depth_scale)
-    sources: list[FrameSource] = []
-    folders: list[Path] = []
+    found: list[tuple[Path, FrameSource]] = []  # folder of each frame, and the frame
     for path in paths:
         path = named_path(path)
         if not path.is_dir():
@@ -135,29 +131,26 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         if any(path.glob("scene_camera.json")) or any(path.glob("*/scene_camera.json")):
             dataset = BOP(path)
             of_path = [
-                FrameSource(name, functools.partial(_read_bop, dataset.only(k), depth_scale))
+                (path / name, FrameSource(name, functools.partial(_read_bop, dataset.only(k), depth_scale)))
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
             # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
             names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
             images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
-            of_path = [
-                frame_files(folder).source(
-                    folder.name if folder == path else folder.relative_to(path).as_posix(), depth_scale
-                )
-                for folder in sorted({file.parent for file in images})
-            ]
+            of_path = []
+            for folder in sorted({file.parent for file in images}):
+                name = folder.name if folder == path else folder.relative_to(path).as_posix()
+                of_path.append((folder, frame_files(folder).source(name, depth_scale)))
         if not of_path:
             raise InputError(f"frames: {path} has no {' or '.join(FILE_NAMES['color'])}; expected a folder of frames")
-        sources += of_path
-        folders += [path if each.files and each.files.color.parent == path else path / each.name for each in of_path]
-    names = [source.name for source in sources]
-    if len(set(names)) == len(names):
+        found += of_path
+    sources = [source for _, source in found]
+    if len({source.name for source in sources}) == len(sources):
         return sources
     # Frames in different folders may have the same name: their names are then relative to the common parent folder.
-    common = Path(os.path.commonpath([path.parent for path in folders]))
-    names = [path.relative_to(common).as_posix() for path in folders]
+    common = Path(os.path.commonpath([folder.parent for folder, _ in found]))
+    names = [folder.relative_to(common).as_posix() for folder, _ in found]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
@@ -213,7 +206,7 @@ class FrameFolder(LabelledFrames):
             return source.read(), {}, {}
         if files.labels is None:
             raise InputError(f"{files.color.with_name(FILE_NAMES['labels'][0])} is missing")
-        frame, truth = source.read(), read_names(files.names)
+        frame, truth = source.read(), files.read_names()
         if truth and set(truth).isdisjoint(frame.instances):
             raise InputError(
                 f"{files.names} has the labels {_listed(truth)}, but {files.labels} has only "
@@ -223,8 +216,8 @@ class FrameFolder(LabelledFrames):
 
     def names(self) -> set[str] | None:
         """Return the names of the objects in the labels.json of all frames."""
-        files = [source.files.names for source in self.sources if source.files]
-        return {name for path in files for name in read_names(path).values()} if self.named else None
+        files = [source.files for source in self.sources if source.files]
+        return {name for each in files for name in each.read_names().values()} if self.named else None
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame; empty for a recording."""
@@ -234,14 +227,6 @@ class FrameFolder(LabelledFrames):
 
 def _listed(labels: Iterable[int]) -> str:
     return ", ".join(map(str, sorted(labels))) or "background"
-
-
-def read_names(path: Path) -> dict[int, str]:
-    """Read `labels.json`: label -> name of the object; raise InputError or OSError if it is unusable."""
-    content = read_file(path)
-    with decoding(f"{path} is invalid", '{"labels": {"<number>": "<name>", ...}}'):
-        entries = [(int(label), name) for label, name in json.loads(content)["labels"].items()]
-    return named_labels(path, entries)
 
 
 def segmented_source(source: FrameSource | RecordedFrame, segmenter: Segmenter) -> FrameSource:
@@ -287,7 +272,7 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
 
 def _frames(bag: Bag, every: int) -> Iterator[RecordedFrame]:
     """Open the recording and yield every `every`-th frame; closing the iterator closes the recording."""
-    with bag:
+    with bag:  # no method of `_Recording`: a cycle of references would keep the recording open
         yield from itertools.islice(bag.frames(), 0, None, every)
 
 

@@ -10,15 +10,7 @@ from typing import Any, Self
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = [
-    "LabelledFrame",
-    "LabelledFrames",
-    "dataset_folder",
-    "named_labels",
-    "named_path",
-    "path_ends",
-    "sequence_of",
-]
+__all__ = ["LabelledFrame", "LabelledFrames", "named_labels", "named_path", "path_ends", "sequence_of"]
 
 
 def sequence_of(identifier: str) -> str:
@@ -30,14 +22,6 @@ def named_path(path: str | Path) -> Path:
     """Return the absolute path of a folder, so that its last part is a name, even for "." and "x/.."."""
     path = Path(path)
     return path.resolve() if ".." in path.parts else path.absolute()
-
-
-def dataset_folder(path: str | Path) -> Path:
-    """Return the path of a dataset; raise InputError if it is not a directory."""
-    path = Path(path)
-    if not path.is_dir():
-        raise InputError(f"dataset: {path} is not a directory; expected a dataset")
-    return path
 
 
 def path_ends(sequence: str) -> list[str]:
@@ -87,6 +71,14 @@ class LabelledFrames(abc.ABC):
 
     identifiers: Sequence[str]
     sources: Sequence[Any]
+
+    @staticmethod
+    def dataset_folder(path: str | Path) -> Path:
+        """Return the path of a dataset; raise InputError if it is not a directory."""
+        path = Path(path)
+        if not path.is_dir():
+            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+        return path
 
     def __len__(self) -> int:
         return len(self.identifiers)

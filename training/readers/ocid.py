@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, dataset_folder, path_ends, sequence_of
+from training.readers.labelled import LabelledFrames, path_ends, sequence_of
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
@@ -57,7 +57,7 @@ class OCID(LabelledFrames):
                 table of OCID-VLG without any of the frames.
             OSError: `names` cannot be opened.
         """
-        path = dataset_folder(path)
+        path = self.dataset_folder(path)
         root = path / "YCB10" if (path / "YCB10").is_dir() else path
         images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
@@ -232,10 +232,19 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
             f"{path}: its header has {width} x {height} points with fields of {counts} numbers; "
             "expected at least one point and one number for each axis"
         )
+    data, n = content[start:], width * height
     if encoding == "binary":
-        points = _binary(content[start:], record, width * height, axes, path)
+        if len(data) < n * record.itemsize:
+            raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
+        records = np.frombuffer(data, record, count=n)
+        with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
+            points = np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
     elif encoding == "ascii":
-        points = _ascii(content[start:], counts, width * height, axes, path)
+        try:
+            numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
+        except (ValueError, OverflowError):
+            raise InputError(f"{path} does not hold {n} lines of {sum(counts)} numbers") from None
+        points = numbers[:, [sum(counts[:axis]) for axis in axes]]
     else:
         raise InputError(f"{path} has DATA {encoding}; expected ascii or binary")
     return points.reshape(height, width, 3)
@@ -249,19 +258,3 @@ def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     if "DATA" not in header:
         raise InputError(f"{path} is not a PCD file; expected a line DATA")
     return header, end + 1
-
-
-def _binary(data: bytes, record: np.dtype[Any], n: int, axes: list[int], path: Path) -> NDArray[np.float64]:
-    if len(data) < n * record.itemsize:
-        raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
-    records = np.frombuffer(data, record, count=n)
-    with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
-        return np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
-
-
-def _ascii(data: bytes, counts: list[int], n: int, axes: list[int], path: Path) -> NDArray[np.float64]:
-    try:
-        numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
-    except (ValueError, OverflowError):
-        raise InputError(f"{path} does not hold {n} lines of {sum(counts)} numbers") from None
-    return numbers[:, [sum(counts[:axis]) for axis in axes]]

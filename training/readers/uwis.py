@@ -9,7 +9,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, dataset_folder, named_labels
+from training.readers.labelled import LabelledFrames, named_labels
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
@@ -51,7 +51,7 @@ class UWISOccluded(LabelledFrames):
         Raises:
             InputError: the folder holds no frame.
         """
-        path = dataset_folder(path)
+        path = self.dataset_folder(path)
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
         self.sources = [color for video in videos for color in sorted((video / "images").glob("*_rgb.png"))]
         if not self.sources:

@@ -23,7 +23,6 @@ from training.objects.mesh import TexturedMesh
 __all__ = [
     "Camera",
     "DISTANCE",
-    "Hits",
     "RayCaster",
     "RenderedView",
     "TRAINING_CAMERA",

@@ -20,18 +20,9 @@ import platformdirs
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import (
-    atomic_write,
-    content_digest,
-    pack_arrays,
-    read_file,
-    safetensors_metadata,
-    unpack_arrays,
-    write_text,
-)
+from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays, write_text
 
 __all__ = [
-    "LOCK",
     "MANIFEST",
     "Progress",
     "add_prefix",
@@ -41,7 +32,6 @@ __all__ = [
     "check_same_job",
     "intact_content",
     "load_arrays",
-    "load_metadata",
     "locked",
     "numbered",
     "of_stage",
@@ -265,19 +255,6 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
     """
     with atomic_write(path) as temporary:
         temporary.write_bytes(pack_arrays(arrays, {**metadata, "sha256": _arrays_digest(arrays)}))
-
-
-def load_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of a file; only its header must be intact.
-
-    Raises:
-        ValueError: the file is missing, or its header is damaged.
-    """
-    try:
-        with path.open("rb") as stream:
-            return safetensors_metadata(stream.read(2**20))
-    except (OSError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(str(error)) from None
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:

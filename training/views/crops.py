@@ -15,9 +15,9 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,18 +33,7 @@ from training.views.mesh_views import RenderJob, ViewTask, all_views
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from training.views.dataset import ViewDataset
 
-__all__ = [
-    "CROPS",
-    "CROP_SIZE",
-    "Crop",
-    "ViewCrops",
-    "fill_depth",
-    "read_crops",
-    "render_crops",
-    "rgbd_crop",
-    "stacked",
-    "surface_normals",
-]
+__all__ = ["CROPS", "Crop", "ViewCrops", "read_crops", "render_crops", "rgbd_crop", "stacked"]
 
 CROP_SIZE = 224
 """Side of a crop, pixels."""
@@ -181,14 +170,9 @@ class ViewCrops:
     def __len__(self) -> int:
         return len(self.color)
 
-    @property
-    def size(self) -> int:
-        """Side of a crop, pixels."""
-        return int(self.color.shape[1])
-
     def reduced(self, size: int) -> "ViewCrops":
         """Return the crops area-filtered to sides of `size` pixels; the same record if they already have this size."""
-        if size == self.size:
+        if size == self.color.shape[1]:
             return self
 
         def smaller(images: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -221,24 +205,8 @@ def _encode(crops: ViewCrops) -> bytes:
     return stream.getvalue()
 
 
-def _write_manifest(directory: Path, size: int, dataset: str, files: Mapping[str, str]) -> None:
-    """Write the manifest of a directory of crops.
-
-    Args:
-        directory: the directory.
-        size: side of the crops, pixels.
-        dataset: digest of the dataset.
-        files: file name -> SHA-256 of the finished files.
-
-    Raises:
-        OSError: the manifest cannot be written.
-    """
-    content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset, "files": files}
-    write_text(directory / MANIFEST, json.dumps(content) + "\n")
-
-
-def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
-    """Return size, dataset and files of the manifest in a directory of crops, see `_write_manifest`.
+def _read_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the job of a directory of crops (their size, and the digest of their dataset) and file name -> SHA-256.
 
     Raises:
         InputError: the manifest is missing, damaged or of another format.
@@ -248,7 +216,7 @@ def _read_manifest(directory: Path) -> tuple[int, str, dict[str, str]]:
         content = json.loads(path.read_bytes())
         if content["format"] != CROPS_FORMAT:
             raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
-        return int(content["size"]), str(content["dataset"]), dict(content["files"])
+        return {"crops": int(content["size"]), "dataset": str(content["dataset"])}, dict(content["files"])
     except OSError:
         raise InputError(
             f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
@@ -281,9 +249,8 @@ def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
-    stored_size, digest, files = _read_manifest(directory)
-    requested = {"crops": size, "dataset": dataset.digest}
-    check_same_job(directory, {"crops": stored_size, "dataset": digest}, requested)
+    stored, files = _read_manifest(directory)
+    check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
     return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
 
 
@@ -319,7 +286,9 @@ def render_crops(
                 views, name = dataset.read(index), _crop_file(dataset.shards[index].file)
                 of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
                 done[name] = write_checked(directory / name, _encode(stacked(of_shard, size)))
-                _write_manifest(directory, size, dataset.digest, dict(sorted(done.items())))
+                files = dict(sorted(done.items()))
+                content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset.digest, "files": files}
+                write_text(directory / MANIFEST, json.dumps(content) + "\n")
                 n_done += len(views)
                 progress(n_done, len(dataset))
 
@@ -327,13 +296,13 @@ def render_crops(
 def read_crops(dataset: "ViewDataset", index: int, size: int) -> ViewCrops:
     """Read the crops of a shard; arguments and exceptions as `ViewDataset.read_crops`."""
     directory, name = dataset.directory / CROPS, _crop_file(dataset.shards[index].file)
-    stored, digest, files = _read_manifest(directory)
-    if digest != dataset.digest:
+    stored, files = _read_manifest(directory)
+    if stored["dataset"] != dataset.digest:
         raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
-    if stored < size:
+    if stored["crops"] < size:
         raise InputError(
-            f"dataset: {directory} has crops of {stored} pixels; expected at least {size}; delete it and render "
-            f"with --crops {size}"
+            f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
+            f"render with --crops {size}"
         )
     content = intact_content(directory, name, files.get(name, ""))
     if content is None:

@@ -116,10 +116,7 @@ class WithLabelledViews:
     """
 
     def __init__(
-        self,
-        instances: LabelledInstances,
-        config: DescriptorConfig,
-        rendered: ViewSource | None = None,
+        self, instances: LabelledInstances, config: DescriptorConfig, rendered: ViewSource | None = None
     ) -> None:
         """Store the instances; nothing is computed yet.
 
@@ -135,20 +132,17 @@ class WithLabelledViews:
         clouds = [0] * len(self.classes)
         for shard in shards:
             clouds[shard.label] += shard.views
-        self._wanted = max(clouds) or CLOUDS
+        wanted = max(clouds) or CLOUDS
         self._first = len(shards)
-        sizes = {name: len(each) * (1 + self._copies(name)) for name, each in views.items()}
+        self._copies = {name: min(MAX_COPIES, max(wanted // len(each) - 1, 0)) for name, each in views.items()}
+        sizes = {name: len(each) * (1 + self._copies[name]) for name, each in views.items()}
         self.shards = (*shards, *(SourceShard(self.classes.index(name), size) for name, size in sizes.items()))
-
-    def _copies(self, name: str) -> int:
-        return min(MAX_COPIES, max(self._wanted // len(self._views[name]) - 1, 0))
 
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
         rendered = self._rendered.digest if self._rendered else None
-        copies = [self._copies(name) for name in self._views]
-        return content_digest([repr((rendered, self._instances.digest, copies))])
+        return content_digest([repr((rendered, self._instances.digest, list(self._copies.values())))])
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -160,7 +154,7 @@ class WithLabelledViews:
             "frames": {
                 "digest": self._instances.digest,
                 "instances": {name: len(each) for name, each in self._views.items()},
-                "copies": {name: self._copies(name) for name in self._views},
+                "copies": self._copies,
                 "skipped": list(self._instances.skipped),
             },
         }
@@ -175,7 +169,7 @@ class WithLabelledViews:
             assert self._rendered is not None
             return self._rendered.read(index)
         name, label = list(self._views)[index - self._first], self.shards[index].label
-        views, copies = self._views[name], self._copies(name)
+        views, copies = self._views[name], self._copies[name]
         each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
         flat = [view for group in each for view in group]
         clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
@@ -195,6 +189,6 @@ class WithLabelledViews:
             return self._rendered.read_crops(index, size)
         assert self._instances.crops is not None
         name = list(self._views)[index - self._first]
-        crops, times = self._instances.crops[name], 1 + self._copies(name)
+        crops, times = self._instances.crops[name], 1 + self._copies[name]
         reduced = stacked(crops, len(crops[0][0])).reduced(size)
         return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

@@ -128,26 +128,17 @@ class ViewTask:
     seed: int = 0
 
 
-def _clouds_per_view(augmentations: Augmentations | None) -> int:
-    """Return the number of clouds per view: the view as rendered and its augmented copies."""
-    return 1 + augmentations.copies if augmentations else 1
-
-
-def _seed_of(name: str) -> int:
-    """Return a seed that depends on the object's name only."""
-    return int.from_bytes(hashlib.sha256(name.encode(errors="surrogatepass")).digest()[:8], "little")
-
-
 def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
     """Yield the number of the view, the number of the copy and the image of each view, ordered by view and copy."""
-    caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
+    caster, centre = RayCaster([task.mesh]), task.mesh.centre
+    name = int.from_bytes(hashlib.sha256(task.name.encode(errors="surrogatepass")).digest()[:8], "little")
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
         yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
-        for copy in range(1, _clouds_per_view(task.augmentations)):
-            assert task.augmentations is not None
-            rng = np.random.default_rng([task.seed, name, number, copy])
-            other = render_view(caster, camera_pose(*random_angles(rng), centre))
-            yield number, copy, augment(other, task.augmentations, rng)
+        if task.augmentations:
+            for copy in range(1, 1 + task.augmentations.copies):
+                rng = np.random.default_rng([task.seed, name, number, copy])
+                other = render_view(caster, camera_pose(*random_angles(rng), centre))
+                yield number, copy, augment(other, task.augmentations, rng)
 
 
 def _clouds(task: ViewTask) -> Iterator[tuple[int, int, "Cloud"]]:
@@ -214,8 +205,8 @@ class RenderJob:
 
     @property
     def copies(self) -> int:
-        """Number of clouds of a view."""
-        return _clouds_per_view(self.augmentations)
+        """Number of clouds of a view: the view as rendered and its augmented copies."""
+        return 1 + self.augmentations.copies if self.augmentations else 1
 
     @functools.cached_property
     def shards(self) -> dict[str, tuple[str, range]]:
@@ -237,10 +228,7 @@ class RenderJob:
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be at least 0")
         augmentations, camera = self.augmentations, TRAINING_CAMERA
-        objects = [
-            {"name": name, "mesh": _checked_size(name, mesh).digest}
-            for name, mesh in _checked_meshes(self.meshes, self.angles)
-        ]
+        checked = (_checked_size(*each) for each in _checked_meshes(self.meshes, self.angles))
         # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
         intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
         return {
@@ -253,7 +241,7 @@ class RenderJob:
             "azimuth_step": float(self.azimuth_step),
             "polar_step": float(self.polar_step),
             "variations": {"seed": self.seed, "cameras": "random", **augmentations.record()} if augmentations else None,
-            "objects": objects,
+            "objects": [{"name": name, "mesh": mesh.digest} for name, mesh in checked],
             "shards": len(self.shards),
         }
 
@@ -267,15 +255,15 @@ class RenderJob:
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
 
 
-def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
-    """Return a mesh; raise InputError if its views may be too large to be stored."""
+def _checked_size(name: str, mesh: TexturedMesh) -> tuple[str, TexturedMesh]:
+    """Return an object; raise InputError if its views may be too large to be stored."""
     diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if SIGMA_S * diameter > MAX_VIEW_LENGTH:
         raise InputError(
             f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
             "stored; scale the mesh to metres"
         )
-    return mesh
+    return name, mesh
 
 
 def render_views(

@@ -82,7 +82,7 @@ def latest(broadcast: Broadcast) -> dict[str, Any]:
 def test_messages_of_a_view() -> None:
     broadcast = Broadcast()
     message = functools.partial(latest, broadcast)
-    view = LiveView(recognize, lambda: segment_table, broadcast)
+    view = LiveView(recognize, segment_table, broadcast)
     assert message()["state"] == "waiting" and "image" not in message()
     view.show(recorded(1))
     one = message()
@@ -148,7 +148,7 @@ def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.Monk
     monkeypatch.setattr(live, "KEEP_ALIVE", 0.05)
     broadcast, page, errors = Broadcast(), browser.new_page(), []
     page.set_default_timeout(1000 * HANG)
-    view = LiveView(recognize, lambda: segment_table, broadcast)
+    view = LiveView(recognize, segment_table, broadcast)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:

@@ -16,11 +16,18 @@ from small_runs import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
+from training.baselines import architectures
 from training.baselines import baseline as module
-from training.baselines import image_baselines
-from training.baselines.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
+from training.baselines.architectures import (
+    ARCHITECTURES,
+    Architecture,
+    crop_size,
+    network_inputs,
+    pretrained_files,
+    tensor_shapes,
+)
 from training.baselines.baseline import BaselineInputs, baseline_file, read_baseline
-from training.baselines.image_baselines import check_backbone, compare, crop_size, pretrained_files
+from training.baselines.image_baselines import check_backbone, compare
 from training.baselines.job import load_baselines, train_baselines
 from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.protocol import DEFAULT
@@ -83,7 +90,7 @@ def quick_network() -> Iterator[None]:
     architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ARCHITECTURES, SMALL, architecture)
-        patch.setattr(image_baselines, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
+        patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
         yield
 
 

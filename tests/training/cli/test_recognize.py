@@ -18,8 +18,7 @@ from written_files import files_of
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
 from training.cli import recognize as recognize_command
-from training.frame_recognition import read_source
-from training.readers.frames import FrameSource
+from training.readers.frames import FrameFiles
 
 
 def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
@@ -207,13 +206,15 @@ def test_a_bad_frame_does_not_end_a_sequence(
     (frames[1] / "depth.png").write_bytes(b"damaged")
     (frames[2] / "mask.png").unlink()
 
-    def read_and_remove(source: FrameSource) -> RGBDFrame:
-        frame = read_source(source)
-        if source.name == "4":
+    read = FrameFiles.read
+
+    def read_and_remove(files: FrameFiles, depth_scale: float | None) -> RGBDFrame:
+        frame = read(files, depth_scale)
+        if files.color.parent == frames[4]:
             (frames[3] / "depth.png").unlink(missing_ok=True)
         return frame
 
-    monkeypatch.setattr("training.frame_recognition.read_source", read_and_remove)
+    monkeypatch.setattr(FrameFiles, "read", read_and_remove)
     assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
     out, err = capfd.readouterr()
     answers = json_lines(out)

@@ -14,14 +14,14 @@ def test_calibration_error_matches_hand_calculation() -> None:
     confidence = np.array([0.5, 0.52, 0.95, 0.97, 1.0, 0.0])
     correct = np.array([True, False, True, True, False, False])
     result = scores.reliability(confidence, correct)
-    assert result.answers.tolist() == [1] + [0] * 6 + [2] + [0] * 6 + [3]
-    assert result.accuracy[[0, 7, 14]] == pytest.approx([0, 1 / 2, 2 / 3])
-    assert result.confidence[[0, 7, 14]] == pytest.approx([0, 0.51, 2.92 / 3])
-    assert np.isnan(result.accuracy[1])
+    assert result["answers"].tolist() == [1] + [0] * 6 + [2] + [0] * 6 + [3]
+    assert result["accuracy"][[0, 7, 14]] == pytest.approx([0, 1 / 2, 2 / 3])
+    assert result["confidence"][[0, 7, 14]] == pytest.approx([0, 0.51, 2.92 / 3])
+    assert np.isnan(result["accuracy"][1])
     by_hand = (1 * 0 + 2 * abs(0.5 - 0.51) + 3 * abs(2 / 3 - 2.92 / 3)) / 6
     assert scores.expected_calibration_error(confidence, correct) == pytest.approx(by_hand)
     # Bins include their upper edge.
-    assert np.flatnonzero(scores.reliability(np.array([0.2, 0.2000001]), correct[:2]).answers).tolist() == [2, 3]
+    assert np.flatnonzero(scores.reliability(np.array([0.2, 0.2000001]), correct[:2])["answers"]).tolist() == [2, 3]
 
 
 def test_metrics_without_answers_are_nan() -> None:

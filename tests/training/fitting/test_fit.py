@@ -16,7 +16,7 @@ from small_clouds import random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.networks import MLP, model_arrays
-from training.fitting import loop
+from training import train_run
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
 from training.fitting.samples import Samples, describe_batch, sample_views
@@ -144,17 +144,17 @@ def metrics(epoch: int) -> EpochMetrics:
 def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
     """Only the epochs of one classifier and fold are discarded."""
     path = tmp_path / "metrics.jsonl"
-    loop.append_metrics(path, 0, "ce", metrics(1))
+    train_run.append_metrics(path, 0, "ce", metrics(1))
     with path.open("a") as file:
         file.write('{"fold": 0, "cl')
-    assert [row["epoch"] for row in loop.read_metrics(path)] == [1]
-    loop.discard_later_epochs(path, 0, "ce", 1)
-    loop.append_metrics(path, 0, "ce", metrics(2))
-    loop.append_metrics(path, 0, "tops", metrics(2))
-    loop.append_metrics(path, 1, "ce", metrics(2))
-    assert [row["epoch"] for row in loop.read_metrics(path)] == [1, 2, 2, 2]
-    loop.discard_later_epochs(path, 0, "ce", 1)
-    kept = [(row["fold"], row["classifier"], row["epoch"]) for row in loop.read_metrics(path)]
+    assert [row["epoch"] for row in train_run.read_metrics(path)] == [1]
+    train_run.discard_later_epochs(path, 0, "ce", 1)
+    train_run.append_metrics(path, 0, "ce", metrics(2))
+    train_run.append_metrics(path, 0, "tops", metrics(2))
+    train_run.append_metrics(path, 1, "ce", metrics(2))
+    assert [row["epoch"] for row in train_run.read_metrics(path)] == [1, 2, 2, 2]
+    train_run.discard_later_epochs(path, 0, "ce", 1)
+    kept = [(row["fold"], row["classifier"], row["epoch"]) for row in train_run.read_metrics(path)]
     assert kept == [(0, "ce", 1), (0, "tops", 2), (1, "ce", 2)]
     path.write_text("no json\n{}\n")
-    assert_refused(r"out: .*metrics\.jsonl", loop.read_metrics, path)
+    assert_refused(r"out: .*metrics\.jsonl", train_run.read_metrics, path)
