@@ -1,7 +1,7 @@
 """The live view: a loop that recognizes each frame and publishes it, and the local web server of its page.
 
 with serve_live(broadcast, port=0) as url:
-    view = LiveView(recognizer.recognize, partial(load_segmenter, "table"), broadcast)
+    view = LiveView(recognizer.recognize, load_segmenter("table"), broadcast)
     for recorded in frames:
         view.show(recorded)
 

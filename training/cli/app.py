@@ -198,6 +198,10 @@ def main() -> None:
         if package not in TRAINING_PACKAGES:
             raise
         _exit_with(f"{package} is not installed; this command needs it, recognition does not: see docs/install.md")
+    except RuntimeError as error:
+        if "Symlink loop" not in str(error):  # of Path.resolve
+            raise
+        _exit_with(str(error))
     except OSError as error:
         _exit_with(reason_of(error))
     finally:

@@ -83,6 +83,12 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
     assert shlex.split(line)[-6:] == ["a b", "./-c", "--depth-scale", "100.0", "--max-gap", "0.5"]
 
 
+def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    assert str(tmp_path / "a") in refused("forget", "mug", "--model", tmp_path / "a")
+
+
 def test_version(printed: Command) -> None:
     assert printed("--version") == f"thor2 {thor2.__version__}\n"
 
