@@ -4,8 +4,7 @@ import asyncio
 import contextlib
 import io
 import secrets
-import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +32,7 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.signals import handlers_replaced
+from thor2_jax.service.signals import ended_by_signals
 
 __all__ = ["create_app"]
 
@@ -59,11 +58,12 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with _stop_accepting_on_signal(service):
+        # The handlers of uvicorn would wait until the worker is ready.
+        with ended_by_signals() if workers > 1 else contextlib.nullcontext():
             await run_in_threadpool(service.start)
             if workers > 1:
                 await run_in_threadpool(service.wait_until_ready)
-            yield
+        yield
         await run_in_threadpool(service.close)
 
     app = FastAPI(
@@ -103,25 +103,6 @@ def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
             await _problem_response(RequestError(403, "Host", message))(scope, receive, send)
 
     return checked
-
-
-@contextlib.contextmanager
-def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
-    """Refuse new requests as soon as the signal arrives; the server closes its connections later."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop_before(handler: Any) -> Callable[[int, Any], None]:
-        def stop(number: int, frame: Any) -> None:
-            service.stop_accepting()
-            if callable(handler):
-                handler(number, frame)
-
-        return stop
-
-    with handlers_replaced(stop_before):
-        yield
 
 
 def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:

@@ -164,14 +164,10 @@ class Service:
             progress = f": {self.progress}" if self.state == "starting" and self.progress else ""
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
-    def stop_accepting(self) -> None:
-        """Refuse new requests; requests in progress are still answered."""
+    def close(self) -> None:
+        """Refuse new requests, finish those in progress, then stop processes and threads."""
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
-
-    def close(self) -> None:
-        """Finish requests in progress, then stop processes and threads."""
-        self.stop_accepting()
         self._warm_up_thread.join()
         self._pool.close()
         self._batcher.close()

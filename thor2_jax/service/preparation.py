@@ -150,9 +150,9 @@ def _run_process(pipe: Connection, segmenter: str | None) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
     if segmenter is not None:
         _warm_up(segmenter)
-    pipe.send("ready")
     outcome: tuple[Any, Exception | None]
     with contextlib.suppress(EOFError, OSError):  # The service has ended or was killed.
+        pipe.send("ready")
         while True:
             function, arguments = pipe.recv()
             try:
