@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 
 import uvicorn
 from fastapi import FastAPI
+from prometheus_client.multiprocess import mark_process_dead
 from uvicorn.config import LOGGING_CONFIG
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
@@ -102,9 +103,12 @@ class _Supervisor(Multiprocess):
         self._close_ends_of_workers()
 
     def keep_subprocess_alive(self) -> None:
-        """Replace workers that have died."""
+        """Replace workers that have died; their requests no longer count as in progress."""
+        before = {process.pid for process in self.processes}
         with signals_blocked(signal.SIGINT):
             super().keep_subprocess_alive()
+        for pid in before - {process.pid for process in self.processes}:
+            mark_process_dead(pid)
         self._close_ends_of_workers()
 
     def _close_ends_of_workers(self) -> None:
