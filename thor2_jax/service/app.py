@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
-from thor2_jax.service.decoding import parse_enrollment, parse_number, read_body, read_form
+from thor2_jax.service.decoding import read_body, read_form
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
@@ -152,9 +152,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
         The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
-        seconds = max(service.settings.deadline, WHY_SECONDS)
-        async with service.admit(partial(read_form, request, schemas.WHY_FORM), seconds) as (admitted, files):
-            return await service.why(files, parse_number(files, "instance"), admitted)
+        async with service.admit(partial(read_form, request, schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
+            return await service.why(files, admitted)
 
     arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
     responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
@@ -234,9 +233,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         For a name that exists, set extend or replace.
         """
         async with service.admit(partial(read_form, request, schemas.ENROLLMENT_FORM)) as (admitted, files):
-            name, label, flags = parse_enrollment(files)
-            known = await service.enroll(files, name, label, flags, admitted)
-        (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
+            known = await service.enroll(files, admitted)
+        (enrolled,) = [answer for answer in object_answers(known) if answer.name == files["name"]]
         return schemas.EnrollmentAnswer(
             **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
         )
@@ -249,8 +247,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def undo(request: Request) -> schemas.ChangeAnswer:
         """Undo the last change of the gallery, unless it has changed again since then."""
         async with service.admit(partial(read_form, request, schemas.UNDO_FORM)) as (admitted, files):
-            generation = parse_number(files, "generation")
-            known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
+            known = await service.change(lambda objects: objects.undo(files["generation"]), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))

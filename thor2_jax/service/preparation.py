@@ -110,17 +110,17 @@ def _warm_up(name: str) -> None:
         segmented(blank, _segmenter(name))
 
 
-def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance for enrollment or explanation.
+def prepare_view(fields: dict[str, Any], config: DescriptorConfig) -> PreparedRequest:
+    """Decode a frame and compute the cloud of its instance `fields["instance"]` for enrollment or explanation.
 
     Raises:
         RequestError: 422 if there is no such instance or it has too few points; also as `prepare_frame`.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
-        frame = decode_frame(**files)
+        frame = decode_frame(**{name: fields[name] for name in ("color", "depth", "intrinsics", "labels")})
     with timed(seconds, "clouds"), field_errors():
-        view = instance_view(frame, label, config.sigma_s)
+        view = instance_view(frame, fields["instance"], config.sigma_s)
     return PreparedRequest([view], seconds, frame=frame)
 
 
