@@ -141,9 +141,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
             recognized = await service.recognize(files, admitted, with_label_map=True)
-            model, timings = service.engine.model, admitted.milliseconds()
-            answer = await run_in_threadpool(explained_frame, model, *recognized, timings)
-            content = await run_in_threadpool(answer.model_dump_json)
+            arguments = service.engine.model, *recognized, admitted.milliseconds()
+            content = await run_in_threadpool(lambda: explained_frame(*arguments).model_dump_json())
         return Response(content, media_type="application/json")
 
     @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})

@@ -26,14 +26,7 @@ from thor2_jax.printable import check_name
 from thor2_jax.service.problem import FieldError, RequestError, field_errors
 from thor2_jax.service.schemas import FORM, MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_POINTS, CloudsBody
 
-__all__ = [
-    "check_instances",
-    "decode_frame",
-    "decode_json_clouds",
-    "decode_npz_clouds",
-    "read_body",
-    "read_form",
-]
+__all__ = ["check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds", "read_body", "read_form"]
 
 MAX_BODY = 16 * 2**20
 """Largest size of a request body, and of the arrays it decompresses to, in bytes."""

@@ -124,7 +124,7 @@ class InferenceEngine:
             # By default JAX caches only large programs that take more than a second to compile.
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        recognizer = _load(settings)
+        self._recognizer = recognizer = _load(settings)
         run = recognizer.run
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
@@ -132,7 +132,6 @@ class InferenceEngine:
         if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")
         recognizer.model = model
-        self._recognizer = recognizer
         # With `teach`, the embedding is compiled before the first object is enrolled.
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
@@ -245,12 +244,11 @@ def _load(settings: Settings) -> Recognizer:
     Raises:
         InputError: as `Recognizer.load`; also if the given gallery does not exist and `teach` is not set.
     """
-    directory = settings.gallery
-    if directory is not None and not settings.teach:
+    directory = settings.gallery or settings.model / GALLERY_DIRECTORY
+    if settings.gallery is not None and not settings.teach:
         check_exists(directory)
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
-        directory = directory or settings.model / GALLERY_DIRECTORY
         try:
             check_writable(directory)
         except OSError as error:

@@ -249,9 +249,8 @@ class Service:
             (instance,) = self.engine.correct(prepared.instances, observe=False)
             return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
-        with timed(request.seconds, "explain"):
-            with field_errors("instance"):
-                answer = await asyncio.wrap_future(self._explainer.submit(explained))
+        with timed(request.seconds, "explain"), field_errors("instance"):
+            answer = await asyncio.wrap_future(self._explainer.submit(explained))
         answer.timings = request.milliseconds()
         return answer
 

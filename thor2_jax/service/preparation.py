@@ -125,16 +125,13 @@ def prepare_view(fields: dict[str, Any], config: DescriptorConfig) -> PreparedRe
 
 
 def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
-    step = 1
-    while True:
-        coarse = labels[::step, ::step]
-        flat = coarse.ravel()
-        starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
-        if len(starts) <= MAX_LABEL_RUNS:
-            height, width = coarse.shape
-            lengths = np.diff(starts, append=flat.size)
-            return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
-        step *= 2
+    flat = labels.ravel()
+    starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
+    if len(starts) > MAX_LABEL_RUNS:
+        return _encode_label_map(labels[::2, ::2])
+    height, width = labels.shape
+    lengths = np.diff(starts, append=flat.size)
+    return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
 
 
 def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
@@ -150,24 +147,26 @@ def _run_process(pipe: Connection, segmenter: str | None) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
     if segmenter is not None:
         _warm_up(segmenter)
-    outcome: tuple[Any, Exception | None]
     with contextlib.suppress(EOFError, OSError):  # The service has ended or was killed.
         pipe.send("ready")
         while True:
             function, arguments = pipe.recv()
             try:
-                outcome = function(*arguments), None
+                pipe.send((function(*arguments), None))
             except RequestError as error:
-                outcome = None, error
+                pipe.send((None, error))
             except Exception:
-                outcome = None, RuntimeError(traceback.format_exc())
-            pipe.send(outcome)
+                pipe.send((None, RuntimeError(traceback.format_exc())))
 
 
 class _PreparationProcess:
     def __init__(self, context: Any, segmenter: str | None) -> None:
-        self.pipe, child_pipe = context.Pipe()
-        self.process = context.Process(target=_run_process, args=(child_pipe, segmenter), daemon=True)
+        self._context, self._segmenter = context, segmenter
+        self.start()
+
+    def start(self) -> None:
+        self.pipe, child_pipe = self._context.Pipe()
+        self.process = self._context.Process(target=_run_process, args=(child_pipe, self._segmenter), daemon=True)
         with signals_blocked(signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; `stop` ends this one.
             self.process.start()
         child_pipe.close()
@@ -178,20 +177,23 @@ class _PreparationProcess:
         self.process.join()
         self.pipe.close()
 
+    def restart(self) -> None:
+        self.stop()
+        self.start()
+
 
 class PreparationPool:
     """A fixed number of processes, each with a thread that waits for it."""
 
     def __init__(self, count: int, segmenter: str | None = None) -> None:
         """Start `count` processes, each of which loads the segmenter of this name."""
-        self._segmenter = segmenter
         # The fork server has imported this module and has no threads, so that a replacement process starts at once.
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([__name__])
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([__name__])
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")
         self._idle: queue.SimpleQueue[_PreparationProcess] = queue.SimpleQueue()
         for _ in range(count):
-            self._idle.put(_PreparationProcess(self._context, segmenter))
+            self._idle.put(_PreparationProcess(context, segmenter))
 
     def submit(
         self, deadline: float, function: Callable[..., PreparedRequest], *arguments: Any
@@ -209,24 +211,20 @@ class PreparationPool:
         process = self._idle.get()
         try:
             if not process.process.is_alive():
-                process = self._replace(process)
+                process.restart()
             process.pipe.send((function, arguments))
             if not process.pipe.poll(max(deadline - time.monotonic(), MIN_SECONDS)):
-                process = self._replace(process)
+                process.restart()
                 raise RequestError(504)
             result, error = process.pipe.recv()
         except (EOFError, OSError):
-            process = self._replace(process)
+            process.restart()
             raise RequestError(422, "body", "The body made the process that decoded it crash.") from None
         finally:
             self._idle.put(process)
         if error is not None:
             raise error
         return result
-
-    def _replace(self, process: _PreparationProcess) -> _PreparationProcess:
-        process.stop()
-        return _PreparationProcess(self._context, self._segmenter)
 
     def close(self) -> None:
         """Wait for submitted calls, then stop the processes."""
