@@ -27,6 +27,7 @@ from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, 
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,
+    Prepare,
     PreparedRequest,
     prepare_clouds,
     prepare_frame,
@@ -273,8 +274,7 @@ class Service:
         if all(flags.values()):
             raise RequestError(422, "replace", "extend and replace are both true; choose one.")
         with self._gallery_errors(409, "name"):
-            self.engine.objects.refresh()
-            self.engine.objects.gallery.name_to_enroll(name, **flags)
+            self.known_objects().gallery.name_to_enroll(name, **flags)
         prepared = await self._prepare(request, prepare_view, fields, self.engine.run.config)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
@@ -336,9 +336,7 @@ class Service:
             self.engine.objects.refresh()
         return self.engine.objects
 
-    async def _prepare(
-        self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any
-    ) -> PreparedRequest:
+    async def _prepare(self, request: AdmittedRequest, function: Prepare, *arguments: Any) -> PreparedRequest:
         prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, function, *arguments))
         request.seconds.update(prepared.seconds)
         return prepared

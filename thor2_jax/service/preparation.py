@@ -30,7 +30,7 @@ from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.signals import signals_blocked
 
-__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
+__all__ = ["PreparationPool", "Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
 MAX_LABEL_RUNS = 50_000
 """Largest number of runs in the label map of an explained frame."""
@@ -62,6 +62,10 @@ class PreparedRequest:
     seconds: dict[str, float]
     label_map: LabelMap | None = None
     frame: RGBDFrame | None = None
+
+
+Prepare = Callable[..., PreparedRequest]
+"""A function such as `prepare_frame`; it and its arguments are pickled."""
 
 
 def prepare_frame(
@@ -195,19 +199,15 @@ class PreparationPool:
         for _ in range(count):
             self._idle.put(_PreparationProcess(context, segmenter))
 
-    def submit(
-        self, deadline: float, function: Callable[..., PreparedRequest], *arguments: Any
-    ) -> Future[PreparedRequest]:
-        """Call `function` in a process; the function and its arguments are pickled.
+    def submit(self, deadline: float, function: Prepare, *arguments: Any) -> Future[PreparedRequest]:
+        """Call `function` in a process.
 
         The future raises RequestError: the error of the function, 504 if the call has not returned at `deadline` (a
         time of `time.monotonic`), 422 if the process crashed.
         """
         return self._threads.submit(self._call, deadline, function, arguments)
 
-    def _call(
-        self, deadline: float, function: Callable[..., PreparedRequest], arguments: Sequence[Any]
-    ) -> PreparedRequest:
+    def _call(self, deadline: float, function: Prepare, arguments: Sequence[Any]) -> PreparedRequest:
         process = self._idle.get()
         try:
             if not process.process.is_alive():
