@@ -149,11 +149,12 @@ class _Connection:
             kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
             raise kind(f"{self._url} gives no answer ({error or type(error).__name__})") from None
 
-    def _parsed(self, response: httpx.Response, parse: Callable[[bytes], T]) -> T:
-        """Return what `parse` makes of the body of a response."""
-        content = _content(response)
+    def _parsed(self, response: httpx.Response, parse: Callable[[httpx.Response], T]) -> T:
+        """Return what `parse` makes of a response; raise ServiceError if its status is an error."""
+        if not response.is_success:
+            raise _service_error(response)
         try:
-            return parse(content)
+            return parse(response)
         except Exception:  # of many types, since another server can answer anything
             raise ConnectionError(f"{self._url} does not answer as the service does; check the URL") from None
 
@@ -181,7 +182,7 @@ class Client(_Connection):
             OSError: a file cannot be read, or the service cannot be reached.
         """
         files = _frame_files(color, depth, labels, intrinsics)
-        return self._send("POST", "/v1/recognize", lambda content: _recognitions(content)[0], files=files)
+        return self._send("POST", "/v1/recognize", lambda response: _recognitions(response)[0], files=files)
 
     def recognize_frame(
         self, *, color: File, depth: File, labels: File | NDArray[Any] | None = None, intrinsics: Any
@@ -223,7 +224,7 @@ class Client(_Connection):
 
     def objects(self) -> list[KnownObject]:
         """Return the objects that the service can recognize; raise errors as `describe`."""
-        return self._send("GET", "/v1/objects", _objects)
+        return self._send("GET", "/v1/objects", lambda r: [_known(each, KnownObject) for each in r.json()["objects"]])
 
     def enroll(
         self,
@@ -260,9 +261,7 @@ class Client(_Connection):
         files = _frame_files(color, depth, labels, intrinsics)
         fields = {"name": name, "instance": instance, "extend": extend, "replace": replace}
         files |= {field: str(value).encode() for field, value in fields.items()}
-        return self._send(
-            "POST", "/v1/objects", lambda content: _known(json.loads(content), EnrolledObject), files=files
-        )
+        return self._send("POST", "/v1/objects", lambda response: _known(response.json(), EnrolledObject), files=files)
 
     def forget(self, name: str) -> int:
         """Forget an object, and return the generation of the gallery, for `undo`.
@@ -282,8 +281,8 @@ class Client(_Connection):
         """
         return self._send("POST", "/v1/objects/undo", _generation, files={"generation": str(generation).encode()})
 
-    def _send(self, method: str, path: str, parse: Callable[[bytes], T], **body: Any) -> T:
-        """Send a request with a body (content, files) and return what `parse` makes of the body of its answer."""
+    def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
+        """Send a request with a body (content, files) and return what `parse` makes of its response."""
         with self._no_answer_named(), httpx.Client(**self._options) as http:
             response = http.request(method, path, **body)
         return self._parsed(response, parse)
@@ -308,7 +307,7 @@ class AsyncClient(_Connection):
     forget = _coroutine(Client.forget)
     undo = _coroutine(Client.undo)
 
-    async def _send(self, method: str, path: str, parse: Callable[[bytes], T], **body: Any) -> T:
+    async def _send(self, method: str, path: str, parse: Callable[[httpx.Response], T], **body: Any) -> T:
         with self._no_answer_named():
             async with httpx.AsyncClient(**self._options) as http:
                 response = await http.request(method, path, **body)
@@ -343,8 +342,8 @@ def _encode_labels(labels: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _recognitions(content: bytes) -> tuple[list[Recognition], NDArray[np.int32] | None]:
-    answer = json.loads(content)
+def _recognitions(response: httpx.Response) -> tuple[list[Recognition], NDArray[np.int32] | None]:
+    answer = response.json()
     label_map = answer.get("label_map")  # Services of version 0.1.0 have none.
     return [_recognition(instance) for instance in answer["instances"]], label_map and _label_image(label_map)
 
@@ -360,13 +359,13 @@ def _label_image(label_map: Mapping[str, Any]) -> NDArray[np.int32]:
     return flat.reshape(label_map["height"], label_map["width"])
 
 
-def _descriptors(content: bytes) -> Descriptors:
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+def _descriptors(response: httpx.Response) -> Descriptors:
+    with np.load(io.BytesIO(response.content), allow_pickle=False) as arrays:
         return Descriptors(**arrays)
 
 
-def _model(content: bytes) -> ServiceModel:
-    values = json.loads(content)
+def _model(response: httpx.Response) -> ServiceModel:
+    values = response.json()
     values["config"] = DescriptorConfig.of_record(values.pop("descriptor"))
     values |= {name: tuple(values[name]) for name in ("classes", "classifiers")}
     return _known({"knows": "", "teaches": False, "segmenter": None} | values, ServiceModel)
@@ -378,18 +377,11 @@ def _known(values: Mapping[str, Any], kind: type[T]) -> T:
     return kind(**{name: values[name] for name in names})
 
 
-def _objects(content: bytes) -> list[KnownObject]:
-    return [_known(each, KnownObject) for each in json.loads(content)["objects"]]
+def _generation(response: httpx.Response) -> int:
+    return int(response.json()["generation"])
 
 
-def _generation(content: bytes) -> int:
-    return int(json.loads(content)["generation"])
-
-
-def _content(response: httpx.Response) -> bytes:
-    """Return the body of a response; raise ServiceError if its status is an error."""
-    if response.is_success:
-        return response.content
+def _service_error(response: httpx.Response) -> ServiceError:
     retry_after = response.headers.get("Retry-After", "")
     try:
         problem = response.json()
@@ -397,4 +389,4 @@ def _content(response: httpx.Response) -> bytes:
     except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
         field, message = None, response.reason_phrase
     # In responses of proxies, Retry-After may be a date.
-    raise ServiceError(response.status_code, field, message, float(retry_after) if retry_after.isdecimal() else None)
+    return ServiceError(response.status_code, field, message, float(retry_after) if retry_after.isdecimal() else None)

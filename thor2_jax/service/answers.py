@@ -95,8 +95,7 @@ def explained_frame(
         if instance.reason is None:
             result = next(remaining)
             if len(instances) < schemas.MAX_EXPLAINED:
-                confidence = calibrated_confidence(model, recognition, result.inference)
-                details = _details(instance, result, confidence, model.run.config)
+                details = _details(model, instance, result, recognition)
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 
@@ -126,7 +125,7 @@ def calibrated_confidence(model: Model, recognition: Recognition, inference: Inf
 
 
 def _details(
-    instance: PreparedInstance, result: CloudResult, calibrated_confidence: float | None, config: DescriptorConfig
+    model: Model, instance: PreparedInstance, result: CloudResult, recognition: Recognition
 ) -> schemas.Details:
     aligned = result.aligned[: len(instance.points)]
     shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_SHOWN_POINTS]
@@ -135,8 +134,8 @@ def _details(
     return schemas.Details(
         points=aligned[shown].astype(float).round(4).tolist(),
         colors=instance.colors[shown].tolist(),
-        slice_borders=_slice_borders(aligned[:, 2], config),
-        calibrated_confidence=calibrated_confidence,
+        slice_borders=_slice_borders(aligned[:, 2], model.run.config),
+        calibrated_confidence=calibrated_confidence(model, recognition, result.inference),
         image_peak=peak,
         slices=[
             schemas.SliceDetails(image=image.tolist(), strips=_strip_colors(colors))

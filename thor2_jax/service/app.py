@@ -4,8 +4,7 @@ import asyncio
 import contextlib
 import io
 import secrets
-import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +24,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
-from thor2_jax.service.decoding import parse_enrollment, parse_number, read_body, read_form
+from thor2_jax.service.decoding import read_body, read_form
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.hosts import is_allowed_host
 from thor2_jax.service.metrics import count_requests
@@ -33,7 +32,7 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.signals import handlers_replaced
+from thor2_jax.service.signals import ended_by_signals
 
 __all__ = ["create_app"]
 
@@ -59,11 +58,12 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with _stop_accepting_on_signal(service):
+        # The handlers of uvicorn would wait until the worker is ready.
+        with ended_by_signals() if workers > 1 else contextlib.nullcontext():
             await run_in_threadpool(service.start)
             if workers > 1:
                 await run_in_threadpool(service.wait_until_ready)
-            yield
+        yield
         await run_in_threadpool(service.close)
 
     app = FastAPI(
@@ -105,25 +105,6 @@ def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
     return checked
 
 
-@contextlib.contextmanager
-def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
-    """Refuse new requests as soon as the signal arrives; the server closes its connections later."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop_before(handler: Any) -> Callable[[int, Any], None]:
-        def stop(number: int, frame: Any) -> None:
-            service.stop_accepting()
-            if callable(handler):
-                handler(number, frame)
-
-        return stop
-
-    with handlers_replaced(stop_before):
-        yield
-
-
 def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
     @app.get("/healthz")
     async def healthz() -> schemas.Health:
@@ -160,9 +141,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
             recognized = await service.recognize(files, admitted, with_label_map=True)
-            model, timings = service.engine.model, admitted.milliseconds()
-            answer = await run_in_threadpool(explained_frame, model, *recognized, timings)
-            content = await run_in_threadpool(answer.model_dump_json)
+            arguments = service.engine.model, *recognized, admitted.milliseconds()
+            content = await run_in_threadpool(lambda: explained_frame(*arguments).model_dump_json())
         return Response(content, media_type="application/json")
 
     @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})
@@ -171,9 +151,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
         The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
-        seconds = max(service.settings.deadline, WHY_SECONDS)
-        async with service.admit(partial(read_form, request, schemas.WHY_FORM), seconds) as (admitted, files):
-            return await service.why(files, parse_number(files, "instance"), admitted)
+        async with service.admit(partial(read_form, request, schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
+            return await service.why(files, admitted)
 
     arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
     responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
@@ -253,9 +232,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         For a name that exists, set extend or replace.
         """
         async with service.admit(partial(read_form, request, schemas.ENROLLMENT_FORM)) as (admitted, files):
-            name, label, flags = parse_enrollment(files)
-            known = await service.enroll(files, name, label, flags, admitted)
-        (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
+            known = await service.enroll(files, admitted)
+        (enrolled,) = [answer for answer in object_answers(known) if answer.name == files["name"]]
         return schemas.EnrollmentAnswer(
             **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
         )
@@ -268,8 +246,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     async def undo(request: Request) -> schemas.ChangeAnswer:
         """Undo the last change of the gallery, unless it has changed again since then."""
         async with service.admit(partial(read_form, request, schemas.UNDO_FORM)) as (admitted, files):
-            generation = parse_number(files, "generation")
-            known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
+            known = await service.change(lambda objects: objects.undo(files["generation"]), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))

@@ -8,6 +8,7 @@ import io
 import re
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,16 +26,7 @@ from thor2_jax.printable import check_name
 from thor2_jax.service.problem import FieldError, RequestError, field_errors
 from thor2_jax.service.schemas import FORM, MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_POINTS, CloudsBody
 
-__all__ = [
-    "check_instances",
-    "decode_frame",
-    "decode_json_clouds",
-    "decode_npz_clouds",
-    "parse_enrollment",
-    "parse_number",
-    "read_body",
-    "read_form",
-]
+__all__ = ["check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds", "read_body", "read_form"]
 
 MAX_BODY = 16 * 2**20
 """Largest size of a request body, and of the arrays it decompresses to, in bytes."""
@@ -69,12 +61,14 @@ async def read_body(request: Request) -> bytes:
     return b"".join([data async for data in _limited_stream(request)])
 
 
-async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
+async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a multipart form that are in `form`, an OpenAPI request body; other fields are ignored.
+
+    Files are returned as bytes; names, numbers and flags are parsed.
 
     Raises:
         RequestError: 413 if the body is larger than `MAX_BODY`, 415 for another content type or charset, 400 if the
-            form cannot be parsed, 422 if a field is missing or repeated.
+            form cannot be parsed, 422 if a field is missing, repeated or invalid.
     """
     schema = form["content"][FORM]["schema"]
     content_type, options = parse_options_header(request.headers.get("content-type"))
@@ -92,7 +86,7 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
     except MultiPartException as error:
         raise RequestError(400, "body", error.message) from None
     try:
-        fields = {}
+        fields: dict[str, bytes] = {}
         for name in schema["properties"]:
             values = received.getlist(name)
             if not values and name not in schema["required"]:
@@ -100,53 +94,38 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
             if len(values) != 1:
                 raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
             fields[name] = await values[0].read() if isinstance(values[0], UploadFile) else values[0].encode()
-        return fields
     finally:
         await received.close()
+    parsers = {name: partial(_PARSERS[name], name, fields[name]) for name in fields if name in _PARSERS}
+    return {**fields, **_parse_fields(parsers)}
 
 
-def parse_enrollment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]]:
-    """Remove the fields name, instance, extend and replace from a form and parse them; the last two are optional.
-
-    Returns:
-        The name of the object, its number in the label image, and the flags extend and replace.
-
-    Raises:
-        RequestError: 422, with the errors of all fields.
-    """
-    values = _parse_fields(
-        {
-            "name": lambda: _parse_name(fields.pop("name")),
-            "instance": lambda: parse_number(fields, "instance"),
-            "extend": lambda: _parse_flag(fields, "extend"),
-            "replace": lambda: _parse_flag(fields, "replace"),
-        }
-    )
-    name, instance = values.pop("name"), values.pop("instance")
-    if all(values.values()):
-        raise RequestError(422, "replace", "extend and replace are both true; choose one.")
-    return name, instance, values
-
-
-def _parse_name(content: bytes) -> str:
+def _parse_name(_: str, content: bytes) -> str:
     with field_errors("name"):
         # A valid name has at most 4000 bytes; decoding and quoting a long one completely would take time.
         return check_name(content[:4004].decode(errors="surrogateescape"))
 
 
-def _parse_flag(fields: dict[str, bytes], name: str) -> bool:
-    value = fields.pop(name, b"false").lower()
-    if value not in (b"true", b"1", b"false", b"0"):
-        raise RequestError(422, name, f"{name} must be true or false.")
-    return value in (b"true", b"1")
+def _parse_flag(field: str, content: bytes) -> bool:
+    if content.lower() not in (b"true", b"1", b"false", b"0"):
+        raise RequestError(422, field, f"{field} must be true or false.")
+    return content.lower() in (b"true", b"1")
 
 
-def parse_number(fields: dict[str, bytes], name: str) -> int:
-    """Remove a field from a form and return its number; raise RequestError (422) if it is invalid."""
-    content = fields.pop(name)
+def _parse_number(field: str, content: bytes) -> int:
     if not re.fullmatch(rb"[0-9]{1,18}", content):
-        raise RequestError(422, name, f"{name} is not a number; expected a whole number of at most 18 digits.")
+        raise RequestError(422, field, f"{field} is not a number; expected a whole number of at most 18 digits.")
     return int(content)
+
+
+_PARSERS: dict[str, Callable[[str, bytes], Any]] = {
+    "name": _parse_name,
+    "instance": _parse_number,
+    "extend": _parse_flag,
+    "replace": _parse_flag,
+    "generation": _parse_number,
+}
+"""Parsers of the fields of forms that are not files."""
 
 
 def _parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import explained_by_classifiers
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
@@ -111,7 +110,13 @@ class Batcher:
 
 
 class InferenceEngine:
-    """A trained run on the device. Not thread-safe."""
+    """A trained run on the device. Not thread-safe.
+
+    Attributes:
+        run: the run, whose descriptors are computed without a host callback.
+        objects: the enrolled objects. Change a copy of them in another thread, and call `refresh` in this one.
+        max_batch: largest number of clouds in a batch.
+    """
 
     def __init__(self, settings: Settings) -> None:
         """Load the run.
@@ -124,15 +129,14 @@ class InferenceEngine:
             # By default JAX caches only large programs that take more than a second to compile.
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        recognizer = _load(settings)
-        run = recognizer.run
+        self._recognizer = recognizer = _load(settings)
+        self.objects, run = recognizer.objects, recognizer.run
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         model = dataclasses.replace(recognizer.model, run=self.run)
         if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")
         recognizer.model = model
-        self._recognizer = recognizer
         # With `teach`, the embedding is compiled before the first object is enrolled.
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
@@ -167,11 +171,6 @@ class InferenceEngine:
             model = dataclasses.replace(model, color_transform=self.adaptation.transform)
         return [model.corrected(instance) for instance in instances]
 
-    @property
-    def objects(self) -> ObjectGallery:
-        """The enrolled objects. Change a copy of them in another thread, and call `refresh` in this one."""
-        return self._recognizer.objects
-
     def refresh(self) -> None:
         """Read the gallery again if a process has changed it; if it cannot be read, the gallery in memory is unchanged.
 
@@ -196,20 +195,17 @@ class InferenceEngine:
 
     def compile(self, n_clouds: int, n_points: int) -> None:
         """Compile the programs for one of `batch_shapes`."""
-        self._infer([], n_clouds, n_points)
+        self.infer([], (n_clouds, n_points))
 
     def compile_adaptation(self) -> None:
         """Compile the programs of the adaptation, with `adapt`."""
         if self._online is not None:
             self._online.compile()
 
-    def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
-        """Describe and classify at most `max_batch` clouds."""
+    def infer(self, instances: Sequence[PreparedInstance], shape: tuple[int, int] | None = None) -> list[CloudResult]:
+        """Describe and classify at most `max_batch` clouds, in one of `batch_shapes`: by default the smallest."""
         n_points = batch_points(len(instance.points) for instance in instances)
-        return self._infer(instances, _padded_batch(len(instances)), n_points)
-
-    def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
-        clouds = pack_instances(instances, n_clouds, n_points)
+        clouds = pack_instances(instances, *(shape or (_padded_batch(len(instances)), n_points)))
         network, config = self.run.network, self.run.config
         aligned = aligned_looks(clouds, config, config.looks)
         cloud_strips = strips(aligned, network, config)
@@ -245,12 +241,11 @@ def _load(settings: Settings) -> Recognizer:
     Raises:
         InputError: as `Recognizer.load`; also if the given gallery does not exist and `teach` is not set.
     """
-    directory = settings.gallery
-    if directory is not None and not settings.teach:
+    directory = settings.gallery or settings.model / GALLERY_DIRECTORY
+    if settings.gallery is not None and not settings.teach:
         check_exists(directory)
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:
-        directory = directory or settings.model / GALLERY_DIRECTORY
         try:
             check_writable(directory)
         except OSError as error:

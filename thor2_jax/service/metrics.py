@@ -1,19 +1,16 @@
 """Prometheus metrics of the service, including the number of compilations after warm-up (expected to be zero)."""
 
-import contextlib
 import functools
 import os
-from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
-from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
+from prometheus_client.multiprocess import MultiProcessCollector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 __all__ = ["Metrics", "count_requests"]
 
 STAGE_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
-SHARED_DIRECTORY = "PROMETHEUS_MULTIPROC_DIR"
 
 
 class Metrics:
@@ -43,23 +40,11 @@ class Metrics:
 
     def _merged(self) -> CollectorRegistry:
         """Return the registry of this process, or one that merges those of all workers."""
-        if SHARED_DIRECTORY not in os.environ:
+        if "PROMETHEUS_MULTIPROC_DIR" not in os.environ:
             return self._registry
-        _remove_dead_workers(Path(os.environ[SHARED_DIRECTORY]))
         merged = CollectorRegistry()
         MultiProcessCollector(merged)
         return merged
-
-
-def _remove_dead_workers(directory: Path) -> None:
-    """Remove the gauges of workers that have died, so that their requests no longer count as in progress."""
-    for path in directory.glob("gauge_live*.db"):
-        pid = int(path.stem.rpartition("_")[2])
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            with contextlib.suppress(FileNotFoundError):  # Another worker has removed the file.
-                mark_process_dead(pid)
 
 
 def count_requests(app: ASGIApp, metrics: Metrics) -> ASGIApp:

@@ -27,6 +27,7 @@ from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, 
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,
+    Prepare,
     PreparedRequest,
     prepare_clouds,
     prepare_frame,
@@ -49,7 +50,7 @@ WHY_RETRY_SECONDS = 3
 COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
 """JAX event for the compilation of a program."""
 
-COMPILER_THREAD = "compile-explanations"
+COMPILER_THREAD = "compile"
 """Name of the thread whose compilations are not counted, since no request waits for them."""
 
 LOCK_SHARE = 0.8
@@ -101,8 +102,7 @@ class Service:
         self._batcher = Batcher(self._process_batch, settings.max_batch)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
-        self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
-        self._warm_up_thread.start()
+        self._warmed_up = self._compiler.submit(self._warm_up)
         jax.monitoring.register_event_duration_secs_listener(self._count_compilation)
 
     def _count_compilation(self, event: str, duration_secs: float, **_: str | int) -> None:
@@ -123,7 +123,7 @@ class Service:
         except Exception:
             log.exception("warm-up failed")
             self.state = "failed"
-            return
+            raise
         if self.state == "starting":
             self.state = "ready"
             self.metrics.ready_workers.set(1)
@@ -153,10 +153,8 @@ class Service:
         return self._compiled[programs]
 
     def wait_until_ready(self) -> None:
-        """Return when the warm-up has ended; raise RuntimeError if it failed."""
-        self._warm_up_thread.join()
-        if self.state == "failed":
-            raise RuntimeError("warm-up failed")
+        """Return when the warm-up has ended; raise its error if it failed."""
+        self._warmed_up.result()
 
     def check_ready(self) -> None:
         """Raise RequestError (503) unless the service accepts requests."""
@@ -164,31 +162,26 @@ class Service:
             progress = f": {self.progress}" if self.state == "starting" and self.progress else ""
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
-    def stop_accepting(self) -> None:
-        """Refuse new requests; requests in progress are still answered."""
+    def close(self) -> None:
+        """Refuse new requests, finish those in progress, then stop processes and threads."""
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
-
-    def close(self) -> None:
-        """Finish requests in progress, then stop processes and threads."""
-        self.stop_accepting()
-        self._warm_up_thread.join()
+        self._compiler.shutdown(cancel_futures=True)
         self._pool.close()
         self._batcher.close()
-        self._compiler.shutdown(cancel_futures=True)
         self._explainer.shutdown(cancel_futures=True)
         jax.monitoring.unregister_event_duration_listener(self._count_compilation)
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
     async def admit(
-        self, read_body: Callable[[], Awaitable[T]], seconds: float | None = None
+        self, read_body: Callable[[], Awaitable[T]], min_seconds: float = 0.0
     ) -> AsyncIterator[tuple[AdmittedRequest, T]]:
         """Admit a request for the duration of the context; yield it with its body.
 
         Args:
             read_body: function that waits for the body of the request; called only if the request is admitted.
-            seconds: time until the deadline; by default that of the settings.
+            min_seconds: shortest time until the deadline, if that of the settings is shorter.
 
         Raises:
             RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
@@ -197,7 +190,7 @@ class Service:
         self.check_ready()
         if self._in_progress >= self.settings.queue:
             raise RequestError(429, None, f"The queue is full: {self.settings.queue} requests are in progress.")
-        seconds = self.settings.deadline if seconds is None else seconds
+        seconds = max(self.settings.deadline, min_seconds)
         request = AdmittedRequest(seconds)
         self._in_progress += 1
         self._accepted += 1
@@ -236,14 +229,16 @@ class Service:
         recognitions = self.engine.recognize(corrected, results)
         return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
-    async def why(self, files: dict[str, bytes], label: int, request: AdmittedRequest) -> WhyAnswer:
+    async def why(self, fields: dict[str, Any], request: AdmittedRequest) -> WhyAnswer:
         """Explain the answer for one instance of a frame, one request after the other.
+
+        The fields are those of `schemas.WHY_FORM`.
 
         Raises:
             RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
                 this size are compiled.
         """
-        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
+        prepared = await self._prepare(request, prepare_view, fields, self.engine.run.config)
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
@@ -255,9 +250,8 @@ class Service:
             (instance,) = self.engine.correct(prepared.instances, observe=False)
             return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
-        with timed(request.seconds, "explain"):
-            with field_errors("instance"):
-                answer = await asyncio.wrap_future(self._explainer.submit(explained))
+        with timed(request.seconds, "explain"), field_errors("instance"):
+            answer = await asyncio.wrap_future(self._explainer.submit(explained))
         answer.timings = request.milliseconds()
         return answer
 
@@ -266,26 +260,26 @@ class Service:
         prepared = await self._prepare(request, prepare_clouds, content, is_npz)
         return await self._infer(prepared.instances, request)
 
-    async def enroll(
-        self, files: dict[str, bytes], name: str, label: int, flags: dict[str, bool], request: AdmittedRequest
-    ) -> ObjectGallery:
-        """Enroll an object from one instance of the frame in `files`, and return the new gallery.
+    async def enroll(self, fields: dict[str, Any], request: AdmittedRequest) -> ObjectGallery:
+        """Enroll an object from one instance of a frame, and return the new gallery.
 
-        The view and its augmented copies are embedded in batches, like the instances of frames. The flags are
-        `extend` and `replace` of `ObjectGallery.add`.
+        The view and its augmented copies are embedded in batches, like the instances of frames. The fields are those of
+        `schemas.ENROLLMENT_FORM`.
 
         Raises:
-            RequestError: 409 if the name exists and neither `extend` nor `replace` is true; also as `change` and
-                `prepare_view`. Nothing is enrolled.
+            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, 422 if both are; also as
+                `change` and `prepare_view`. Nothing is enrolled.
         """
+        name, flags = fields["name"], {flag: fields.get(flag, False) for flag in ("extend", "replace")}
+        if all(flags.values()):
+            raise RequestError(422, "replace", "extend and replace are both true; choose one.")
         with self._gallery_errors(409, "name"):
-            self.engine.objects.refresh()
-            self.engine.objects.gallery.name_to_enroll(name, **flags)
-        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config, label)
+            self.known_objects().gallery.name_to_enroll(name, **flags)
+        prepared = await self._prepare(request, prepare_view, fields, self.engine.run.config)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
         except InputError as error:
-            message = str(error).replace("views[0]", f"instance {label}")
+            message = str(error).replace("views[0]", f"instance {fields['instance']}")
             raise RequestError(422, "instance", f"{message}.") from None
         views = await asyncio.to_thread(views_to_embed, clouds, "frames")
         embeddings = np.array([result.inference.embeddings[:LOOKS] for result in await self._infer(views, request)])
@@ -342,9 +336,7 @@ class Service:
             self.engine.objects.refresh()
         return self.engine.objects
 
-    async def _prepare(
-        self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any
-    ) -> PreparedRequest:
+    async def _prepare(self, request: AdmittedRequest, function: Prepare, *arguments: Any) -> PreparedRequest:
         prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, function, *arguments))
         request.seconds.update(prepared.seconds)
         return prepared

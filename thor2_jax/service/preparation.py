@@ -30,7 +30,7 @@ from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.signals import signals_blocked
 
-__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
+__all__ = ["PreparationPool", "Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
 MAX_LABEL_RUNS = 50_000
 """Largest number of runs in the label map of an explained frame."""
@@ -62,6 +62,10 @@ class PreparedRequest:
     seconds: dict[str, float]
     label_map: LabelMap | None = None
     frame: RGBDFrame | None = None
+
+
+Prepare = Callable[..., PreparedRequest]
+"""A function such as `prepare_frame`; it and its arguments are pickled."""
 
 
 def prepare_frame(
@@ -110,31 +114,28 @@ def _warm_up(name: str) -> None:
         segmented(blank, _segmenter(name))
 
 
-def prepare_view(files: dict[str, bytes], config: DescriptorConfig, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance for enrollment or explanation.
+def prepare_view(fields: dict[str, Any], config: DescriptorConfig) -> PreparedRequest:
+    """Decode a frame and compute the cloud of its instance `fields["instance"]` for enrollment or explanation.
 
     Raises:
         RequestError: 422 if there is no such instance or it has too few points; also as `prepare_frame`.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
-        frame = decode_frame(**files)
+        frame = decode_frame(**{name: fields[name] for name in ("color", "depth", "intrinsics", "labels")})
     with timed(seconds, "clouds"), field_errors():
-        view = instance_view(frame, label, config.sigma_s)
+        view = instance_view(frame, fields["instance"], config.sigma_s)
     return PreparedRequest([view], seconds, frame=frame)
 
 
 def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
-    step = 1
-    while True:
-        coarse = labels[::step, ::step]
-        flat = coarse.ravel()
-        starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
-        if len(starts) <= MAX_LABEL_RUNS:
-            height, width = coarse.shape
-            lengths = np.diff(starts, append=flat.size)
-            return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
-        step *= 2
+    flat = labels.ravel()
+    starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
+    if len(starts) > MAX_LABEL_RUNS:
+        return _encode_label_map(labels[::2, ::2])
+    height, width = labels.shape
+    lengths = np.diff(starts, append=flat.size)
+    return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
 
 
 def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
@@ -150,24 +151,26 @@ def _run_process(pipe: Connection, segmenter: str | None) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
     if segmenter is not None:
         _warm_up(segmenter)
-    pipe.send("ready")
-    outcome: tuple[Any, Exception | None]
     with contextlib.suppress(EOFError, OSError):  # The service has ended or was killed.
+        pipe.send("ready")
         while True:
             function, arguments = pipe.recv()
             try:
-                outcome = function(*arguments), None
+                pipe.send((function(*arguments), None))
             except RequestError as error:
-                outcome = None, error
+                pipe.send((None, error))
             except Exception:
-                outcome = None, RuntimeError(traceback.format_exc())
-            pipe.send(outcome)
+                pipe.send((None, RuntimeError(traceback.format_exc())))
 
 
 class _PreparationProcess:
     def __init__(self, context: Any, segmenter: str | None) -> None:
-        self.pipe, child_pipe = context.Pipe()
-        self.process = context.Process(target=_run_process, args=(child_pipe, segmenter), daemon=True)
+        self._context, self._segmenter = context, segmenter
+        self.start()
+
+    def start(self) -> None:
+        self.pipe, child_pipe = self._context.Pipe()
+        self.process = self._context.Process(target=_run_process, args=(child_pipe, self._segmenter), daemon=True)
         with signals_blocked(signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; `stop` ends this one.
             self.process.start()
         child_pipe.close()
@@ -178,55 +181,50 @@ class _PreparationProcess:
         self.process.join()
         self.pipe.close()
 
+    def restart(self) -> None:
+        self.stop()
+        self.start()
+
 
 class PreparationPool:
     """A fixed number of processes, each with a thread that waits for it."""
 
     def __init__(self, count: int, segmenter: str | None = None) -> None:
         """Start `count` processes, each of which loads the segmenter of this name."""
-        self._segmenter = segmenter
         # The fork server has imported this module and has no threads, so that a replacement process starts at once.
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([__name__])
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([__name__])
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")
         self._idle: queue.SimpleQueue[_PreparationProcess] = queue.SimpleQueue()
         for _ in range(count):
-            self._idle.put(_PreparationProcess(self._context, segmenter))
+            self._idle.put(_PreparationProcess(context, segmenter))
 
-    def submit(
-        self, deadline: float, function: Callable[..., PreparedRequest], *arguments: Any
-    ) -> Future[PreparedRequest]:
-        """Call `function` in a process; the function and its arguments are pickled.
+    def submit(self, deadline: float, function: Prepare, *arguments: Any) -> Future[PreparedRequest]:
+        """Call `function` in a process.
 
         The future raises RequestError: the error of the function, 504 if the call has not returned at `deadline` (a
         time of `time.monotonic`), 422 if the process crashed.
         """
         return self._threads.submit(self._call, deadline, function, arguments)
 
-    def _call(
-        self, deadline: float, function: Callable[..., PreparedRequest], arguments: Sequence[Any]
-    ) -> PreparedRequest:
+    def _call(self, deadline: float, function: Prepare, arguments: Sequence[Any]) -> PreparedRequest:
         process = self._idle.get()
         try:
             if not process.process.is_alive():
-                process = self._replace(process)
+                process.restart()
             process.pipe.send((function, arguments))
             if not process.pipe.poll(max(deadline - time.monotonic(), MIN_SECONDS)):
-                process = self._replace(process)
+                process.restart()
                 raise RequestError(504)
             result, error = process.pipe.recv()
         except (EOFError, OSError):
-            process = self._replace(process)
+            process.restart()
             raise RequestError(422, "body", "The body made the process that decoded it crash.") from None
         finally:
             self._idle.put(process)
         if error is not None:
             raise error
         return result
-
-    def _replace(self, process: _PreparationProcess) -> _PreparationProcess:
-        process.stop()
-        return _PreparationProcess(self._context, self._segmenter)
 
     def close(self) -> None:
         """Wait for submitted calls, then stop the processes."""

@@ -6,42 +6,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from thor2_jax.capacity import POINT_BUCKETS
 
-__all__ = [
-    "AdaptationAnswer",
-    "CLOUDS_BODY",
-    "FORM",
-    "FRAME_FORM",
-    "ENROLLMENT_FORM",
-    "MAX_CLOUDS",
-    "MAX_CLOUD_COORDINATE",
-    "MAX_EXPLAINED",
-    "MAX_POINTS",
-    "NPZ",
-    "UNDO_FORM",
-    "Candidate",
-    "CloudsBody",
-    "ChangeAnswer",
-    "ColorNetworkAnswer",
-    "DescribeAnswer",
-    "Details",
-    "EnrollmentAnswer",
-    "ExplainedFrame",
-    "ExplainedInstance",
-    "FrameAnswer",
-    "Health",
-    "InstanceAnswer",
-    "LabelMap",
-    "ModelAnswer",
-    "ObjectAnswer",
-    "ObjectsAnswer",
-    "Readiness",
-    "SliceDetails",
-    "StripColors",
-    "WHY_FORM",
-    "WhyAnswer",
-    "WhyPicture",
-]
-
 FORM = "multipart/form-data"
 """Content type of forms."""
 

@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 
 import uvicorn
 from fastapi import FastAPI
+from prometheus_client.multiprocess import mark_process_dead
 from uvicorn.config import LOGGING_CONFIG
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
@@ -75,8 +76,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     )
     with listening(host, port) as (listener, url):
         if workers == 1:
-            with ended_by_signals():
-                config.load()
+            config.load()
             log.info("listening at %s", url)
             # uvicorn raises the signal again after the shutdown, which then is a normal exit.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -102,9 +102,12 @@ class _Supervisor(Multiprocess):
         self._close_ends_of_workers()
 
     def keep_subprocess_alive(self) -> None:
-        """Replace workers that have died."""
+        """Replace workers that have died; their requests no longer count as in progress."""
+        before = {process.pid for process in self.processes}
         with signals_blocked(signal.SIGINT):
             super().keep_subprocess_alive()
+        for pid in before - {process.pid for process in self.processes}:
+            mark_process_dead(pid)
         self._close_ends_of_workers()
 
     def _close_ends_of_workers(self) -> None:
@@ -116,9 +119,8 @@ class _Supervisor(Multiprocess):
 def _create_worker(settings: Settings, workers: int) -> FastAPI:
     """Create the application of one process; a worker is terminated when its parent has ended, even by SIGKILL."""
     parent = multiprocessing.parent_process()
-    if parent is None:
-        return create_app(settings, workers)
-    threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
+    if parent is not None:
+        threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
     with ended_by_signals():  # uvicorn's handler would wait for the compilation.
         return create_app(settings, workers)
 

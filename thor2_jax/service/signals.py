@@ -2,24 +2,10 @@
 
 import contextlib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing import resource_tracker
-from typing import Any
 
-__all__ = ["ended_by_signals", "handlers_replaced", "signals_blocked"]
-
-
-@contextlib.contextmanager
-def handlers_replaced(replace: Callable[[Any], Any]) -> Iterator[None]:
-    """Replace the handlers of SIGINT and SIGTERM inside the context; `replace` returns the new handler for each."""
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number, handler in previous.items():
-        signal.signal(number, replace(handler))
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+__all__ = ["ended_by_signals", "signals_blocked"]
 
 
 @contextlib.contextmanager
@@ -29,8 +15,14 @@ def ended_by_signals() -> Iterator[None]:
     While modules and models are loaded, the exception of Python's handler can get lost, and with it the signal:
     exceptions in callbacks, such as those of JAX for garbage collection, are ignored.
     """
-    with handlers_replaced(lambda previous: previous if previous is signal.SIG_IGN else signal.SIG_DFL):
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in previous.items():
+        signal.signal(number, handler if handler is signal.SIG_IGN else signal.SIG_DFL)
+    try:
         yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -270,6 +270,7 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: py
     """Its other counts are kept."""
     code = """if True:
         import os
+        from unittest.mock import Mock, patch
         from thor2_jax.service.metrics import Metrics
         died = os.fork()
         metrics = Metrics()
@@ -279,6 +280,9 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: py
             os._exit(0)
         os.waitpid(died, 0)
         metrics.in_progress.inc(1)
+        from thor2_jax.service import server
+        with patch.object(server.Multiprocess, "keep_subprocess_alive", lambda self: self.processes.clear()):
+            server._Supervisor.keep_subprocess_alive(Mock(server._Supervisor, processes=[Mock(pid=died)]))
         print(metrics.text().decode())
     """
     monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))

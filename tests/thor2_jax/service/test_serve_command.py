@@ -121,20 +121,24 @@ def test_health_check_ends_when_the_worker_dies(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    app = create_app(Settings(run_dir), workers=2)
+    """It ends a worker at once, which then does not compile for a minute; uvicorn handles it in a ready worker."""
+    app, actions = create_app(Settings(run_dir), workers=2), []
 
-    async def state() -> str:
+    def record() -> None:
+        actions.append(signal.getsignal(signal.SIGTERM))
+
+    async def start() -> None:
         async with app.router.lifespan_context(app):
-            return str(app.state.service.state)
+            record()
 
-    for name in ("wait_until_ready", "close"):
-        monkeypatch.setattr(app.state.service, name, lambda: None)
-    monkeypatch.setattr(app.state.service, "start", lambda: signal.raise_signal(signal.SIGTERM))
-    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    for name in ("start", "wait_until_ready", "close"):
+        monkeypatch.setattr(app.state.service, name, record)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        assert asyncio.run(state()) == "stopping"
+        asyncio.run(start())
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        signal.signal(signal.SIGTERM, before)
+    assert actions == [signal.SIG_DFL] * 2 + [signal.default_int_handler] * 2
 
 
 def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, refused: Command, run_dir: Path) -> None:
