@@ -55,6 +55,11 @@ class TexturedMesh:
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     @property
+    def longest_side(self) -> float:
+        """Longest side of the axis-aligned bounding box, metres."""
+        return float(np.ptp(self.vertices, axis=0).max())
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the arrays, since mesh files may refer to other files and meshes may not come from files."""
         parts: list[str | bytes] = []
