@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table

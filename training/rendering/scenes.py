@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from training.objects.mesh import TexturedMesh, moved
+from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
 from training.rendering.camera import (
     Camera,
     RayCaster,
@@ -179,9 +179,7 @@ def _table() -> TexturedMesh:
     texture = (np.array([150, 138, 122]) + np.repeat(np.repeat(planks, 32, axis=0), 512, axis=1)).astype(np.uint8)
     texture[::32] = 96, 88, 78
     corner = np.array([[-0.8, -0.8, 0], [0.8, -0.8, 0], [0.8, 0.8, 0], [-0.8, 0.8, 0]])
-    uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return TexturedMesh(corner, faces, uv, (texture,), np.zeros(2, np.int32))
+    return TexturedMesh(corner, np.array(QUAD_FACES, np.int32), QUAD_UV, (texture,), np.zeros(2, np.int32))
 
 
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -227,8 +225,8 @@ def compose_scene(
     Raises:
         InputError: there are fewer than `n_objects` objects.
     """
-    names, meshes, _, pose = _composed(objects, n_objects, clutter, rng)
-    return _render(names, meshes, pose, camera, noise, light, rng)
+    meshes, _, pose = _composed(objects, n_objects, clutter, rng)
+    return _render(meshes, pose, camera, noise, light, rng)
 
 
 def compose_views(
@@ -265,18 +263,18 @@ def compose_views(
     Raises:
         InputError: there are fewer than `n_objects` objects.
     """
-    names, meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
+    meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
     views = []
     for turn in np.arange(n_views) * arc / n_views:
         pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
-        views.append((_render(names, meshes, pose, camera, noise, light, rng), pose))
+        views.append((_render(meshes, pose, camera, noise, light, rng), pose))
     return views
 
 
 def _composed(
     objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
-) -> tuple[list[str], list[TexturedMesh], float, Array]:
-    """Return names and meshes of random objects on the table, and the azimuth and pose of a camera in line with them.
+) -> tuple[dict[str, TexturedMesh], float, Array]:
+    """Return random objects on the table, and the azimuth and pose of a camera in line with them.
 
     Raises:
         InputError: there are fewer than `count` objects.
@@ -287,7 +285,8 @@ def _composed(
     azimuth = rng.uniform(0, 2 * np.pi)
     pose = _random_pose(rng, azimuth)
     towards = np.array([np.cos(azimuth), np.sin(azimuth)])
-    return names, _arrange([objects[name] for name in names], towards, clutter, rng), azimuth, pose
+    arranged = _arrange([objects[name] for name in names], towards, clutter, rng)
+    return dict(zip(names, arranged, strict=True)), azimuth, pose
 
 
 def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:
@@ -297,21 +296,15 @@ def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:
 
 
 def _render(
-    names: Sequence[str],
-    meshes: Sequence[TexturedMesh],
-    pose: NDArray[np.float64],
-    camera: Camera,
-    noise: float,
-    light: float,
-    rng: np.random.Generator,
+    meshes: dict[str, TexturedMesh], pose: Array, camera: Camera, noise: float, light: float, rng: np.random.Generator
 ) -> Scene:
     """Render arranged objects; the last arguments are as in `compose_scene`."""
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
-    hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
+    hits = RayCaster([_table(), *meshes.values()]).cast(pose[:3, 3], rays)
     shape = (camera.height, camera.width)
     labels = hits.mesh.clip(0).astype(np.uint8 if len(meshes) < 256 else np.uint16).reshape(shape)
     truth, visible = {}, {}
-    for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), 1):
+    for label, (name, mesh) in enumerate(meshes.items(), 1):
         pixels = int((labels == label).sum())
         if pixels < MIN_PIXELS:
             labels[labels == label] = 0
