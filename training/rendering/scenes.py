@@ -7,13 +7,13 @@ The table is the plane z = 0. Objects rest on it without touching, and occlude e
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
 from training.rendering.camera import (
@@ -134,8 +134,8 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
     return _Placed(mesh.transformed(matrix), footprint[outline.vertices], outline.equations[:, :2])
 
 
-def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Array | None:
-    """Return a free position [2] in line with a placed object and the camera, with the taller one in front, or None."""
+def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield positions [2] in line with a placed object and the camera, with the taller one in front."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])
@@ -145,20 +145,16 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
     for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
         place = middle + distance * forth
         if np.linalg.norm(place) > 1.3 * TABLE_RADIUS:
-            return None
-        if all(new.apart(other, *place) for other in placed):
-            return place
-    return None
+            return
+        yield place
 
 
-def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
-    """Return a free position [2] on the table; the radius is enlarged only if there is no space."""
+def _anywhere(rng: np.random.Generator) -> Iterator[Array]:
+    """Yield random positions [2] on the table, within a radius that grows slowly, in case there is no space."""
     reach = TABLE_RADIUS
     while True:
         angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
-        place = radius * np.array([np.cos(angle), np.sin(angle)])
-        if all(new.apart(other, *place) for other in placed):
-            return place
+        yield radius * np.array([np.cos(angle), np.sin(angle)])
         reach *= 1.005
 
 
@@ -168,8 +164,9 @@ def _arrange(
     placed: list[_Placed] = []
     for mesh in meshes:
         new = _put_down(mesh, rng)
-        place = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else None
-        placed.append(new.moved(*(_anywhere(new, placed, rng) if place is None else place)))
+        in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
+        places = itertools.chain(in_line, _anywhere(rng))
+        placed.append(new.moved(*next(each for each in places if all(new.apart(other, *each) for other in placed))))
     return [item.mesh for item in placed]
 
 
@@ -209,7 +206,7 @@ def compose_scene(
     Args:
         objects: name -> mesh; metres, z up.
         rng: random number generator.
-        n_objects: number of objects in the scene, each a different one.
+        n_objects: number of objects in the scene, each a different one; at most the number of `objects`.
         camera: camera of the frame.
         clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
             occludes the other.
@@ -221,9 +218,6 @@ def compose_scene(
     Returns:
         The scene. An instance with fewer than `MIN_PIXELS` visible pixels is not labelled (its pixels are 0), so that
         there may be fewer than `n_objects` labels.
-
-    Raises:
-        InputError: there are fewer than `n_objects` objects.
     """
     meshes, _, pose = _composed(objects, n_objects, clutter, rng)
     return _render(meshes, pose, camera, noise, light, rng)
@@ -259,9 +253,6 @@ def compose_views(
 
     Returns:
         For each camera, the scene as from `compose_scene` and the pose [4, 4], camera to world coordinates.
-
-    Raises:
-        InputError: there are fewer than `n_objects` objects.
     """
     meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
     views = []
@@ -274,13 +265,7 @@ def compose_views(
 def _composed(
     objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
 ) -> tuple[dict[str, TexturedMesh], float, Array]:
-    """Return random objects on the table, and the azimuth and pose of a camera in line with them.
-
-    Raises:
-        InputError: there are fewer than `count` objects.
-    """
-    if not 1 <= count <= len(objects):
-        raise InputError(f"n_objects is {count!r}; it must be 1 to {len(objects)}, the number of objects")
+    """Return random objects on the table, and the azimuth and pose of a camera in line with them."""
     names = [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
     azimuth = rng.uniform(0, 2 * np.pi)
     pose = _random_pose(rng, azimuth)

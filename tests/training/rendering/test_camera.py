@@ -95,11 +95,6 @@ def test_nearest_mesh_is_hit_and_named() -> None:
     assert hits.distance.tolist() == pytest.approx([1.45, 0.925, np.inf])
 
 
-def test_no_rays() -> None:
-    hits = RayCaster([painted(trimesh.creation.box([0.1] * 3))]).cast(np.zeros(3), np.zeros((0, 3)))
-    assert hits.distance.shape == (0,) and hits.color.shape == (0, 3)
-
-
 def test_an_object_outside_the_image_leaves_it_empty() -> None:
     mesh = painted(trimesh.creation.box([0.1] * 3))
     for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):

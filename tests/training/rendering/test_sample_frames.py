@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 import thor2_jax
-from thor2_jax.frames.frames import RGBDFrame, read_frame
+from training.readers.frames import frame_files
 from training.rendering.sample_frames import write_sample_frames
 
 PACKAGED = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
-
-
-def read(folder: Path) -> RGBDFrame:
-    parts = {"color": "color.jpg", "depth": "depth.png", "labels": "labels.png", "intrinsics": "intrinsics.json"}
-    return read_frame(**{part: folder / name for part, name in parts.items()})
 
 
 @pytest.mark.slow
@@ -24,7 +19,7 @@ def test_packaged_samples_are_up_to_date(tmp_path: Path) -> None:
     index = json.loads((tmp_path / "index.json").read_text())
     assert index == json.loads((PACKAGED / "index.json").read_text())
     for one in index:
-        rendered, packaged = read(tmp_path / one["folder"]), read(PACKAGED / one["folder"])
+        rendered, packaged = (frame_files(folder / one["folder"]).read() for folder in (tmp_path, PACKAGED))
         assert rendered.intrinsics == packaged.intrinsics
         # Ray casting and JPEG may round differently on other machines.
         for name, tolerance in (("labels", 0), ("depth", 1), ("color", 4)):
