@@ -65,11 +65,9 @@ def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
-    if visual.kind == "vertex":
-        return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
-    if visual.kind == "face":
-        colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
-        return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
+    if visual.kind in ("vertex", "face"):
+        colors = visual.vertex_colors[faces] if visual.kind == "vertex" else np.stack([visual.face_colors] * 3, axis=1)
+        return TexturedMesh(vertices, faces, corner_colors=np.asarray(colors[..., :3], np.uint8))
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours")
     material = visual.material

@@ -81,12 +81,9 @@ class _Placed:
     def height(self) -> float:
         return float(self.mesh.vertices[:, 2].max())
 
-    def moved(self, x: float, y: float) -> "_Placed":
-        return _Placed(moved(self.mesh, (x, y, 0)), self.corners + [x, y], self.normals)
-
-    def apart(self, other: "_Placed", x: float, y: float) -> bool:
-        """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
-        here, there = self.corners + [x, y], other.corners
+    def apart(self, other: "_Placed", place: Array) -> bool:
+        """Return whether this object, moved to `place` [2], is at least `MIN_GAP` from the other (separating axes)."""
+        here, there = self.corners + place, other.corners
         gaps = (self.normals @ there.T).min(axis=1) - (self.normals @ here.T).max(axis=1)
         other_gaps = (other.normals @ here.T).min(axis=1) - (other.normals @ there.T).max(axis=1)
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
@@ -166,7 +163,8 @@ def _arrange(
         new = _put_down(mesh, rng)
         in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
         places = itertools.chain(in_line, _anywhere(rng))
-        placed.append(new.moved(*next(each for each in places if all(new.apart(other, *each) for other in placed))))
+        place = next(each for each in places if all(new.apart(other, each) for other in placed))
+        placed.append(_Placed(moved(new.mesh, (*place, 0)), new.corners + place, new.normals))
     return [item.mesh for item in placed]
 
 
