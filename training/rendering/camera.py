@@ -244,11 +244,13 @@ def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera:
     in_camera = (vertices - pose[:3, 3]) @ pose[:3, :3]
     if in_camera[:, 2].min() <= 0:
         return 0, camera.height, 0, camera.width
-    k, size = camera.intrinsics, np.array([camera.width, camera.height])
-    pixels = in_camera[:, :2] / in_camera[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
-    first = np.floor(pixels.min(axis=0)).clip(0, size - 1)
-    end = (np.ceil(pixels.max(axis=0)) + 1).clip(first + 1, size)
-    return int(first[1]), int(end[1]), int(first[0]), int(end[0])
+    k = camera.intrinsics
+    box = []
+    for axis, (f, c, size) in enumerate([(k.fx, k.cx, camera.width), (k.fy, k.cy, camera.height)]):
+        pixels = in_camera[:, axis] / in_camera[:, 2] * f + c
+        low = int(np.clip(np.floor(pixels.min()), 0, size - 1))
+        box.append((low, int(np.clip(np.ceil(pixels.max()) + 1, low + 1, size))))
+    return *box[1], *box[0]
 
 
 def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> RenderedView:
