@@ -85,7 +85,7 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
     """Return an augmented copy of a view, determined by the arguments and the state of `rng`.
 
     The order is illumination, registration, segmentation, base, occlusion, sensor. Flying pixels are removed after
-    segmentation and sensor, as recognition does.
+    segmentation and sensor, as recognition does, that is, unless they are more than half of all pixels.
 
     Args:
         view: view as rendered; not modified.
@@ -101,11 +101,8 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
     for name, (_, apply) in KINDS.items():
         settings = getattr(augmentations, name)
         view = apply(view, settings, rng) if settings else view
-    return _without_flying(view) if augmentations.segmentation or augmentations.sensor else view
-
-
-def _without_flying(view: RenderedView) -> RenderedView:
-    """Remove flying pixels as recognition does, that is, unless they are more than half of all pixels."""
+    if not (augmentations.segmentation or augmentations.sensor):
+        return view
     pixels = np.flatnonzero(view.depth)
     flying = flying_pixels(view.frame, pixels)
     return view if 2 * flying.sum() > len(pixels) else view.without(pixels[flying])

@@ -128,8 +128,7 @@ def _color(color: NDArray[np.uint8], camera: SimulatedCamera, rng: np.random.Gen
     values *= camera.gain * np.array([1 + camera.warmth, 1, 1 - camera.warmth], np.float32)
     grey = (values @ LUMA)[..., None]
     values = (grey + camera.saturation * (values - grey)) * (1 - camera.veil) + camera.veil
-    if camera.blur:
-        values = gaussian_filter(values, (camera.blur, camera.blur, 0))
+    values = gaussian_filter(values, (camera.blur, camera.blur, 0))
     (row, column), (height, width) = camera.shift, color.shape[:2]
     rows, columns = (np.arange(n) - s for n, s in ((height, row), (width, column)))
     values = values[rows.clip(0, height - 1)][:, columns.clip(0, width - 1)]
@@ -176,9 +175,8 @@ def _labels(
 
 def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.integer]:
     """Return the labels without `pixels` [H, W]; masks that would keep less than `MIN_MASK` are not changed."""
-    counts, lost = (np.bincount(values.ravel()) for values in (labels, labels[pixels]))
-    share = np.zeros(len(counts))
-    share[: len(lost)] = lost / np.maximum(counts[: len(lost)], 1)
+    counts = np.bincount(labels.ravel())
+    share = np.bincount(labels[pixels], minlength=len(counts)) / np.maximum(counts, 1)
     return np.where(pixels & (share <= 1 - MIN_MASK)[labels], 0, labels).astype(labels.dtype)
 
 

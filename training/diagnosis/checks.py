@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics
-from training.objects.meshes import MAX_SIDE, MIN_SIDE, longest_side
+from training.objects.meshes import MAX_SIDE, MIN_SIDE, read_mesh
 
 __all__ = ["Diagnosis", "check_camera", "check_labels", "check_meshes"]
 
@@ -169,7 +169,7 @@ def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float 
     sides = {}
     for name, path in meshes.items():
         try:
-            sides[name] = longest_side(path) * scale
+            sides[name] = read_mesh(path).longest_side * scale
         except InputError as error:
             diagnosis.add("mesh", f"A mesh cannot be used: {error}.", "Repair it, or leave it out.")
     if not sides:

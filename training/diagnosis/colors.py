@@ -94,7 +94,10 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
             f"least {MIN_OBJECTS} objects of the model"
         )
         return
-    lights = {name: confidences(_lit(frame.color, factors)) for name, factors in LIGHTS.items()}
+    lights = {}
+    for name, factors in LIGHTS.items():
+        lit = np.rint(frame.color * np.array(factors)).clip(0, 255)
+        lights[name] = confidences(lit.astype(np.uint8))
     best = max(lights, key=lambda name: float(lights[name].mean()))
     if _logit(exchanged) - _logit(given) > MIN_LOGIT_GAIN and exchanged.mean() > lights[best].mean():
         diagnosis.add(
@@ -110,10 +113,6 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
             f"{lights[best].mean():.2f} instead of {given.mean():.2f}).",
             "Set the exposure and the white balance of the camera.",
         )
-
-
-def _lit(color: NDArray[np.uint8], factors: tuple[float, float, float]) -> NDArray[np.uint8]:
-    return np.clip(np.rint(color * np.array(factors)), 0, 255).astype(np.uint8)
 
 
 def _logit(confidence: NDArray[np.float64]) -> float:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
@@ -69,8 +68,8 @@ def instance_extents(frame: RGBDFrame) -> dict[int, float]:
 def check_depth(
     diagnosis: Diagnosis,
     frame: RGBDFrame,
-    mesh_sides: Mapping[str, float] = MappingProxyType({}),
-    names: Mapping[int, str] = MappingProxyType({}),
+    mesh_sides: Mapping[str, float] = {},
+    names: Mapping[int, str] = {},
     *,
     trust_camera: bool = True,
 ) -> None:
@@ -99,11 +98,11 @@ def check_depth(
         return
     extents = instance_extents(frame) if labelled and trust_camera else {}
     median = float(np.median(valid))
-    if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, extents, mesh_sides, names):
-        return
     own = {label: mesh_sides[name] for label, name in names.items() if label in extents and name in mesh_sides}
-    compared = [extents[label] for label in own or extents]
-    if _check_unit(diagnosis, frame, median, compared, list((own or mesh_sides).values())):
+    compared, sides = [extents[label] for label in own or extents], [*(own or mesh_sides).values()]
+    if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, compared, sides, bool(own)):
+        return
+    if _check_unit(diagnosis, frame, median, compared, sides):
         return
     in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
     if in_range < MIN_IN_RANGE:
@@ -116,27 +115,22 @@ def check_depth(
 
 
 def _check_focal_length(
-    diagnosis: Diagnosis,
-    median: float,
-    extents: Mapping[int, float],
-    mesh_sides: Mapping[str, float],
-    names: Mapping[int, str],
+    diagnosis: Diagnosis, median: float, extents: list[float], mesh_sides: list[float], is_paired: bool
 ) -> bool:
     """Check the sizes of objects at a plausible distance against their meshes; return whether fx, fy are too small.
 
-    If no object has a name and there are as many meshes as objects, they are compared in the order of their sizes.
-    Otherwise, the longest mesh is the upper bound for all objects. `_check_unit` reports a single instance that is much
+    Unless each object is paired with its own mesh, as many meshes as objects are compared in the order of their sizes;
+    otherwise, the longest mesh is the upper bound for all objects. `_check_unit` reports a single instance that is much
     larger, since it may cover several objects.
     """
-    ratios = [extent / mesh_sides[names[label]] for label, extent in extents.items() if names.get(label) in mesh_sides]
-    largest = MAX_FOCAL_FACTOR
-    if not ratios and mesh_sides:
-        sides = sorted(mesh_sides.values())
-        sides = sides if len(sides) == len(extents) else [sides[-1]] * len(extents)
-        ratios = [extent / side for extent, side in zip(sorted(extents.values()), sides, strict=True)]
-        largest = EXTENT_MARGIN if len(ratios) == 1 else MAX_FOCAL_FACTOR
-    ratio = float(np.median(ratios)) if ratios else 1.0
-    if not MAX_RATIO < ratio <= largest:
+    if not extents or not mesh_sides:
+        return False
+    if not is_paired:
+        extents, mesh_sides = sorted(extents), sorted(mesh_sides)
+        mesh_sides = mesh_sides if len(mesh_sides) == len(extents) else mesh_sides[-1:] * len(extents)
+    ratios = np.divide(extents, mesh_sides)
+    ratio = float(np.median(ratios))
+    if not MAX_RATIO < ratio <= (EXTENT_MARGIN if len(ratios) == 1 and not is_paired else MAX_FOCAL_FACTOR):
         return False
     diagnosis.add(
         "intrinsics-focal",

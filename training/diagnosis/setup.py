@@ -6,7 +6,6 @@ for finding in diagnose(FrameFiles(color, depth, labels, intrinsics)).findings:
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,7 +30,7 @@ def diagnose(
     *,
     depth_scale: float | None = None,
     recognizer: Recognizer | None = None,
-    meshes: Mapping[str, Path] = MappingProxyType({}),
+    meshes: Mapping[str, Path] = {},
     mesh_scale: float = 1.0,
 ) -> Diagnosis:
     """Diagnose the set-up with which a frame was recorded.

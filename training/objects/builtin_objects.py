@@ -117,23 +117,18 @@ def _ellipse(x: Array, y: Array, centre: tuple[float, float], radii: tuple[float
 def _soup_can(label: Color) -> TexturedMesh:
     profile = [(0, 0.002), (0.031, 0.002), (0.033, 0), (0.033, 0.101), (0.031, 0.099), (0, 0.099)]
     across = 0.104  # width of half of the label, metres
-    return _lathe(
-        profile,
-        STEEL,
-        (label, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.097)),
-        (IVORY, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.030)),
-        (YELLOW, lambda u, r, z, s: (r > 0.0325) & _ellipse((u * 2 % 1 - 0.5) * across, z, (0, 0.062), (0.014, 0.014))),
-    )
+    paper: Mark = (label, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.097))
+    band: Mark = (IVORY, lambda u, r, z, s: (r > 0.0325) & (z > 0.004) & (z < 0.030))
+    disc = ((0, 0.062), (0.014, 0.014))
+    discs: Mark = (YELLOW, lambda u, r, z, s: (r > 0.0325) & _ellipse((u * 2 % 1 - 0.5) * across, z, *disc))
+    return _lathe(profile, STEEL, paper, band, discs)
 
 
 def _mug(outside: Color, inside: Color, stripe: Color) -> TexturedMesh:
     profile = [(0, 0), (0.038, 0), (0.041, 0.003), (0.041, 0.095), (0.038, 0.095), (0.038, 0.007), (0, 0.006)]
-    body = _lathe(
-        profile,
-        outside,
-        (inside, lambda u, r, z, s: (r < 0.0395) & (z > 0.0055)),
-        (stripe, lambda u, r, z, s: (r > 0.0405) & (abs(z - 0.070) < 0.009)),
-    )
+    hollow: Mark = (inside, lambda u, r, z, s: (r < 0.0395) & (z > 0.0055))
+    ring: Mark = (stripe, lambda u, r, z, s: (r > 0.0405) & (abs(z - 0.070) < 0.009))
+    body = _lathe(profile, outside, hollow, ring)
     arc = _arc(0.029, 90, -90, 15)
     path = np.stack([0.0395 + arc[:, 0] * 1.15, np.zeros(15), 0.049 + arc[:, 1]], axis=1)
     handle = _sweep(path, np.tile([0.0045, 0.0065], (15, 1)), (0, 1, 0), outside)
@@ -203,28 +198,18 @@ def _banana() -> TexturedMesh:
     t = np.linspace(-1, 1, 25)
     size = 0.018 * np.sqrt(np.clip(1 - np.abs(t) ** 3.2, 0, 1))
     size[-4:-1] = np.maximum(size[-4:-1], 0.0048)
-    body = _sweep(
-        path,
-        np.stack([size, size], axis=1),
-        (0, 0, 1),
-        YELLOW,
-        (BROWN, lambda u, t: (t < 0.035) | (t > 0.93)),
-        (BROWN, lambda u, t: (abs(u - 0.3) < 0.02) & (abs(t - 0.45) < 0.06)),
-        sides=12,
-    )
-    return standing(body)
+    ends: Mark = (BROWN, lambda u, t: (t < 0.035) | (t > 0.93))
+    spot: Mark = (BROWN, lambda u, t: (abs(u - 0.3) < 0.02) & (abs(t - 0.45) < 0.06))
+    return standing(_sweep(path, np.stack([size, size], axis=1), (0, 0, 1), YELLOW, ends, spot, sides=12))
 
 
 def _apple() -> TexturedMesh:
     phi = np.radians(np.linspace(-90, 90, 33))
     r = 0.038 * np.cos(phi) * (1 + 0.06 * np.sin(phi))
     z = 0.035 * np.sin(phi) - 0.013 * np.exp(-((r / 0.014) ** 2)) * np.sign(phi) * np.where(phi > 0, 1.0, 0.6)
-    body = _lathe(
-        np.stack([r.clip(0), z], axis=1),
-        RED,
-        (LIME, lambda u, r, z, s: s > 0.94 + 0.02 * np.sin(u * 4 * np.pi)),
-        (ORANGE, lambda u, r, z, s: _ellipse(u, s, (0.35, 0.6), (0.16, 0.22))),
-    )
+    top: Mark = (LIME, lambda u, r, z, s: s > 0.94 + 0.02 * np.sin(u * 4 * np.pi))
+    cheek: Mark = (ORANGE, lambda u, r, z, s: _ellipse(u, s, (0.35, 0.6), (0.16, 0.22)))
+    body = _lathe(np.stack([r.clip(0), z], axis=1), RED, top, cheek)
     line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041]])
     stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2], (0, 1, 0), BROWN, sides=8)
     return standing(body, stem)
@@ -248,14 +233,10 @@ def _sponge() -> TexturedMesh:
 def _screwdriver() -> TexturedMesh:
     profile = [(0, 0), (0.011, 0.001), (0.0155, 0.010), (0.0155, 0.080), (0.010, 0.090), (0.013, 0.100)]
     profile += [(0.0035, 0.103), (0.0035, 0.205), (0.0015, 0.212), (0, 0.212)]
-    tool = _lathe(
-        profile,
-        STEEL,
-        (RED, lambda u, r, z, s: z < 0.1015),
-        (DARK, lambda u, r, z, s: (z > 0.012) & (z < 0.080) & (u * 6 % 1 < 0.4)),
-        (DARK, lambda u, r, z, s: (z > 0.084) & (z < 0.1015)),
-    )
-    return standing(moved(tool, axis="y", degrees=90))
+    handle: Mark = (RED, lambda u, r, z, s: z < 0.1015)
+    grooves: Mark = (DARK, lambda u, r, z, s: (z > 0.012) & (z < 0.080) & (u * 6 % 1 < 0.4))
+    collar: Mark = (DARK, lambda u, r, z, s: (z > 0.084) & (z < 0.1015))
+    return standing(moved(_lathe(profile, STEEL, handle, grooves, collar), axis="y", degrees=90))
 
 
 def _hammer() -> TexturedMesh:

@@ -55,6 +55,11 @@ class TexturedMesh:
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     @property
+    def longest_side(self) -> float:
+        """Longest side of the axis-aligned bounding box, metres."""
+        return float(np.ptp(self.vertices, axis=0).max())
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the arrays, since mesh files may refer to other files and meshes may not come from files."""
         parts: list[str | bytes] = []
@@ -201,6 +206,11 @@ def tube_surface(
     return _ring_surface(points, np.concatenate([[0.0], arc_lengths(line), [1.0]]), texture)
 
 
+QUAD_FACES = ((0, 1, 2), (0, 2, 3))
+QUAD_UV = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
+"""Texture coordinates of the two triangles of a rectangle, within a texture that must not repeat."""
+
+
 def box_surface(size: Sequence[float], textures: Sequence[NDArray[np.uint8]]) -> TexturedMesh:
     """Return a box that stands on z = 0, centred over the origin.
 
@@ -209,14 +219,12 @@ def box_surface(size: Sequence[float], textures: Sequence[NDArray[np.uint8]]) ->
         textures: of the sides -y (the front), +x, +y, -x, top and bottom, seen from outside.
     """
     x, y, z = size[0] / 2, size[1] / 2, size[2]
-    ring = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
-    quads = [[[*ring[k], 0], [*ring[(k + 1) % 4], 0], [*ring[(k + 1) % 4], z], [*ring[k], z]] for k in range(4)]
-    quads.append([[*p, z] for p in ring])
-    quads.append([[*p, 0] for p in ring[::-1]])
-    faces = np.concatenate([[[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]] for k in range(6)])
-    corners = np.tile(np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32), (6, 1, 1))
-    vertices, uv = np.asarray(quads, np.float64).reshape(-1, 3), corners.clip(1e-4, 1 - 1e-4)
-    return TexturedMesh(vertices, faces.astype(np.int32), uv, tuple(textures), np.arange(12, dtype=np.int32) // 2)
+    low, high = ([[-x, -y, h], [x, -y, h], [x, y, h], [-x, y, h]] for h in (0, z))
+    sides = [[low[k - 1], low[k], high[k], high[k - 1]] for k in (1, 2, 3, 0)]
+    vertices = np.array([*sides, high, low[::-1]], np.float64).reshape(-1, 3)
+    faces = (4 * np.arange(6, dtype=np.int32)[:, None, None] + np.array(QUAD_FACES, np.int32)).reshape(-1, 3)
+    uv = np.tile(QUAD_UV, (6, 1, 1))
+    return TexturedMesh(vertices, faces, uv, tuple(textures), np.arange(12, dtype=np.int32) // 2)
 
 
 def moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:

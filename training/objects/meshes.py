@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
@@ -19,7 +18,7 @@ from training.objects.mesh import TexturedMesh, merge_meshes
 if TYPE_CHECKING:  # takes 0.2 s to import, so it is imported where meshes are read
     import trimesh
 
-__all__ = ["MAX_SIDE", "MIN_SIDE", "find_meshes", "find_object_meshes", "load_mesh", "longest_side", "scaled_meshes"]
+__all__ = ["MAX_SIDE", "MIN_SIDE", "find_meshes", "find_object_meshes", "load_mesh", "read_mesh", "scaled_meshes"]
 
 # Without a handler, Python prints trimesh's log of a damaged file on standard error, also with a traceback.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -43,60 +42,44 @@ MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
-def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> TexturedMesh:
-    """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
+def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
+    """Convert one geometry of a file.
 
     Raises:
         InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that cannot be used.
         ValueError: the geometry is inconsistent.
     """
-    from trimesh.transformations import transform_points
-    from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
+    from trimesh.visual.material import PBRMaterial, empty_material
 
     vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
-    vertices = transform_points(vertices, transform)
     faces = np.reshape(np.asarray(geometry.faces, np.int32), (-1, 3))
-    if np.linalg.det(transform[:3, :3]) < 0:  # keep the faces of a mirrored part oriented outwards
-        faces = np.fliplr(faces).copy()
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
-    if visual.kind == "vertex":
-        return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
-    if visual.kind == "face":
-        colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
-        return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
+    if visual.kind in ("vertex", "face"):
+        colors = visual.vertex_colors[faces] if visual.kind == "vertex" else np.stack([visual.face_colors] * 3, axis=1)
+        return TexturedMesh(vertices, faces, corner_colors=np.asarray(colors[..., :3], np.uint8))
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours")
     material = visual.material
-    if isinstance(material, PBRMaterial):
-        image, factor = material.baseColorTexture, material.baseColorFactor
-    elif isinstance(material, SimpleMaterial):
-        image, factor = material.image, None if material.image is not None else material.diffuse
+    is_simple = not isinstance(material, PBRMaterial)
+    image = material.image if is_simple else material.baseColorTexture
+    factor = material.baseColorFactor if not is_simple else material.diffuse if image is None else None
+    if image is None:
+        uv, texture = np.zeros((len(faces), 3, 2), np.float32), np.full((1, 1, 3), 255, np.uint8)
     else:
-        raise InputError(f"unsupported material {type(material).__name__}")
-    if image is not None:
         check_size(image.width, image.height)  # before it is decoded
-        is_simple = isinstance(material, SimpleMaterial)
         if visual.uv is None:
             raise InputError("a texture, but no texture coordinates; export the mesh with them")
         if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
             raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
-    factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
-    if image is None:
-        uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
-    else:
         uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
         texture = np.asarray(image.convert("RGB"))
-        if (factor < 255).any():
-            texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
+    if factor is not None:
+        texture = np.rint(texture * (np.asarray(factor, np.uint8)[:3] / 255.0)).astype(np.uint8)
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
-
-
-def _longest(mesh: TexturedMesh) -> float:
-    return float(np.ptp(mesh.vertices, axis=0).max())
 
 
 def _check_extensions(path: Path) -> None:
@@ -126,10 +109,10 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     """
     if not 0 < scale < np.inf:
         raise InputError(f"mesh_scale is {scale:g}; expected a positive number, such as 0.001 for millimetres")
-    mesh = _parsed(Path(path))
+    mesh = read_mesh(Path(path))
     if scale != 1:
         mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
-    longest = _longest(mesh)
+    longest = mesh.longest_side
     if not MIN_SIDE <= longest <= MAX_SIDE:
         unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
         raise InputError(
@@ -139,17 +122,13 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     return mesh
 
 
-def longest_side(path: str | Path) -> float:
-    """Return the longest side of a mesh's bounding box in the file's unit; raise InputError as `load_mesh`."""
-    return _longest(_parsed(Path(path)))
-
-
 def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | TexturedMesh]:
     """Return object name -> mesh file, or -> scaled mesh if `scale` is not 1; raise InputError as `load_mesh`."""
     return {name: path if scale == 1 else load_mesh(path, scale) for name, path in meshes.items()}
 
 
-def _parsed(path: Path) -> TexturedMesh:
+def read_mesh(path: Path) -> TexturedMesh:
+    """Return the mesh in the unit of its file, of any size; raise InputError as `load_mesh`."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
@@ -174,12 +153,7 @@ def _parsed(path: Path) -> TexturedMesh:
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
-        parts = []
-        for node in scene.graph.nodes_geometry:
-            transform, name = scene.graph[node]
-            geometry = scene.geometry[name]
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-                parts.append(_part(geometry, transform))
+        parts = [_part(part) for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)
@@ -234,11 +208,10 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
-    requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         name = entry.name if entry.is_dir() else entry.stem
-        if requested is not None and name not in requested:  # scans that are not requested are not checked
+        if names is not None and name not in names.values():  # scans that are not requested are not checked
             continue
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:
@@ -246,20 +219,14 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     if names is None:
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
-        return _named(folder, scans)
+        names = {scan: scan for scan in scans}
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
-    return _named(folder, {name: scans[names[name]] for name in sorted(names)})
-
-
-def _named(folder: Path, meshes: Mapping[str, Path]) -> dict[str, Path]:
-    """Return the meshes under their names as normalized by `check_name`."""
-    named: dict[str, Path] = {}
-    for name, path in meshes.items():
-        with with_context(f"mesh folder {folder}"):
-            if named.setdefault(check_name(name), path) != path:
-                raise InputError(f"object {name!r} is there twice; expected one mesh of each object")
+    with with_context(f"mesh folder {folder}"):
+        named = {check_name(name): scans[names[name]] for name in sorted(names)}
+        if len(named) < len(names):
+            raise InputError("two names are equal but for spaces or Unicode forms; expected one mesh of each object")
     return named
 
 
@@ -281,7 +248,7 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
     if any(file.stem.lower() == "textured" for file in path.iterdir()) or name == own:
         mesh = _mesh_in(path)
         if mesh is not None:
-            return _named(path.resolve().parent, {name or own: mesh})
+            return {check_name(name or own): mesh}
     meshes = find_meshes(path)
     if name is None:
         return meshes

@@ -215,14 +215,12 @@ class RayCaster:
         directions = np.ascontiguousarray(directions, np.float32)
         origins = np.full_like(directions, origin)
         result = self._scene.run(origins, directions, output=True)
-        hit = np.flatnonzero(result["primID"] >= 0)
-        distance = np.full(len(directions), np.inf, np.float32)
-        distance[hit] = result["tfar"][hit]
-        mesh_index = np.full(len(directions), -1, np.int32)
-        mesh_index[hit] = result["geomID"][hit]
+        is_hit = result["primID"] >= 0
+        distance = np.where(is_hit, result["tfar"], np.float32(np.inf))
+        mesh_index = np.where(is_hit, result["geomID"].astype(np.int32), np.int32(-1))
         color = np.zeros((len(directions), 3), np.uint8)
         for index, mesh in enumerate(self.meshes):
-            here = hit[mesh_index[hit] == index]
+            here = np.flatnonzero(mesh_index == index)
             if len(here):
                 barycentric = np.stack([result["u"].take(here), result["v"].take(here)]).T
                 color[here] = mesh.colors_at(result["primID"].take(here), barycentric)

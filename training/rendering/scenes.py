@@ -7,15 +7,15 @@ The table is the plane z = 0. Objects rest on it without touching, and occlude e
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from training.objects.mesh import TexturedMesh, moved
+from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
 from training.rendering.camera import (
     Camera,
     RayCaster,
@@ -81,12 +81,9 @@ class _Placed:
     def height(self) -> float:
         return float(self.mesh.vertices[:, 2].max())
 
-    def moved(self, x: float, y: float) -> "_Placed":
-        return _Placed(moved(self.mesh, (x, y, 0)), self.corners + [x, y], self.normals)
-
-    def apart(self, other: "_Placed", x: float, y: float) -> bool:
-        """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
-        here, there = self.corners + [x, y], other.corners
+    def apart(self, other: "_Placed", place: Array) -> bool:
+        """Return whether this object, moved to `place` [2], is at least `MIN_GAP` from the other (separating axes)."""
+        here, there = self.corners + place, other.corners
         gaps = (self.normals @ there.T).min(axis=1) - (self.normals @ here.T).max(axis=1)
         other_gaps = (other.normals @ here.T).min(axis=1) - (other.normals @ there.T).max(axis=1)
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
@@ -134,8 +131,8 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
     return _Placed(mesh.transformed(matrix), footprint[outline.vertices], outline.equations[:, :2])
 
 
-def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Array | None:
-    """Return a free position [2] in line with a placed object and the camera, with the taller one in front, or None."""
+def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield positions [2] in line with a placed object and the camera, with the taller one in front."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])
@@ -145,20 +142,16 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
     for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
         place = middle + distance * forth
         if np.linalg.norm(place) > 1.3 * TABLE_RADIUS:
-            return None
-        if all(new.apart(other, *place) for other in placed):
-            return place
-    return None
+            return
+        yield place
 
 
-def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
-    """Return a free position [2] on the table; the radius is enlarged only if there is no space."""
+def _anywhere(rng: np.random.Generator) -> Iterator[Array]:
+    """Yield random positions [2] on the table, within a radius that grows slowly, in case there is no space."""
     reach = TABLE_RADIUS
     while True:
         angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
-        place = radius * np.array([np.cos(angle), np.sin(angle)])
-        if all(new.apart(other, *place) for other in placed):
-            return place
+        yield radius * np.array([np.cos(angle), np.sin(angle)])
         reach *= 1.005
 
 
@@ -168,8 +161,10 @@ def _arrange(
     placed: list[_Placed] = []
     for mesh in meshes:
         new = _put_down(mesh, rng)
-        place = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else None
-        placed.append(new.moved(*(_anywhere(new, placed, rng) if place is None else place)))
+        in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
+        places = itertools.chain(in_line, _anywhere(rng))
+        place = next(each for each in places if all(new.apart(other, each) for other in placed))
+        placed.append(_Placed(moved(new.mesh, (*place, 0)), new.corners + place, new.normals))
     return [item.mesh for item in placed]
 
 
@@ -179,9 +174,7 @@ def _table() -> TexturedMesh:
     texture = (np.array([150, 138, 122]) + np.repeat(np.repeat(planks, 32, axis=0), 512, axis=1)).astype(np.uint8)
     texture[::32] = 96, 88, 78
     corner = np.array([[-0.8, -0.8, 0], [0.8, -0.8, 0], [0.8, 0.8, 0], [-0.8, 0.8, 0]])
-    uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return TexturedMesh(corner, faces, uv, (texture,), np.zeros(2, np.int32))
+    return TexturedMesh(corner, np.array(QUAD_FACES, np.int32), QUAD_UV, (texture,), np.zeros(2, np.int32))
 
 
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -211,7 +204,7 @@ def compose_scene(
     Args:
         objects: name -> mesh; metres, z up.
         rng: random number generator.
-        n_objects: number of objects in the scene, each a different one.
+        n_objects: number of objects in the scene, each a different one; at most the number of `objects`.
         camera: camera of the frame.
         clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
             occludes the other.
@@ -223,12 +216,9 @@ def compose_scene(
     Returns:
         The scene. An instance with fewer than `MIN_PIXELS` visible pixels is not labelled (its pixels are 0), so that
         there may be fewer than `n_objects` labels.
-
-    Raises:
-        InputError: there are fewer than `n_objects` objects.
     """
-    names, meshes, _, pose = _composed(objects, n_objects, clutter, rng)
-    return _render(names, meshes, pose, camera, noise, light, rng)
+    meshes, _, pose = _composed(objects, n_objects, clutter, rng)
+    return _render(meshes, pose, camera, noise, light, rng)
 
 
 def compose_views(
@@ -261,33 +251,25 @@ def compose_views(
 
     Returns:
         For each camera, the scene as from `compose_scene` and the pose [4, 4], camera to world coordinates.
-
-    Raises:
-        InputError: there are fewer than `n_objects` objects.
     """
-    names, meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
+    meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
     views = []
     for turn in np.arange(n_views) * arc / n_views:
         pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
-        views.append((_render(names, meshes, pose, camera, noise, light, rng), pose))
+        views.append((_render(meshes, pose, camera, noise, light, rng), pose))
     return views
 
 
 def _composed(
     objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
-) -> tuple[list[str], list[TexturedMesh], float, Array]:
-    """Return names and meshes of random objects on the table, and the azimuth and pose of a camera in line with them.
-
-    Raises:
-        InputError: there are fewer than `count` objects.
-    """
-    if not 1 <= count <= len(objects):
-        raise InputError(f"n_objects is {count!r}; it must be 1 to {len(objects)}, the number of objects")
+) -> tuple[dict[str, TexturedMesh], float, Array]:
+    """Return random objects on the table, and the azimuth and pose of a camera in line with them."""
     names = [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
     azimuth = rng.uniform(0, 2 * np.pi)
     pose = _random_pose(rng, azimuth)
     towards = np.array([np.cos(azimuth), np.sin(azimuth)])
-    return names, _arrange([objects[name] for name in names], towards, clutter, rng), azimuth, pose
+    arranged = _arrange([objects[name] for name in names], towards, clutter, rng)
+    return dict(zip(names, arranged, strict=True)), azimuth, pose
 
 
 def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:
@@ -297,21 +279,15 @@ def _random_pose(rng: np.random.Generator, azimuth: float) -> Array:
 
 
 def _render(
-    names: Sequence[str],
-    meshes: Sequence[TexturedMesh],
-    pose: NDArray[np.float64],
-    camera: Camera,
-    noise: float,
-    light: float,
-    rng: np.random.Generator,
+    meshes: dict[str, TexturedMesh], pose: Array, camera: Camera, noise: float, light: float, rng: np.random.Generator
 ) -> Scene:
     """Render arranged objects; the last arguments are as in `compose_scene`."""
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
-    hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
+    hits = RayCaster([_table(), *meshes.values()]).cast(pose[:3, 3], rays)
     shape = (camera.height, camera.width)
     labels = hits.mesh.clip(0).astype(np.uint8 if len(meshes) < 256 else np.uint16).reshape(shape)
     truth, visible = {}, {}
-    for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), 1):
+    for label, (name, mesh) in enumerate(meshes.items(), 1):
         pixels = int((labels == label).sum())
         if pixels < MIN_PIXELS:
             labels[labels == label] = 0

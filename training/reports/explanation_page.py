@@ -1,5 +1,6 @@
 """The files of an explanation: a self-contained page, its pictures and JSON."""
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -93,26 +94,26 @@ def _lead(explanation: Explanation, name: str) -> str:
 
 
 def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]]) -> list[Section]:
-    check, is_odds = explanation.attributions, explanation.scores.unit == "log-odds"
-    if is_odds:
-        margin = (
-            f"The classifiers' log-odds of {explanation.name} are {check.margin:.1f}. Log-odds compare a class with "
-            "the others together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %. The "
-            "attributions below explain this number."
+    check, name = explanation.attributions, explanation.name
+    if explanation.scores.unit == "log-odds":
+        lost = "log-odds"
+        answer = (
+            f"The classifiers' log-odds of {name} are {check.margin:.1f}. Log-odds compare a class with the others "
+            "together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %."
         )
     else:
-        margin = (
-            f"{explanation.name} is {check.margin:.2f} more similar (in cosine) than any other enrolled object. The "
-            "attributions below explain this number."
-        )
-    runner_up = "" if explanation.runner_up is None else f" The next best name is {explanation.runner_up}."
+        lost = "lead"
+        answer = f"{name} is {check.margin:.2f} more similar (in cosine) than any other enrolled object."
+    answer += " The attributions below explain this number."
+    if explanation.runner_up is not None:
+        answer += f" The next best name is {explanation.runner_up}."
     comparison = (
         f"Without the tenth of the points with the highest attributions, the answer loses {check.most_attributed:.2f} "
-        f"of its {'log-odds' if is_odds else 'lead'}; without a random tenth, {check.random:.2f} on average."
+        f"of its {lost}; without a random tenth, {check.random:.2f} on average."
     )
     resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
     return [
-        Section("The answer", margin + runner_up, _answer_table(explanation.recognition)),
+        Section("The answer", answer, _answer_table(explanation.recognition)),
         Section("What decided", _DECIDED.format(check=comparison), pictures=pictures["decided"]),
         Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
         *resembling,
@@ -147,23 +148,19 @@ def _advice(explanation: Explanation) -> str:
 def _changes_text(explanation: Explanation) -> str:
     kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
     sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
-    unchanged = {
-        "color": "No shift of the colours by up to half of their range changes the answer.",
-        "extent": "No change of the side lengths by up to a factor of two changes the answer.",
-    }
     changed = {change.kind for change in explanation.changes}
-    return " ".join([*sentences, *(text for kind, text in unchanged.items() if kind not in changed)])
+    if "color" not in changed:
+        sentences.append("No shift of the colours by up to half of their range changes the answer.")
+    if "extent" not in changed:
+        sentences.append("No change of the side lengths by up to a factor of two changes the answer.")
+    return " ".join(sentences)
 
 
 def _answer_table(answer: Recognition) -> Table:
     sources = [source for source in _SOURCES if answer.top.get(source)]
-    count = max((len(answer.top[source]) for source in sources), default=0)
-    rows = []
-    for rank in range(count):
-        cells = (answer.top[source][rank : rank + 1] for source in sources)
-        texts = [" ".join(f"{name} {_percent(value)}" for name, value in cell) for cell in cells]
-        rows.append([str(rank + 1), *texts])
-    return (["", *(_SOURCES[source] for source in sources)], rows)
+    columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source]] for source in sources]
+    ranked = enumerate(itertools.zip_longest(*columns, fillvalue=""), 1)
+    return ["", *(_SOURCES[source] for source in sources)], [[str(rank), *cells] for rank, cells in ranked]
 
 
 def _percent(value: float) -> str:

@@ -209,17 +209,17 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | P
     dashed = False
     for k, (name, records) in enumerate(curves.items()):
         folds = sorted({record.get("fold", 0) for record in records})
-        for fold in folds or [0]:
+        for fold in folds:
             rows = [record for record in records if record.get("fold", 0) == fold]
-            style: dict[str, Any] = {"color": PALETTE[k % len(PALETTE)], "linewidth": 1.5 if len(folds) < 2 else 0.8}
+            style: dict[str, Any] = {"color": PALETTE[k % len(PALETTE)], "linewidth": 1.5 if len(folds) == 1 else 0.8}
             if len(rows) < 30:
                 style |= {"marker": "o", "markersize": 3}
             epochs = [record["epoch"] for record in rows]
-            label = name.upper() if fold == (folds or [0])[0] else None
+            label = name.upper() if fold == folds[0] else None
             upper.plot(epochs, [record["loss"] for record in rows], label=label, **style)
             lower.plot(epochs, [record["accuracy"] for record in rows], **style)
             held_out = [record.get("held_out_accuracy") for record in rows]
-            if held_out and None not in held_out:
+            if None not in held_out:
                 lower.plot(epochs, held_out, linestyle="--", **style)
                 dashed = True
     upper.set(yscale="log", ylabel="loss (cross-entropy)")

@@ -14,10 +14,10 @@ import pytest
 from commands import Command, json_lines, run_thor2
 from dataset_files import write_bop
 from image_files import encode_image
-from PIL import Image
 from rendered_objects import write_box
 
 import thor2_jax
+from benchmarks.doctor import _interpolated, _zoomed
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.model.recognition import Recognition
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
@@ -142,11 +142,6 @@ def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
     assert_found("", check_depth, frame, {"pin": 0.01}, trust_camera=False)
 
 
-def interpolated(labels: np.ndarray) -> np.ndarray:
-    spread = Image.fromarray((labels * 40).astype(np.uint8))
-    return np.asarray(spread.resize((100, 75)).resize((labels.shape[1], labels.shape[0]), Image.Resampling.BICUBIC))
-
-
 def blobs(n: int) -> np.ndarray:
     labels = np.zeros((90, 120), np.uint8)
     for k in range(n):
@@ -159,20 +154,12 @@ def test_labels(frame: RGBDFrame) -> None:
         (lambda labels: labels.astype(np.int32) * 1000, ""),
         (lambda labels: labels * 0, "labels-empty"),
         (lambda labels: labels + 1, "labels-background"),
-        (interpolated, "labels-(thin|many)"),
+        (_interpolated, "labels-(thin|many)"),
         (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), "labels-many"),
         (lambda labels: blobs(2), ""),
         (lambda labels: blobs(3) * 255, "labels-foreground"),
     ):
         assert_found(expected, check_labels, make(frame.label_image))
-
-
-def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
-    height, width = image.shape
-    size = round(width / factor), round(height / factor)
-    left, top = (width - size[0]) // 2, (height - size[1]) // 2
-    cut = Image.fromarray(image[top : top + size[1], left : left + size[0]])
-    return np.asarray(cut.resize((width, height), Image.Resampling.NEAREST))
 
 
 def test_registration(frame: RGBDFrame) -> None:
@@ -181,7 +168,7 @@ def test_registration(frame: RGBDFrame) -> None:
         (lambda depth: np.roll(depth, (0, 20), (0, 1)), "registration: .*moved (19|20|21) pixels left"),
         (lambda depth: np.roll(depth, (-16, 0), (0, 1)), "registration: .*moved (15|16|17) pixels down"),
         (lambda depth: np.ascontiguousarray(depth[:, ::-1]), "registration: .*mirrored"),
-        (lambda depth: zoomed(depth, 1.15), "registration: .*enlarged by a factor of 1.1"),
+        (_zoomed(1.15), "registration: .*enlarged by a factor of 1.1"),
         (np.ones_like, ""),
         (np.zeros_like, ""),
     ):

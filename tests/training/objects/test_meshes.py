@@ -3,7 +3,6 @@
 import functools
 import json
 import logging
-import os
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -17,13 +16,16 @@ from rendered_objects import write_box
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from training.objects.mesh import TexturedMesh, merge_meshes
-from training.objects.meshes import find_meshes, load_mesh, longest_side, read_names, scaled_meshes
+from training.objects.meshes import find_meshes, load_mesh, read_mesh, read_names, scaled_meshes
+from training.rendering.camera import RayCaster
 
 QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
 QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 QUAD_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 # Rows from the top: red, green / blue, white.
 CHECKERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+PBR = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
+SIMPLE = SimpleMaterial(image=Image.fromarray(CHECKERS))
 
 
 def textured_quad(material: PBRMaterial | SimpleMaterial, uv: np.ndarray = QUAD_UV) -> trimesh.Trimesh:
@@ -33,15 +35,9 @@ def textured_quad(material: PBRMaterial | SimpleMaterial, uv: np.ndarray = QUAD_
 
 def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
     """Return the colours at the centres of the quad's quarters: (x, y) low-low, high-low, high-high, low-high."""
-    colors = []
-    for x, y in [(0.025, 0.025), (0.075, 0.025), (0.075, 0.075), (0.025, 0.075)]:
-        for face in range(2):
-            a, b, c = mesh.vertices[mesh.faces[face]][:, :2]
-            weights = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x, y]) - a)
-            if weights.min() >= -1e-9 and weights.sum() <= 1 + 1e-9:
-                colors.append(mesh.colors_at(np.array([face]), weights[None])[0].tolist())
-                break
-    return colors
+    eye = np.array([0.05, 0.05, 1])
+    points = np.array([[0.025, 0.025, 0], [0.075, 0.025, 0], [0.075, 0.075, 0], [0.025, 0.075, 0]])
+    return RayCaster([mesh]).cast(eye, points - eye).color.tolist()
 
 
 QUADRANTS = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
@@ -49,9 +45,7 @@ QUADRANTS = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 def test_textures_are_upright(tmp_path: Path, suffix: str) -> None:
-    image = Image.fromarray(CHECKERS)
-    material = PBRMaterial(baseColorTexture=image) if suffix == "glb" else SimpleMaterial(image=image)
-    textured_quad(material).export(tmp_path / f"quad.{suffix}")
+    textured_quad(PBR if suffix == "glb" else SIMPLE).export(tmp_path / f"quad.{suffix}")
     mesh = load_mesh(tmp_path / f"quad.{suffix}")
     assert len(mesh.faces) == 2 and mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
     assert quadrant_colors(mesh) == QUADRANTS
@@ -151,17 +145,13 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
 
 
 def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
-    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "quad.obj")
+    textured_quad(SIMPLE).export(tmp_path / "quad.obj")
     (picture,) = tmp_path.glob("*.png")
     (material,) = tmp_path.glob("*.mtl")
     picture.unlink()
     check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing")
-    os.mkfifo(picture)
-    check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing or unreadable")
     material.unlink()
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing")
-    os.mkfifo(material)
-    check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing or unreadable")
 
 
 def test_a_ply_without_its_texture_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -182,8 +172,7 @@ def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
 
 
 def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
-    material, path = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)), tmp_path / "quad.glb"
-    quad = textured_quad(material)
+    quad, path = textured_quad(PBR), tmp_path / "quad.glb"
     for name in ("KHR_texture_transform", "KHR_draco_mesh_compression"):
         quad.export(path, tree_postprocessor=functools.partial(dict.update, extensionsUsed=[name]))
         check_refused(path, f"it uses {name}")
@@ -199,11 +188,11 @@ def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
 
 
 def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
-    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "quad.obj")
+    textured_quad(SIMPLE).export(tmp_path / "quad.obj")
     (picture,) = tmp_path.glob("*.png")
     Image.fromarray(np.full((2, 2), 9000, np.uint16)).save(picture)
     check_refused(tmp_path / "quad.obj", "mode I;16; expected 8 bits")
-    textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))).export(tmp_path / "quad.glb")
+    textured_quad(PBR).export(tmp_path / "quad.glb")
     content = (tmp_path / "quad.glb").read_bytes()
     (tmp_path / "quad.glb").write_bytes(content.replace(b"TEXCOORD_0", b"TEXCOORD_1"))
     check_refused(tmp_path / "quad.glb", "no texture coordinates")
@@ -212,7 +201,7 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
     scene, quad = trimesh.Scene(), textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)))
     for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
-        scene.add_geometry(quad, transform=np.diag([*scale, 1.0]))
+        scene.add_geometry(textured_quad(PBR), transform=np.diag([*scale, 1.0]))
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
     expected = trimesh.load_scene(tmp_path / "scene.glb", process=False).to_mesh()
@@ -221,18 +210,18 @@ def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
 
 
 def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:
-    material, path = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)), tmp_path / "quad.glb"
-    textured_quad(material, QUAD_UV * [1, 2.0**23]).export(path)
+    path = tmp_path / "quad.glb"
+    textured_quad(PBR, QUAD_UV * [1, 2.0**23]).export(path)
     assert load_mesh(path).colors_at(np.arange(2), np.full((2, 2), 0.3)).shape == (2, 3)
     for far in (1e30, np.nan):
-        textured_quad(material, QUAD_UV * [1, far]).export(path)
+        textured_quad(PBR, QUAD_UV * [1, far]).export(path)
         check_refused(path, "texture coordinates are not finite, or beyond")
 
 
 def test_damaged_lines_of_an_obj(tmp_path: Path) -> None:
     lines = "v 0.0 0.0 0.0\nv 0.1 0.0 0.0\nv 0.1 0.1 0.0\nvt 0.0 0.0\nvt 1.0 0.0\nvt 1.0 1.0\nf 1/1 2/2 3/3\n"
     content, path = f"mtllib material.mtl\nusemtl material_0\n{lines}", tmp_path / "quad.obj"
-    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "whole.obj")
+    textured_quad(SIMPLE).export(tmp_path / "whole.obj")
     path.write_text(content)
     assert len(load_mesh(path).faces) == 1
     for line, other, message in (
@@ -263,12 +252,12 @@ def test_finding_meshes(tmp_path: Path) -> None:
     assert [(name, path.stem) for name, path in by_class.items()] == [("again", "mug"), ("cup", "mug"), ("soup", "can")]
 
 
-def test_names_of_meshes_are_normal_and_differ(tmp_path: Path) -> None:
+def test_names_of_meshes_are_normal(tmp_path: Path) -> None:
     (tmp_path / "cafe\u0301.ply").touch()
     assert list(find_meshes(tmp_path)) == ["caf\u00e9"]
     assert list(find_meshes(tmp_path, {" cup": "cafe\u0301"})) == ["cup"]
     (tmp_path / "caf\u00e9.glb").touch()
-    assert_refused("'caf\u00e9' is there twice|'cafe\u0301' is there twice", find_meshes, tmp_path)
+    assert_refused("two names are equal but for", find_meshes, tmp_path)
     assert_refused("name is '..', which is reserved", find_meshes, tmp_path, {"..": "cafe\u0301"})
 
 
@@ -315,7 +304,7 @@ def test_meshes_in_other_units(tmp_path: Path) -> None:
     expected, scaled = load_mesh(box), load_mesh(large, 0.001)
     np.testing.assert_allclose(scaled.vertices, expected.vertices, atol=1e-6)
     np.testing.assert_array_equal(scaled.corner_colors, expected.corner_colors)
-    assert longest_side(large) == pytest.approx(200)
+    assert read_mesh(large).longest_side == pytest.approx(200)
     assert_refused(f"{large}: longest side 200.*--mesh-scale 0.001", load_mesh, large)
     assert scaled_meshes({"box": box}, 1.0) == {"box": box}
     doubled = scaled_meshes({"box": box}, 2.0)["box"]

@@ -85,20 +85,6 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     assert np.abs(depth - expected * 1000).max() <= 0.501
 
 
-def test_nearest_mesh_is_hit_and_named() -> None:
-    near, far = painted(trimesh.creation.box([0.1] * 3), (1, 2, 3)), painted(trimesh.creation.box([0.3] * 3), (9, 8, 7))
-    near.vertices[:, 0] += 0.5
-    hits = RayCaster([far, near]).cast(np.array([2.0, 0, 0]), np.array([[-1.0, 0, 0], [-2, 0.1, 0], [1, 0, 0]]))
-    assert hits.mesh.tolist() == [1, 0, -1]
-    assert hits.color.tolist() == [[1, 2, 3], [9, 8, 7], [0, 0, 0]]
-    assert hits.distance.tolist() == pytest.approx([1.45, 0.925, np.inf])
-
-
-def test_no_rays() -> None:
-    hits = RayCaster([painted(trimesh.creation.box([0.1] * 3))]).cast(np.zeros(3), np.zeros((0, 3)))
-    assert hits.distance.shape == (0,) and hits.color.shape == (0, 3)
-
-
 def test_an_object_outside_the_image_leaves_it_empty() -> None:
     mesh = painted(trimesh.creation.box([0.1] * 3))
     for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):
