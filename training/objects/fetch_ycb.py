@@ -5,7 +5,6 @@ object are written to `<directory>/<object>`, where `find_meshes` finds `texture
 """
 
 import gzip
-import io
 import re
 import tarfile
 import zlib
@@ -33,6 +32,10 @@ NAME = re.compile(r"\d{3}(-[a-z])?_[a-z0-9_-]+")
 MESH_FILE = "textured.obj"
 TIMEOUT = 30.0
 """Seconds without any received data after which the server is considered unreachable."""
+
+CHUNK_BYTES = 2**18
+MAX_BYTES = 2**29
+"""Largest size of the content of an archive; the archives of the set have about 10 MB."""
 
 
 def fetch_ycb(
@@ -110,20 +113,27 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
 def _extract(archive: Path, directory: Path, name: str) -> None:
     """Move the files of the archive to `directory / name` and remove the archive, even after an error.
 
-    Only regular files in `google_16k` are moved, without their folders.
+    Only regular files in `google_16k` are moved, without their folders. The archive is read to its end, so that the
+    checksum of gzip is verified.
     """
+    total = 0
     try:
         with temporary_directory(directory) as temporary:
             folder = temporary / name
             folder.mkdir()
-            data = gzip.decompress(archive.read_bytes())  # verifies the checksum, which tarfile does not
-            with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as content:
+            with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
                 for member in content:
                     path = PurePosixPath(member.name)
-                    if member.isfile() and path.parent.name == "google_16k" and not path.name.startswith("."):
-                        source = content.extractfile(member)
-                        assert source is not None  # not None for a regular file
-                        (folder / path.name).write_bytes(source.read())
+                    total += member.size
+                    if total > MAX_BYTES:
+                        raise InputError(f"more than {MAX_BYTES:,} bytes")
+                    if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
+                        continue
+                    source = content.extractfile(member)
+                    assert source is not None  # not None for a regular file
+                    (folder / path.name).write_bytes(source.read())
+                while stream.read(CHUNK_BYTES):
+                    pass
             load_mesh(folder / MESH_FILE)
             folder.rename(directory / name)
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
