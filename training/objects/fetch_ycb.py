@@ -6,6 +6,7 @@ object are written to `<directory>/<object>`, where `find_meshes` finds `texture
 
 import gzip
 import re
+import shutil
 import tarfile
 import zlib
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ TIMEOUT = 30.0
 
 CHUNK_BYTES = 2**18
 MAX_BYTES = 2**29
-"""Largest size of the content of an archive; the archives of the set have about 10 MB."""
+"""Largest size of an archive and of its content; the archives of the set have about 10 MB."""
 
 
 def fetch_ycb(
@@ -85,6 +86,10 @@ def fetch_ycb(
 def _download(address: str, archive: Path, name: str, progress: Progress) -> None:
     """Download an archive; continue after the bytes that `archive` already contains."""
     have = archive.stat().st_size if archive.exists() else 0
+    if have:
+        with archive.open("rb") as stream:
+            if stream.read(2) != b"\x1f\x8b":
+                raise InputError(f"out: {archive} is not a download of this command (gzip); move it")
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
     try:
         with httpx.stream("GET", address, headers=headers, timeout=TIMEOUT, follow_redirects=True) as answer:
@@ -98,7 +103,12 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
             total = have + int(answer.headers.get("Content-Length", 0))
             with archive.open("ab" if have else "wb") as stream:
                 for block in answer.iter_raw():
-                    have += stream.write(block)
+                    have += len(block)
+                    if max(have, total) > MAX_BYTES:
+                        archive.unlink()
+                        size = f"more than {MAX_BYTES:,} bytes"
+                        raise InputError(f"url: {archive.name[1:]} has {size}; expected an archive of the YCB set")
+                    stream.write(block)
                     progress(name, have // 1000, max(have, total) // 1000, "kB")
     except InputError:
         raise
@@ -131,10 +141,12 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
                         continue
                     source = content.extractfile(member)
                     assert source is not None  # not None for a regular file
-                    (folder / path.name).write_bytes(source.read())
+                    with source, (folder / path.name).open("xb") as target:
+                        shutil.copyfileobj(source, target)
                 while stream.read(CHUNK_BYTES):
                     pass
             load_mesh(folder / MESH_FILE)
+            folder.chmod(0o755)
             folder.rename(directory / name)
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None

@@ -199,7 +199,7 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
-    scene, quad = trimesh.Scene(), textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS)))
+    scene = trimesh.Scene()
     for scale in ((1, 1, 1), (-1, 1, 1), (-1, -1, 2)):
         scene.add_geometry(textured_quad(PBR), transform=np.diag([*scale, 1.0]))
     scene.export(tmp_path / "scene.glb")
