@@ -21,7 +21,7 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.networks import FEATURES
 from training import protocol, train_job
 from training.protocol import DEFAULT, PAPER, QUICK
-from training.readers.frames import read_names
+from training.readers.frames import frame_files
 from training.train_job import TrainJob
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -75,7 +75,7 @@ def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Com
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     printed("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", "--unknown-below", 0)
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
-    truth = read_names(images / "labels.json")
+    truth = frame_files(images).read_names()
     expected = np.mean([a["name"] == truth[a["label"]] for a in answers])
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
     assert report["instances"]["scored"] == whole["instances"] == len(truth)
@@ -107,7 +107,7 @@ def test_any_name_of_an_object(model: Path, images: Path, tmp_path: Path, printe
     renamed, trained = dict(zip(NAMES, names, strict=True)), load_run(model)
     save_run(dataclasses.replace(trained, classes=tuple(renamed[name] for name in trained.classes)), tmp_path / "run")
     shutil.copytree(images, tmp_path / "frames" / "one")
-    truth = {label: renamed[name] for label, name in read_names(images / "labels.json").items()}
+    truth = {label: renamed[name] for label, name in frame_files(images).read_names().items()}
     (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
     expected = printed("recognize", "--model", model, *frame_options(images))
     out = printed("recognize", "--model", tmp_path / "run", *frame_options(images), "--out", tmp_path / "answer")
