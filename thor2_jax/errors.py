@@ -27,8 +27,6 @@ def reason_of(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, OSError) and error.strerror:
         message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    if isinstance(error, KeyError):
-        message = f"{message} is missing"
     return " ".join(message.split()) or type(error).__name__
 
 

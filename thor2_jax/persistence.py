@@ -17,15 +17,17 @@ complexes, and no distances between diagrams. Use GUDHI for these.
 
 import math
 import reprlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from numpy.typing import NDArray
 
 from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
-from thor2_jax.types import Diagrams, as_array, check_types, is_positive_integer, matmul
+from thor2_jax.types import Diagrams, check_types, is_positive_integer, matmul
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
@@ -195,25 +197,34 @@ def images(
     dtype = getattr(diagrams.births, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")
+    for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
+        numbers = _real_numbers(bounds, (2,), dtype)
+        if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:
+            raise InputError(f"{name} is {bounds!r}; expected two finite {dtype} numbers, the smaller one first")
     if np.shape(pixels) != (2,) or not all(map(is_positive_integer, pixels)):
         raise InputError(f"pixels is {pixels!r}; expected two positive integers")
-    increasing, positive = f"two finite {dtype} numbers, the smaller one first", "a positive number"
-    for name, values, shape, least, expected in (
-        ("birth_range", birth_range, (2,), -math.inf, increasing),
-        ("persistence_range", persistence_range, (2,), -math.inf, increasing),
-        ("variance", variance, (), 0, positive),
-        ("exponent", exponent, (), 0, positive),
-    ):
-        if isinstance(values, jax.core.Tracer):
+    for name, value in (("variance", variance), ("exponent", exponent)):
+        if isinstance(value, jax.core.Tracer):
             continue
-        numbers = as_array(values, name, expected)
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite numbers are refused
-            ordered = np.diff(np.array([least, *numbers.ravel(), math.inf]).astype(dtype)) > 0
-        if numbers.shape != shape or numbers.dtype == bool or not ordered.all():
-            raise InputError(f"{name} is {values!r}; expected {expected}")
+        number = _real_numbers(value, (), dtype)
+        if number is None or not 0 < number < math.inf:
+            raise InputError(f"{name} is {value!r}; expected a positive number")
     ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
     edges = (jnp.linspace(*bounds, n + 1, dtype=dtype) for bounds, n in ends)
     return _images(diagrams, *edges, jnp.asarray(variance, dtype), exponent)
+
+
+def _real_numbers(values: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+    """Return the values in a floating type; None if they are no real numbers or have another shape."""
+    try:
+        numbers = np.asarray(values)
+    except ValueError:
+        return None
+    kinds = (jnp.integer, jnp.floating)
+    if numbers.shape != shape or not any(jnp.issubdtype(numbers.dtype, kind) for kind in kinds):
+        return None
+    with np.errstate(over="ignore"):  # infinite numbers are refused
+        return numbers.astype(dtype)
 
 
 @jax.jit

@@ -25,7 +25,7 @@ from colornet.draw import plot_network
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.figures import name_style, plain_text
-from thor2_jax.types import Diagrams, as_array, check_types
+from thor2_jax.types import Diagrams, check_types
 
 __all__ = [
     "PALETTE",
@@ -66,8 +66,17 @@ def attribution_colors(values: ArrayLike) -> ScalarMappable:
     return ScalarMappable(Normalize(-end, end), _DIVERGING)
 
 
+def _as_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Return an array of real numbers; texts, rows of different lengths and other objects raise InputError."""
+    try:
+        np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {reprlib.repr(values)}; expected an array of numbers") from None
+    return np.asarray(values)
+
+
 def _check_points(points: ArrayLike, colors: ArrayLike) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    xyz, rgb = as_array(points, "points"), as_array(colors, "colors")
+    xyz, rgb = _as_numbers("points", points), _as_numbers("colors", colors)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise InputError(f"points is {list(xyz.shape)}; expected [n, 3], for example a cloud of PointClouds.unpack")
     if rgb.shape != xyz.shape:
@@ -91,7 +100,7 @@ def _scatter(
         ax.set_facecolor("#e4e4e4")  # White points must be visible.
         order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
-        given = as_array(values, "values").astype(float)
+        given = _as_numbers("values", values).astype(float)
         if given.shape != (len(colors),):
             raise InputError(f"values is {list(given.shape)}; expected [{len(colors)}], one value for each point")
         colors, magnitude = (scale or attribution_colors(given)).to_rgba(given), np.abs(given)
@@ -229,7 +238,7 @@ def persistence_image(
         InputError: the image has another shape.
     """
     check_types(config=config)
-    values = as_array(image, "image")
+    values = _as_numbers("image", image)
     if values.shape != (config.image_size,) * 2:
         raise InputError(
             f"image is {list(values.shape)}; expected {[config.image_size] * 2}, one of Descriptors.images"
@@ -243,7 +252,7 @@ def persistence_image(
 
 def _check_matrix(matrix: ArrayLike, network: ColorNetwork) -> NDArray[np.float64]:
     check_types(network=network)
-    values = as_array(matrix, "matrix").astype(float)
+    values = _as_numbers("matrix", matrix).astype(float)
     if values.ndim != 2 or values.shape[1] != network.n_regions:
         raise InputError(f"matrix is {list(values.shape)}; expected [J, {network.n_regions}], strips by colour regions")
     return values
@@ -324,7 +333,7 @@ def color_network(ax: Axes, network: ColorNetwork, weights: ArrayLike | None = N
         InputError: the weights have another shape, or a value that is negative or not finite.
     """
     check_types(network=network)
-    used = None if weights is None else as_array(weights, "weights").astype(float)
+    used = None if weights is None else _as_numbers("weights", weights).astype(float)
     if used is not None and (used.shape != (network.n_regions,) or not ((used >= 0) & (used < np.inf)).all()):
         raise InputError(
             f"weights is {reprlib.repr(used.tolist())} of shape {list(used.shape)}; expected [{network.n_regions}] "
@@ -345,7 +354,7 @@ def confusion(ax: Axes, counts: ArrayLike, classes: Sequence[str]) -> None:
     Raises:
         InputError: the shape does not fit the classes.
     """
-    table, classes = as_array(counts, "counts"), list(map(str, classes))
+    table, classes = _as_numbers("counts", counts), list(map(str, classes))
     if table.shape not in ((len(classes),) * 2, (len(classes), len(classes) + 1)):
         raise InputError(f"counts is {list(table.shape)}; expected {[len(classes)] * 2}, or one column more")
     columns = [*map(plain_text, classes), "none"][: table.shape[1]]

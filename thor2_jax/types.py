@@ -10,7 +10,6 @@ cause a compilation:
 """
 
 import dataclasses
-import reprlib
 from collections.abc import Sequence, Sized
 from functools import partial
 from typing import Any
@@ -150,7 +149,10 @@ def _padded_size(sizes: list[int], capacity: int | None) -> int:
 
 
 def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
-    position = _as_float32(as_array(camera, "camera"))
+    try:
+        position = _as_float32(np.asarray(camera, np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"camera is {camera!r}; expected numbers, [3] or [{n_clouds}, 3]") from None
     if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
         raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{n_clouds}, 3]")
     return np.broadcast_to(position, (n_clouds, 3))
@@ -188,15 +190,12 @@ def check_types(**arguments: object) -> None:
             raise InputError(f"{name} is a {type(value).__name__}; expected a {expected[0].__name__}")
 
 
-def as_array(values: ArrayLike, name: str, expected: str = "an array of numbers") -> NDArray[Any]:
-    """Return an array of numbers or flags; texts, rows of different lengths and other objects raise InputError."""
+def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
+    """Return `values` as an array; rows of different lengths raise InputError."""
     try:
-        array = np.asarray(values)
+        return np.asarray(values)
     except ValueError:
-        array = np.zeros(0, object)
-    if array.dtype.kind not in "biuf":
-        raise InputError(f"{name} is {reprlib.repr(values)}; expected {expected}")
-    return array
+        raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
 
 
 def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -208,9 +207,7 @@ def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[n
     """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
-    points, colors = (
-        as_array(part, f"{name}: {k}", "an array [n, 3]") for k, part in zip(("xyz", "rgb"), pair, strict=True)
-    )
+    points, colors = as_array(pair[0], f"{name}: xyz"), as_array(pair[1], f"{name}: rgb")
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
         raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], in metres")
     if colors.shape != points.shape:

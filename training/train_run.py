@@ -3,7 +3,7 @@
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
-RUN/metrics.jsonl                     one line per epoch, classifier (or "embedding") and fold, while the training runs
+RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only

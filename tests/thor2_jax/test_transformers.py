@@ -113,7 +113,7 @@ INVALID = {
     "X is empty": [],
     "X[1] is a int": [(XYZ, RGB), 7],
     "X[1]: xyz[2] is [nan, nan, nan]": [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)],
-    "X[0]: xyz is [[0.0, 1.0, 2.0], [0.0]]; expected an array [n, 3]": [([[0.0, 1.0, 2.0], [0.0]], RGB)],
+    "X[0]: xyz has rows of different lengths": [([[0.0, 1.0, 2.0], [0.0]], RGB)],
     "X[0]: rgb is [2, 3]": [(XYZ, RGB[:2])],
     "X[1] has 8193 points": [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))],
 }
@@ -130,9 +130,7 @@ def test_bad_input_is_refused(message: str) -> None:
     ("name", "value"), [("config", "paper"), ("capacity", 0), ("capacity", 2.5), ("capacity", True), ("network", 3)]
 )
 def test_bad_parameters_are_named(name: str, value: object) -> None:
-    assert_refused(
-        rf"^{name} is ({value!r}|a {type(value).__name__});", thor2.Tops2Transformer(**{name: value}).fit, [(XYZ, RGB)]
-    )
+    assert_refused(f"^{name} is {value!r}", thor2.Tops2Transformer(**{name: value}).fit, [(XYZ, RGB)])
 
 
 def test_clouds_past_the_capacity_are_refused() -> None:

@@ -72,7 +72,7 @@ def test_unpack_undoes_pack() -> None:
 POINTS, COLORS = np.zeros((3, 3)), np.zeros((3, 3))
 
 
-def put(array: np.ndarray, value: float) -> np.ndarray:
+def changed(array: np.ndarray, value: float) -> np.ndarray:
     array = array.copy()
     array[1, 2] = value
     return array
@@ -88,8 +88,12 @@ def put(array: np.ndarray, value: float) -> np.ndarray:
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
         ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb", "int64"]),
-        *(({"clouds": [(put(POINTS, v), COLORS)]}, ["clouds[0]", "xyz[1]", f"{v}"]) for v in (np.nan, -np.inf, 1e39)),
-        *(({"clouds": [(POINTS, put(COLORS, v))]}, ["clouds[0]", "rgb[1]", f"{v}"]) for v in (1.5, -0.5, np.nan)),
+        ({"clouds": [(changed(POINTS, np.nan), COLORS)]}, ["clouds[0]", "xyz[1]", "nan"]),
+        ({"clouds": [(changed(POINTS, -np.inf), COLORS)]}, ["clouds[0]", "xyz[1]", "-inf"]),
+        ({"clouds": [(changed(POINTS, 1e39), COLORS)]}, ["clouds[0]", "xyz[1]", "1e+39"]),
+        ({"clouds": [(POINTS, changed(COLORS, 1.5))]}, ["clouds[0]", "rgb[1]", "1.5"]),
+        ({"clouds": [(POINTS, changed(COLORS, -0.5))]}, ["clouds[0]", "rgb[1]", "-0.5"]),
+        ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
         ({"capacity": 2}, ["clouds[0]", "3", "at most 2, the capacity"]),
@@ -103,7 +107,7 @@ def put(array: np.ndarray, value: float) -> np.ndarray:
         ({"camera": "here"}, ["camera", "here"]),
         ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
-        ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "[[True], [True, False]]; expected bool [n]"]),
+        ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
         ({"rim": []}, ["rim", "0 entries", "1 clouds"]),

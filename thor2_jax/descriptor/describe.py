@@ -272,21 +272,24 @@ def describe_stream(
     """
     if batch < 1:
         raise InputError(f"batch is {batch}; expected at least 1")
-    iterator = iter(clouds)
+    return _stream(iter(clouds), network, config, capacity, batch)
+
+
+def _stream(
+    clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
+) -> Iterator[Descriptors]:
     empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     running: list[tuple[int, Descriptors]] = []
-
-    def fetch() -> Descriptors:
-        count, descriptors = running.pop(0)
-        return jax.tree.map(lambda a: np.asarray(a)[:count], descriptors)
-
-    while chunk := list(itertools.islice(iterator, batch)):
+    while chunk := list(itertools.islice(clouds, batch)):
         packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
         running.append((len(chunk), describe(packed, network, config)))
         if len(running) > 1:
-            yield fetch()
-    if running:
-        yield fetch()
+            yield _fetch(*running.pop(0))
+    yield from (_fetch(*last) for last in running)
+
+
+def _fetch(count: int, descriptors: Descriptors) -> Descriptors:
+    return jax.tree.map(lambda a: np.asarray(a)[:count], descriptors)
 
 
 def batch_mesh(devices: Sequence[Any] | None = None) -> Mesh:

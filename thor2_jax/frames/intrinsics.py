@@ -268,15 +268,16 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
     if "cam_K" in values:
         return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number"), ()
     if "intrinsic_matrix" in values:
-        matrix = np.asarray(values["intrinsic_matrix"], dtype=object)
-        if matrix.size != 9:
+        try:
+            matrix = np.asarray(values["intrinsic_matrix"], dtype=object).reshape(3, 3)
+        except ValueError:
             raise InputError(
                 f"intrinsics.intrinsic_matrix is {str(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, 0, "
                 "cx, cy, 1"
-            )
-        return matrix.reshape(3, 3).T, scale, ()
+            ) from None
+        return matrix.T, scale, ()
     if "ppx" in values or "ppy" in values:
-        scale = _units_per_metre(scale, 1, 1, "metres per depth unit beside ppx and ppy, such as 0.001")
+        scale = _units_per_metre(scale, 1, 1, "metres per depth unit, such as 0.001, since ppx and ppy are given")
         return _pinhole_matrix(values, "ppx", "ppy"), scale, _supported(values.get("model"), values.get("coeffs"))
     if any(name in values for name in ("camera_matrix", "K", "k")):  # K alone is a camera_info, too
         coefficients = _supported(model, _entry(values, "distortion_coefficients", "D", "d"))

@@ -29,6 +29,7 @@ from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 __all__ = [
     "LOOKS",
     "ObjectGallery",
+    "augmented_copies",
     "augmented_view",
     "embed_looks",
     "enrolled_object",
@@ -92,6 +93,8 @@ def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], sour
         InputError: there is no view, or a view has no points or is too large.
     """
     clouds = CompactClouds.of(list(views))
+    if not len(clouds):
+        raise InputError("views is empty; expected at least one view of the object")
     return enrolled_object(_embed_views(embedding, clouds, source), clouds, source)
 
 

@@ -127,24 +127,8 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
     )
 
 
-@contextlib.contextmanager
-def _reading(path: Path, remedy: str) -> Iterator[None]:
-    """Turn every exception for a file into a GalleryError, but not that for a missing one."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
-    except Exception as error:
-        raise GalleryError(f"gallery: {path} is damaged ({reason_of(error)}); {remedy}") from None
-
-
 def _read_index(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
-        return None
-    command = f"thor2 objects --reembed --model RUN --gallery {path.parent}"
-    with _reading(path, f"restore it from a copy, or delete this file and rebuild it: {command}"):
+    try:
         index = json.loads(read_file(path))
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
         if not all(isinstance(index[field], kind) for field, kind in fields.items()):
@@ -156,6 +140,15 @@ def _read_index(path: Path) -> dict[str, Any] | None:
             raise ValueError("a name is missing or listed twice")
         if not all(isinstance(file, str) and _DIGEST.fullmatch(file) for file in files):
             raise ValueError("an object has no file")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise GalleryError(
+            f"gallery: {path} is damaged ({reason_of(error)}); restore it from a copy, or delete this file and rebuild "
+            f"it: thor2 objects --reembed --model RUN --gallery {path.parent}"
+        ) from None
     if index["format"] != GALLERY_FORMAT:
         raise GalleryError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")
     return dict(index)
@@ -192,14 +185,21 @@ def _object_content(name: str, views: GalleryObject) -> bytes:
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     """Return the name of an object (None in files of version 0.2 and before) and the object."""
-    with _reading(path, "restore it from a copy, or delete the gallery"):
+    try:
         content = read_file(path)
-        if content_digest([content]) != path.stem:
-            raise ValueError("its SHA-256 is not its name")
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
+    if content_digest([content]) != path.stem:
+        raise GalleryError(f"gallery: {path} is damaged; restore it from a copy, or delete the gallery")
+    try:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
         views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", file=path.stem)
         return about.get("name"), _with_origin(views, about)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 
 def _lock(directory: Path, seconds: float) -> contextlib.AbstractContextManager[object]:

@@ -29,7 +29,7 @@ from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError, decoding
+from thor2_jax.errors import InputError
 from thor2_jax.files import (
     atomic_directory,
     check_output_directory,
@@ -54,8 +54,6 @@ __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file
 
 EMBEDDING_FILE = "embedding.safetensors"
 """File of a run's embedding, which replaces the packaged one."""
-
-_EXPECTED = "a file of this run; copy the whole run directory, or train it again"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,24 +126,28 @@ def load_run(path: str | Path) -> TrainedRun:
     """
     path = Path(path).absolute()
     description = read_description(path)
-    with decoding(f"model: {path / RUN_FILE} cannot be used", _EXPECTED):
+    try:
         config = DescriptorConfig.of_record(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
         # A run with enrolled objects only has neither.
         names = check_features(description["classifiers"]) if description["classifiers"] else ()
-        if names and not classes:
-            raise ValueError("classes is [] beside classifiers")
-        fingerprint, digests = description["color_network"], {name: description["weights"][name] for name in names}
-    with decoding(f"model: {path / 'network.npz'} cannot be used", _EXPECTED):
+        fingerprint = description["color_network"]
+        digests = {name: description["weights"][name] for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
+    if names and not classes:
+        raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
+    try:
         network = colornet.load(path / "network.npz")
-        if network.fingerprint != fingerprint:
-            raise ValueError(f"it is not the colour network that {RUN_FILE} names")
-    classifiers = {
-        name: _load_classifier(
-            weights_file(path, name), input_size(name, config, network.n_regions), len(classes), digests[name]
-        )
-        for name in names
-    }
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / 'network.npz'} cannot be read: {reason}") from None
+    if network.fingerprint != fingerprint:
+        raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
+    classifiers = {}
+    for name in names:
+        sizes = input_size(name, config, network.n_regions), len(classes)
+        classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
     embedding = Embedding.load(file, network) if file.is_file() else None
     stored = None if embedding is None else embedding.fingerprint
@@ -167,8 +169,15 @@ def weights_file(run: Path, name: str) -> Path:
 
 
 def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
-    with decoding(f"model: {path} cannot be used", _EXPECTED):
+    try:
         content = read_file(path)
-        if content_digest([content]) != digest:
-            raise ValueError(f"its SHA-256 is not the one in {RUN_FILE}")
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is missing; copy the whole run directory") from None
+    except OSError as error:
+        raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
+    if content_digest([content]) != digest:
+        raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
+    try:
         return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])
+    except ValueError as error:
+        raise InputError(f"model: {path} does not fit the classifier ({error})") from None

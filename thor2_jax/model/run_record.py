@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
-from thor2_jax.errors import InputError, decoding
+from thor2_jax.errors import InputError
 from thor2_jax.files import read_file
 
 __all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "run_directories"]
@@ -30,17 +30,22 @@ def read_description(path: Path) -> dict[str, Any]:
     Raises:
         InputError: the path is not a run directory, or its format or descriptor version is not supported.
     """
-    file = path / RUN_FILE
-    if not file.exists():
-        raise InputError(f"model: {path} is not a run directory; expected one with {RUN_FILE}")
-    with decoding(f"model: {file} cannot be used", "the file of a run of this version; copy it again, or train again"):
-        description = json.loads(read_file(file))
-        if not isinstance(description, dict):
-            raise ValueError(f"it holds a {type(description).__name__}")
-        for field, expected in (("format", RUN_FORMAT), ("descriptor_version", DESCRIPTOR_VERSION)):
-            if description.get(field) != expected:
-                raise ValueError(f"{field} is {description.get(field)!r}, not {expected}")
-        classes = description.get("classes")
-        if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-            raise ValueError(f"classes is {classes!r}, not a list of names")
+    try:
+        description = json.loads(read_file(path / RUN_FILE))
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
+    except (OSError, ValueError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None
+    if not isinstance(description, dict) or description.get("format") != RUN_FORMAT:
+        value = description.get("format") if isinstance(description, dict) else type(description).__name__
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected {RUN_FORMAT}; train it again")
+    if description.get("descriptor_version") != DESCRIPTOR_VERSION:
+        raise InputError(
+            f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "
+            f"this version computes {DESCRIPTOR_VERSION}; train it again"
+        )
+    classes = description.get("classes")
+    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
     return description

@@ -26,13 +26,15 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
 
     Args:
         host: address to listen on.
-        port: port to listen on, up to 65535; 0 chooses a free one.
+        port: port to listen on; 0 chooses a free one.
 
     Raises:
         InputError: the address cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     both = host == "::" and socket.has_dualstack_ipv6()
+    if not 0 <= port <= 65_535:
+        raise InputError(f"port is {port}; expected 0 to 65535, where 0 chooses a free one")
     try:
         listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=both)
     except OSError as error:

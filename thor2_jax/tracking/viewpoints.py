@@ -22,7 +22,6 @@ from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import read_file
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
-from thor2_jax.types import as_array
 
 __all__ = [
     "NextView",
@@ -52,7 +51,10 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
     Raises:
         InputError: the pose is not a finite [4, 4] matrix, or not a rigid motion (a rotation and a translation).
     """
-    matrix = as_array(pose, argument, "a matrix [4, 4]").astype(np.float64)
+    try:
+        matrix = np.array(pose, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(
             f"{argument} has shape {matrix.shape}; expected a matrix [4, 4] of finite numbers, from camera to world"

@@ -78,10 +78,12 @@ def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> 
     color = view.color.copy()
     flat = color.reshape(-1, 3)
     values = response.take(flat.take(pixels, axis=0)) @ matrix.astype(np.float32)
-    term = _lambert(view, pixels, rng)
-    values *= (1 + np.float32(shading) * (term - term.mean()))[:, None]
+    if shading:
+        term = _lambert(view, pixels, rng)
+        values *= (1 + np.float32(shading) * (term - term.mean()))[:, None]
     values += np.float32(255 * veil + 0.5)
-    values += np.float32(255 * noise) * rng.standard_normal(values.shape, np.float32)
+    if noise:
+        values += np.float32(255 * noise) * rng.standard_normal(values.shape, np.float32)
     flat[pixels] = values.clip(0, 255).astype(np.uint8)
     return dataclasses.replace(view, color=color)
 

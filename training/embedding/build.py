@@ -3,8 +3,8 @@
 The packaged network was fitted with the default options and the weaker augmentations of an earlier version, since a
 gallery separates unknown objects less well with the present augmentations. Its principal components and reference views
 were computed later (benchmarks/notes/accuracy.md). The fit took 1,280 s on two cores shared with other jobs: 90 s for
-the views and 1,190 s for the fit itself. When the command is repeated, an interrupted fit resumes from the directory
-FILE.checkpoints.
+the views and 1,190 s for the fit itself. `--meshes` adds the objects of a folder. When the command is repeated, an
+interrupted fit resumes from the directory FILE.checkpoints.
 """
 
 import dataclasses
@@ -20,26 +20,33 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from training.embedding.distractors import sample_objects, samples_record
+from training.embedding.distractors import ObjectSource, sample_objects, samples_record
 from training.embedding.fit import fit_embedding, reference_views
 from training.fitting.loop import Checkpoints, fit_progress
+from training.objects.meshes import find_meshes
 from training.storage.jobs import begin_job, locked, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding"]
 
+MESH_WEIGHT = 6
+"""Views of a mesh for each view of a procedural object, since a run must recognize its own objects best."""
+
 
 def build_embedding(
     out: Annotated[Path, typer.Option(help="file to write (safetensors)")],
     objects: Annotated[int, typer.Option(min=2, help="procedural objects")] = 3000,
-    views: Annotated[int, typer.Option(min=1, help="views of each object")] = 16,
+    views: Annotated[int, typer.Option(min=1, help="views of each object; 6 times as many of a mesh")] = 16,
     epochs: Annotated[int, typer.Option(min=1, help="passes over the samples")] = 20,
+    meshes: Annotated[Path | None, typer.Option(help="folder of other objects (GLB, OBJ, PLY)")] = None,
     workers: Annotated[int, typer.Option(min=1, help="rendering processes; they do not affect the result")] = 2,
 ) -> None:
-    """Fit an embedding and write it to a file; the error names an output file that cannot be used."""
+    """Fit an embedding and write it to a file; the error names a mesh or an output file that cannot be used."""
     check_output_file("out", out, lambda path: bool(Embedding.load(path)))
+    of_meshes = find_meshes(meshes).values() if meshes else ()
+    sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in of_meshes for _ in range(MESH_WEIGHT))]
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
-    arguments = range(objects), network, config, views
+    arguments = sources, network, config, views
     job, directory = samples_record(*arguments) | {"epochs": epochs}, out.with_name(f"{out.name}.checkpoints")
     start = time.monotonic()
 

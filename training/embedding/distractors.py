@@ -258,6 +258,7 @@ class Distractors:
         cache = cache_directory("distractors")
         if cache is not None:
             try:
+                cache.mkdir(mode=0o700, parents=True, exist_ok=True)
                 samples = sample(directory=cache / name)
                 _keep_newest(cache, name)
                 return samples

@@ -182,7 +182,7 @@ class Checkpoints:
         """Raise InputError if reading a checkpoint in the block fails."""
         try:
             yield
-        except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
+        except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
             raise InputError(
                 f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
             ) from None

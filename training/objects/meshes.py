@@ -153,7 +153,11 @@ def read_mesh(path: Path) -> TexturedMesh:
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
-        parts = [_part(part) for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        try:
+            placed = scene.dump()
+        except IndexError:
+            raise InputError("faces with invalid vertex indices; repair the mesh") from None
+        parts = [_part(part) for part in placed if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)
@@ -208,10 +212,11 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
+    requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         name = entry.name if entry.is_dir() else entry.stem
-        if names is not None and name not in names.values():  # scans that are not requested are not checked
+        if requested is not None and name not in requested:  # scans that are not requested are not checked
             continue
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:
@@ -219,14 +224,20 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     if names is None:
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
-        names = {scan: scan for scan in scans}
+        return _named(folder, scans)
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
-    with with_context(f"mesh folder {folder}"):
-        named = {check_name(name): scans[names[name]] for name in sorted(names)}
-        if len(named) < len(names):
-            raise InputError("two names are equal but for spaces or Unicode forms; expected one mesh of each object")
+    return _named(folder, {name: scans[names[name]] for name in sorted(names)})
+
+
+def _named(folder: Path, meshes: Mapping[str, Path]) -> dict[str, Path]:
+    """Return the meshes under their names as normalized by `check_name`."""
+    named: dict[str, Path] = {}
+    for name, path in meshes.items():
+        with with_context(f"mesh folder {folder}"):
+            if named.setdefault(check_name(name), path) != path:
+                raise InputError(f"object {name!r} is there twice; expected one mesh of each object")
     return named
 
 
@@ -248,7 +259,7 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
     if any(file.stem.lower() == "textured" for file in path.iterdir()) or name == own:
         mesh = _mesh_in(path)
         if mesh is not None:
-            return {check_name(name or own): mesh}
+            return _named(path.resolve().parent, {name or own: mesh})
     meshes = find_meshes(path)
     if name is None:
         return meshes

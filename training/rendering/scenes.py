@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
 from training.rendering.camera import (
@@ -204,7 +205,7 @@ def compose_scene(
     Args:
         objects: name -> mesh; metres, z up.
         rng: random number generator.
-        n_objects: number of objects in the scene, each a different one; at most the number of `objects`.
+        n_objects: number of objects in the scene, each a different one.
         camera: camera of the frame.
         clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
             occludes the other.
@@ -263,7 +264,13 @@ def compose_views(
 def _composed(
     objects: Mapping[str, TexturedMesh], count: int, clutter: float, rng: np.random.Generator
 ) -> tuple[dict[str, TexturedMesh], float, Array]:
-    """Return random objects on the table, and the azimuth and pose of a camera in line with them."""
+    """Return random objects on the table, and the azimuth and pose of a camera in line with them.
+
+    Raises:
+        InputError: there are fewer than `count` objects.
+    """
+    if not 1 <= count <= len(objects):
+        raise InputError(f"n_objects is {count!r}; it must be 1 to {len(objects)}, the number of objects")
     names = [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
     azimuth = rng.uniform(0, 2 * np.pi)
     pose = _random_pose(rng, azimuth)

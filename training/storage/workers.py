@@ -11,7 +11,6 @@ is given to another worker.
 import collections
 import contextlib
 import ctypes
-import functools
 import importlib
 import inspect
 import multiprocessing
@@ -87,6 +86,50 @@ def _initialize_worker() -> None:
     threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
+class _Processes:
+    """Worker processes that are replaced when they die, with a waiting thread for each.
+
+    There is one ProcessPoolExecutor per process, since an executor with several ends all of them when one dies.
+    """
+
+    def __init__(self, count: int) -> None:
+        # Processes are spawned, since JAX starts threads and a forked child can deadlock on their locks.
+        self._context = multiprocessing.get_context("spawn")
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
+        for _ in range(count):
+            self._idle.put(self._start())
+
+    def _start(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, mp_context=self._context, initializer=_initialize_worker)
+
+    def submit(self, function: Callable[[A], B], item: A) -> Future[B]:
+        return self._threads.submit(self._call, function, item)
+
+    def _call(self, function: Callable[[A], B], item: A) -> B:
+        for _ in range(ATTEMPTS):
+            process = self._idle.get()
+            try:
+                with signals_blocked(signal.SIGINT):  # A process started here ignores Ctrl-C; this process handles it.
+                    future = process.submit(function, item)
+                return future.result()
+            except BrokenProcessPool as error:
+                reason = error
+                process.shutdown()
+                process = self._start()
+            finally:
+                self._idle.put(process)
+        raise ChildProcessError(
+            f"{ATTEMPTS} worker processes died at the same item, possibly because memory ran out ({reason})"
+        ) from reason
+
+    def close(self) -> None:
+        """Wait for running calls, cancel the others, and end the processes."""
+        self._threads.shutdown(cancel_futures=True)
+        while not self._idle.empty():
+            self._idle.get().shutdown()
+
+
 def local_workers(workers: int = 1) -> WorkerPool:
     """Return a pool of processes on this machine; a single worker runs in the calling process.
 
@@ -99,38 +142,8 @@ def local_workers(workers: int = 1) -> WorkerPool:
         if workers == 1:
             yield from map(function, items)
             return
-        # There is one executor per process, since an executor with several ends all of them when one dies. Processes
-        # are spawned, since JAX starts threads and a forked child can deadlock on their locks.
-        spawn = multiprocessing.get_context("spawn")
-        start = functools.partial(ProcessPoolExecutor, 1, mp_context=spawn, initializer=_initialize_worker)
-        threads = ThreadPoolExecutor(workers)  # each waits for a process
-        idle: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
-        for _ in range(workers):
-            idle.put(start())
-
-        def call(item: A) -> B:
-            for _ in range(ATTEMPTS):
-                process = idle.get()
-                try:
-                    with signals_blocked(signal.SIGINT):  # A process started here ignores Ctrl-C; this one handles it.
-                        future = process.submit(function, item)
-                    return future.result()
-                except BrokenProcessPool as error:
-                    reason = error
-                    process.shutdown()
-                    process = start()
-                finally:
-                    idle.put(process)
-            raise ChildProcessError(
-                f"{ATTEMPTS} worker processes died at the same item, possibly because memory ran out ({reason})"
-            ) from reason
-
-        try:
-            yield from _map_ordered(lambda item: threads.submit(call, item), Future.result, items, workers)
-        finally:  # wait for running calls, cancel the others, and end the processes
-            threads.shutdown(cancel_futures=True)
-            while not idle.empty():
-                idle.get().shutdown()
+        with contextlib.closing(_Processes(workers)) as processes:
+            yield from _map_ordered(lambda item: processes.submit(function, item), Future.result, items, workers)
 
     return run
 

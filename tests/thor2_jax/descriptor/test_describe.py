@@ -144,6 +144,6 @@ def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
 
 
 def test_bad_input_of_a_stream() -> None:
-    assert_refused("batch is 0", list, describe.describe_stream(stream(2), NETWORK, CLOSED, batch=0))
+    assert_refused("batch is 0", describe.describe_stream, stream(2), NETWORK, CLOSED, batch=0)
     bad = [*stream(2), (np.full((3, 3), np.nan), np.zeros((3, 3), np.uint8))]
     assert_refused("2", list, describe.describe_stream(bad, NETWORK, CLOSED, capacity=512, batch=4))

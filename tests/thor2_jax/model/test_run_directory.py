@@ -11,6 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
+from failures import full_disk
 from refusals import assert_refused
 from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
@@ -82,6 +84,20 @@ def test_an_empty_directory_may_be_filled(tmp_path: Path) -> None:
     assert tuple(load_run(tmp_path / "run").classifiers) == ("ce",)
 
 
+@pytest.mark.parametrize("broken", ["network", "weights", "json"])
+def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = make_run()
+    if broken == "network":
+        monkeypatch.setattr(colornet, "save", full_disk)
+    elif broken == "weights":
+        monkeypatch.setattr(safetensors.numpy, "save", full_disk)
+    else:
+        run = dataclasses.replace(run, record={"not JSON": object()})
+    with pytest.raises(TypeError if broken == "json" else OSError):
+        save_run(run, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
 def edited(**changes: Any) -> Callable[[Path], None]:
     def edit(path: Path) -> None:
         description = json.loads((path / "run.json").read_text())
@@ -114,25 +130,25 @@ def other_network(path: Path) -> None:
 
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
-    "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be used"),
-    "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "Is a directory"),
-    "a list": (lambda path: (path / "run.json").write_text("[1]"), "it holds a list"),
-    "other format": (edited(format=3), "format is 3"),
-    "other version": (edited(descriptor_version=99), "descriptor_version is 99"),
-    "no record": (edited(record=[1]), "run.json cannot be used"),
+    "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
+    "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
+    "other format": (edited(format=3), "run.json has format 3"),
+    "other version": (edited(descriptor_version=99), "descriptor version 99"),
+    "no record": (edited(record=[1]), "run.json: TypeError"),
     "empty classes": (edited(classes=[]), "classes is []"),
     "one string": (edited(classes="abc"), "classes is 'abc'"),
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
-    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json cannot be used ('tops2' is missing)"),
+    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
     "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
     "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
-    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "does not have the shape"),
-    "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be used"),
-    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be used"),
-    "other network": (other_network, "it is not the colour network"),
-    "flipped bit": (flip_a_bit, "weights/ce.safetensors cannot be used (its SHA-256"),
-    "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors: No such file"),
+    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
+    "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
+    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
+    "other network": (other_network, "network.npz is not the colour network"),
+    "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
+    "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 
 

@@ -27,4 +27,5 @@ def test_listed_hosts_are_names_or_addresses() -> None:
 
 
 def test_addresses_that_cannot_be_used_are_refused() -> None:
+    assert_refused("port is 70000", listening("127.0.0.1", 70_000).__enter__)
     assert_refused("host 203.0.113.9", listening("203.0.113.9", 0).__enter__)  # an address for documentation

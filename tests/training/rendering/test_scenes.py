@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
@@ -132,6 +133,11 @@ def test_light_changes_colours_by_a_gain() -> None:
     bright = (plain.frame.color > 60).all(axis=-1) & (lit.frame.color < 255).all(axis=-1)
     gain = lit.frame.color[bright] / plain.frame.color[bright]
     assert np.ptp(gain, axis=0).max() < 0.02 and 0.6 < gain.min() <= gain.max() < 1.45
+
+
+def test_numbers_of_objects_out_of_range_are_refused() -> None:
+    for count in (0, 99):
+        assert_refused(f"n_objects is {count};", compose_scene, OBJECTS, np.random.default_rng(0), n_objects=count)
 
 
 def test_views_of_a_scene_agree_in_space() -> None:
