@@ -157,13 +157,19 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     """
     record = finished_record(job.out)
     stored = record["dataset"]
-    values = {  # of the finished run, and of the job
-        "seed": (record["seed"], job.protocol.fit.seed),
-        "dataset": (stored.get("job"), job.protocol.render_job(_find_meshes(job)).record()),
-        "frames": (stored.get("frames", {}).get("digest"), labelled.digest if labelled else None),
-        "leave_out": (stored.get("classes_left_out", []), sorted(set(job.leave_out))),
+    trained = {
+        "seed": record["seed"],
+        "dataset": stored.get("job"),
+        "frames": stored.get("frames", {}).get("digest"),
+        "leave_out": stored.get("classes_left_out", []),
     }
-    check_same_job(job.out, *({name: pair[side] for name, pair in values.items()} for side in (0, 1)))
+    requested = {
+        "seed": job.protocol.fit.seed,
+        "dataset": job.protocol.render_job(_find_meshes(job)).record(),
+        "frames": labelled.digest if labelled else None,
+        "leave_out": sorted(set(job.leave_out)),
+    }
+    check_same_job(job.out, trained, requested)
     if job.baselines:
         return
     check_trained(stored["digest"], job.out, job.protocol)

@@ -188,11 +188,10 @@ def train_run(
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
         wait_for_all("begun")
+        held_out = [fold_of == fold if is_held_out else None for fold in range(folds)]
         runs = [
-            _Fold(
-                settings, source, out, fold, samples, label, view, fold_of == fold if is_held_out else None, progress
-            ).train()
-            for fold in range(folds)
+            _Fold(settings, source, out, fold, samples, label, view, mask, progress).train()
+            for fold, mask in enumerate(held_out)
         ]
         wait_for_all("trained")
         if first:
@@ -236,11 +235,12 @@ class _Fold(NamedTuple):
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
         """Fit the classifiers; return the classifiers, the epoch of each, and their temperatures."""
         settings, samples = self.settings, self.samples
+        if samples is None:
+            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
         temperatures: dict[str, float] = {}
         for name in settings.classifiers:
-            assert samples is not None
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)

@@ -228,7 +228,7 @@ class RenderJob:
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be at least 0")
         augmentations, camera = self.augmentations, TRAINING_CAMERA
-        checked = (_checked_size(*each) for each in _checked_meshes(self.meshes, self.angles))
+        checked = ((name, _checked_size(name, mesh)) for name, mesh in _checked_meshes(self.meshes, self.angles))
         # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
         intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
         return {
@@ -255,15 +255,15 @@ class RenderJob:
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
 
 
-def _checked_size(name: str, mesh: TexturedMesh) -> tuple[str, TexturedMesh]:
-    """Return an object; raise InputError if its views may be too large to be stored."""
+def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
+    """Return a mesh; raise InputError if its views may be too large to be stored."""
     diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if SIGMA_S * diameter > MAX_VIEW_LENGTH:
         raise InputError(
             f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
             "stored; scale the mesh to metres"
         )
-    return name, mesh
+    return mesh
 
 
 def render_views(
