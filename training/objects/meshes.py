@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
@@ -42,43 +43,55 @@ MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
-def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
-    """Convert one geometry of a file.
+def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> TexturedMesh:
+    """Convert one geometry of a file, transformed by a homogeneous matrix [4, 4].
 
     Raises:
         InputError: the geometry has no colour, faces with invalid vertex indices, or a texture that cannot be used.
         ValueError: the geometry is inconsistent.
     """
-    from trimesh.visual.material import PBRMaterial, empty_material
+    from trimesh.transformations import transform_points
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
     vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
+    vertices = transform_points(vertices, transform)
     faces = np.reshape(np.asarray(geometry.faces, np.int32), (-1, 3))
+    if np.linalg.det(transform[:3, :3]) < 0:  # keep the faces of a mirrored part oriented outwards
+        faces = np.fliplr(faces).copy()
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
-    if visual.kind in ("vertex", "face"):
-        colors = visual.vertex_colors[faces] if visual.kind == "vertex" else np.stack([visual.face_colors] * 3, axis=1)
-        return TexturedMesh(vertices, faces, corner_colors=np.asarray(colors[..., :3], np.uint8))
+    if visual.kind == "vertex":
+        return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
+    if visual.kind == "face":
+        colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
+        return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours")
     material = visual.material
-    is_simple = not isinstance(material, PBRMaterial)
-    image = material.image if is_simple else material.baseColorTexture
-    factor = material.baseColorFactor if not is_simple else material.diffuse if image is None else None
-    if image is None:
-        uv, texture = np.zeros((len(faces), 3, 2), np.float32), np.full((1, 1, 3), 255, np.uint8)
+    if isinstance(material, PBRMaterial):
+        image, factor = material.baseColorTexture, material.baseColorFactor
+    elif isinstance(material, SimpleMaterial):
+        image, factor = material.image, None if material.image is not None else material.diffuse
     else:
+        raise InputError(f"unsupported material {type(material).__name__}")
+    if image is not None:
         check_size(image.width, image.height)  # before it is decoded
+        is_simple = isinstance(material, SimpleMaterial)
         if visual.uv is None:
             raise InputError("a texture, but no texture coordinates; export the mesh with them")
         if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
             raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
         if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
             raise InputError("texture coordinates, but no material with a texture or a colour")
+    factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
+    if image is None:
+        uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
+    else:
         uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
         texture = np.asarray(image.convert("RGB"))
-    if factor is not None:
-        texture = np.rint(texture * (np.asarray(factor, np.uint8)[:3] / 255.0)).astype(np.uint8)
+        if (factor < 255).any():
+            texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
@@ -153,11 +166,12 @@ def read_mesh(path: Path) -> TexturedMesh:
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
             raise InputError(f"its file {missing[0]!r} is missing or unreadable")
-        try:
-            placed = scene.dump()
-        except IndexError:
-            raise InputError("faces with invalid vertex indices; repair the mesh") from None
-        parts = [_part(part) for part in placed if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        parts = []
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+                parts.append(_part(geometry, transform))
         if not parts:
             raise InputError("no faces")
         mesh = merge_meshes(parts)
