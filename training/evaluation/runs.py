@@ -226,12 +226,12 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         InputError: a sequence has no run, a run cannot be read, or runs differ in their classifiers, baselines, number
             of folds, descriptor or colour network.
     """
-    found = {
+    directories = {
         sequence: [directory / end for end in path_ends(sequence) if (directory / end).is_dir()]
         for sequence in dict.fromkeys(map(sequence_of, frames))
     }
-    loaded = {path: load_runs([path]) for path in dict.fromkeys(paths[0] for paths in found.values() if paths)}
-    missing = [sequence for sequence, paths in found.items() if not paths]
+    loaded = {path: load_runs([path]) for path in dict.fromkeys(paths[0] for paths in directories.values() if paths)}
+    missing = [sequence for sequence, paths in directories.items() if not paths]
     if missing:
         raise InputError(
             f"model: {directory} has no run for {', '.join(missing)}; train the missing ones with "
@@ -246,7 +246,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         _check_same_descriptor(runs[0], first[0], path, first_path)
     result = []
     for fold, run in enumerate(first):
-        of_sequence = {sequence: loaded[paths[0]][fold] for sequence, paths in found.items()}
+        of_sequence = {sequence: loaded[paths[0]][fold] for sequence, paths in directories.items()}
         digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=of_sequence))

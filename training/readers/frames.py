@@ -123,7 +123,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """
     if depth_scale is not None:
         Intrinsics(1.0, 1.0, 0.0, 0.0, depth_scale)
-    found: list[tuple[Path, FrameSource]] = []  # folder of each frame, and the frame
+    located: list[tuple[Path, FrameSource]] = []  # folder of each frame, and the frame
     for path in paths:
         path = named_path(path)
         if not path.is_dir():
@@ -144,13 +144,13 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 of_path.append((folder, frame_files(folder).source(name, depth_scale)))
         if not of_path:
             raise InputError(f"frames: {path} has no {' or '.join(FILE_NAMES['color'])}; expected a folder of frames")
-        found += of_path
-    sources = [source for _, source in found]
+        located += of_path
+    sources = [source for _, source in located]
     if len({source.name for source in sources}) == len(sources):
         return sources
     # Frames in different folders may have the same name: their names are then relative to the common parent folder.
-    common = Path(os.path.commonpath([folder.parent for folder, _ in found]))
-    names = [folder.relative_to(common).as_posix() for folder, _ in found]
+    common = Path(os.path.commonpath([folder.parent for folder, _ in located]))
+    names = [folder.relative_to(common).as_posix() for folder, _ in located]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")

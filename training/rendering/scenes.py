@@ -217,6 +217,9 @@ def compose_scene(
     Returns:
         The scene. An instance with fewer than `MIN_PIXELS` visible pixels is not labelled (its pixels are 0), so that
         there may be fewer than `n_objects` labels.
+
+    Raises:
+        InputError: there are fewer than `n_objects` objects.
     """
     meshes, _, pose = _composed(objects, n_objects, clutter, rng)
     return _render(meshes, pose, camera, noise, light, rng)
@@ -252,6 +255,9 @@ def compose_views(
 
     Returns:
         For each camera, the scene as from `compose_scene` and the pose [4, 4], camera to world coordinates.
+
+    Raises:
+        InputError: there are fewer than `n_objects` objects.
     """
     meshes, azimuth, _ = _composed(objects, n_objects, clutter, rng)
     views = []

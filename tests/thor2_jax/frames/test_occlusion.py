@@ -74,8 +74,8 @@ def test_instances_without_depth_or_of_one_pixel() -> None:
     labels[labels == FRONT] = 0
     depth[labels == BACK] = 0
     labels[0, 0], labels[110, 50] = 3, 4
-    found = {label: occluded for label, (occluded, _) in occlusions(depth, labels).items()}
-    assert found == {BACK: False, 3: True, 4: False}  # 3 is at the border of the image
+    is_occluded = {label: occluded for label, (occluded, _) in occlusions(depth, labels).items()}
+    assert is_occluded == {BACK: False, 3: True, 4: False}  # 3 is at the border of the image
 
 
 # Against a loop over the pixels
