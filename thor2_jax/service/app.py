@@ -22,6 +22,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
+from thor2_jax.printable import find_name
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
 from thor2_jax.service.decoding import read_body, read_form
@@ -233,7 +234,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         """
         async with service.admit(partial(read_form, request, schemas.ENROLLMENT_FORM)) as (admitted, files):
             known = await service.enroll(files, admitted)
-        (enrolled,) = [answer for answer in object_answers(known) if answer.name == files["name"]]
+        stored_name = find_name(files["name"], known.gallery.names)
+        (enrolled,) = [answer for answer in object_answers(known) if answer.name == stored_name]
         return schemas.EnrollmentAnswer(
             **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
         )

@@ -102,6 +102,15 @@ def test_extend_replace_and_undo(http: httpx.Client, files: Files) -> None:
         check_refused(undo(http, other), 409, "generation")
 
 
+def test_a_name_stored_in_another_unicode_form_is_extended(http: httpx.Client, files: Files, gallery: Path) -> None:
+    """Galleries of older versions contain such names."""
+    enroll(http, files, "caf\u00e9")
+    index = gallery / "index.json"
+    index.write_text(index.read_text(encoding="utf-8").replace("\u00e9", "e\u0301"), encoding="utf-8")
+    answer = enroll(http, files, "caf\u00e9", 7, extend="true")
+    assert (answer.status_code, answer.json()["name"], answer.json()["views"]) == (200, "cafe\u0301", 2)
+
+
 def test_another_process_sees_a_change_and_is_seen(
     http: httpx.Client, files: Files, frame: Any, teaching_run: Path, gallery: Path
 ) -> None:
