@@ -100,10 +100,20 @@ class RecognizerArguments:
     model: Path
     unknown_below: float | None = None
     answer_by: str | None = None
+    gallery: Path | None = None
 
     def load(self) -> Recognizer:
-        """Load a recognizer for single frames; raise errors as `Recognizer.load`."""
-        return Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by, chunk=BATCH_BUCKETS[-1])
+        """Load a recognizer for single frames.
+
+        Raises:
+            InputError: as `Recognizer.load`, or the model lacks the classifiers or enrolled objects to answer by.
+        """
+        options: dict[str, Any] = {"gallery": self.gallery, "answer_by": self.answer_by, "chunk": BATCH_BUCKETS[-1]}
+        recognizer = Recognizer.load(self.model, self.unknown_below, **options)
+        if self.answer_by not in (None, "both", recognizer.model.answers_by()):
+            missing = "enrolled objects; enroll" if self.answer_by == "gallery" else "classifiers; train"
+            raise InputError(f"answer_by is {self.answer_by}, but the model has no {missing} some, or leave it out")
+        return recognizer
 
     def segment(self, frame: RGBDFrame) -> NDArray[Any]:
         """Segment a frame with `Recognizer.segment` in a worker process, which loads the recognizer only once."""

@@ -32,11 +32,11 @@ def explain(
     """
     from thor2_jax.explanation.explain import explain as explain_answer
     from thor2_jax.files import check_output_directory
-    from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import MODEL
+    from training.frame_recognition import RecognizerArguments
     from training.reports.explanation_page import PAGE, check_no_foreign_files, write_explanation
 
-    load = functools.cache(lambda: Recognizer.load(model, unknown_below, gallery=gallery, answer_by=answer_by))
+    load = functools.cache(RecognizerArguments(model, unknown_below, answer_by, gallery).load)
     sources = given.sources(segment, lambda frame: load().segment(frame))
     check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
     recognizer = load()

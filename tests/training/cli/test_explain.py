@@ -115,6 +115,7 @@ def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, 
     out = tmp_path / "out"
     command = ("explain", "--model", model, frame, "--out", out)
     assert "table: instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
+    assert "answer_by is gallery" in refused(*command, "--answer-by", "gallery")
     (frame / "mask.png").unlink()
     assert "error: table: labels is None" in refused(*command)
     out.mkdir()  # The error has not created it.

@@ -13,10 +13,12 @@ from commands import Command, Recognize, frame_options, json_lines, run_thor2
 from image_files import small_frame, write_frame_files
 from PIL import Image
 from recording_files import table_frame
+from small_runs import untrained_run
 from written_files import files_of
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.run_directory import save_run
 from training.cli import recognize as recognize_command
 from training.readers.frames import FrameFiles
 
@@ -106,6 +108,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     Path("empty").mkdir()
     files = " ".join(map(str, frame_options(write_frame_files(Path("frames/one"), small_frame()))))
     Path("frames/names.json").write_text("{}")
+    save_run(untrained_run((), ()), Path("gallery-only"))
     for arguments, expected in (
         ("", "give either"),
         ("frames --color frames/one/color.png", "give either"),
@@ -123,6 +126,8 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("FILES --out out --labels frames/names.json", "names.json"),
         ("FILES --out out --model absent", "absent"),
         ("FILES --out out --model empty", "run.json"),
+        ("FILES --out out --answer-by gallery", "answer_by is gallery"),
+        ("FILES --out out --answer-by classifiers --model gallery-only", "answer_by is classifiers"),
     ):
         command = arguments.replace("FILES", files).split()
         assert expected in refused("recognize", "--model", model, *command), arguments
