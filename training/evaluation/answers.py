@@ -170,9 +170,9 @@ Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
-EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
-"""Columns of the embedding alone, of THOR2 with the confidence from the embedding (in runs with the paper's
-classifiers), of the gallery alone, and of all combined. The recognizer computes them without a fusion rule."""
+EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "classifiers", "gallery", "both"
+"""Columns of the embedding alone, of the classifiers with the confidence from the embedding (in runs that have both),
+of the gallery alone, and of all combined. The recognizer computes them without a fusion rule."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
 """All columns that are computed without a fusion rule."""
@@ -196,12 +196,12 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
 
     Args:
         titles: the columns, at least one.
-        answer_by: "classifiers", "gallery" or "both". For "classifiers", the column is the first available one of: the
-            embedding with THOR2, THOR2, the embedding, the last title.
+        answer_by: "classifiers", "gallery" or "both". If there is no column with this title, the column is the first
+            available one of: THOR2, TOPS, TOPS2, the embedding, the last title (see `Model.chosen_classifiers`).
     """
     titles = list(titles)
     last = [title for title in titles if title not in WHOLE][-1:]
-    return next(title for title in (answer_by, ALL_CLASSIFIERS, "THOR2", EMBEDDED, *last) if title in titles)
+    return next(title for title in (answer_by, "THOR2", "TOPS", "TOPS2", EMBEDDED, *last) if title in titles)
 
 
 class Predictions(NamedTuple):

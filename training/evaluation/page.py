@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from training.baselines.job import TITLES
-from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
+from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, main_fusion
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.published import published_seconds
 from training.evaluation.scores import COVERAGE
@@ -203,9 +203,10 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
     elif EMBEDDED in report["fusions"]:
         text += f"The column {EMBEDDED} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
+        named_by = main_fusion(title for title in report["fusions"] if title != ALL_CLASSIFIERS)
         text += (
-            f"{ALL_CLASSIFIERS} shows the names from THOR2 with the confidence from the embedding; answers below the "
-            "threshold keep their names in this table. "
+            f"The column {ALL_CLASSIFIERS} shows the names from {named_by} with the confidence from the embedding; "
+            "answers below the threshold keep their names in this table. "
         )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):
         text += (
@@ -235,7 +236,7 @@ def _bar_chart(table: Mapping[str, Any], titles: Sequence[str], caption: str, pa
 
 
 def _fused_titles(report: Mapping[str, Any]) -> list[str]:
-    return [title for title in report["fusions"] if ("+" in title or title == "THOR2") and title not in WHOLE]
+    return [title for title in report["fusions"] if "+" in title or title == "THOR2"]
 
 
 def _fusion_sections(report: Mapping[str, Any]) -> list[Section]:

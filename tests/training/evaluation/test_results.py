@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from sklearn.metrics import confusion_matrix
-from toy_recognizers import ToyRun
+from toy_recognizers import ToyRun, UntaughtRecognizer
 
+from thor2_jax.networks import FEATURES
 from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
-from training.evaluation.page import answer_texts
+from training.evaluation.page import _accuracy_text, answer_texts
 from training.evaluation.results import compute_results, named_answers
 from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
 
@@ -46,14 +47,24 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
 def test_main_fusion_is_that_of_what_answers() -> None:
     for predictors, answer_by, expected in (
         (["thor", "ce"], "classifiers", "CE"),
-        (["ce", "tops"], "classifiers", "CE+TOPS"),
+        (["ce", "tops"], "classifiers", "TOPS"),
         (["ce", "tops", "tops2", "gallery", "both"], "classifiers", "THOR2"),
         (["ce", "tops", "tops2", "gallery", "both"], "gallery", "gallery"),
         (["forest", "embedding", "gallery", "both"], "both", "both"),
         (["forest", "embedding"], "classifiers", "embedding"),
-        (["tops", "tops2", "embedding", "THOR2+embedding"], "classifiers", "THOR2+embedding"),
+        (["tops", "tops2", "embedding", "classifiers"], "classifiers", "classifiers"),
     ):
         assert main_fusion(fusions(predictors), answer_by) == expected
+    for features in (("ce",), ("tops",), ("ce", "tops"), ("tops2",), ("ce", "tops2"), ("tops", "tops2"), FEATURES):
+        chosen = UntaughtRecognizer(features=features).model.chosen_classifiers()
+        assert fusions(features)[main_fusion(fusions(features))] == chosen
+
+
+@pytest.mark.parametrize(("feature", "named_by"), [("tops", "TOPS"), ("ce", "embedding")])
+def test_the_page_says_which_column_gives_the_names(feature: str, named_by: str) -> None:
+    titles = list(fusions([feature, "embedding", "classifiers"]))
+    text = _accuracy_text({"fusions": titles, "rule": "log-mean", "scratch": [], "runs": ["run"]})
+    assert f"column classifiers shows the names from {named_by} " in text and "THOR2" not in text
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
