@@ -7,7 +7,8 @@ with serve_live(broadcast, port=0) as url:
 
 A message is JSON and a server-sent event. It has `state` (waiting, live, ended or failed), `message`, and the values of
 the last frame: `frame` (its name), `number`, `image` (JPEG in base64), `fps`, `milliseconds` for segmentation and
-recognition, `error`, and `objects`: the fields of the answer, box, position and color of each object.
+recognition, `error`, and `objects`: the fields of the answer, box, position and color of each object. After an error,
+`image` and `milliseconds` are those of the last recognized frame.
 """
 
 import base64

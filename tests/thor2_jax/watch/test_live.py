@@ -163,17 +163,21 @@ def test_page_shows_frames_and_states(browser: Browser, monkeypatch: pytest.Monk
         expect(page.locator("#objects .confidence")).to_have_text(["90 %", "90 %"])
         assert page.locator("#picture").evaluate("image => image.decode().then(() => image.naturalWidth)") == 320
         assert float(page.locator("#fps").inner_text()) > 0
+        assert page.locator("#outdated").is_hidden()
         for width in (1280, 390):
             page.set_viewport_size({"width": width, "height": 800})
             assert page.evaluate("document.documentElement.scrollWidth") == width
         view.show(recorded(2, fail))
         expect(page.locator("#problem")).to_have_text("depth is missing")
         expect(page.locator("#none")).to_be_visible()
+        assert page.locator("#outdated").is_visible()  # one script call updates the whole page
+        assert page.locator("#picture").evaluate("image => getComputedStyle(image).opacity") == "0.4"
         view.publish_state("failed", "the camera was unplugged")
         expect(page.locator("#ready")).to_have_text("Stopped")
         expect(page.locator("#problem")).to_have_text("the camera was unplugged")
         view.show(recorded(3))
         expect(page.locator("#ready")).to_have_text("Live")
+        assert page.locator("#outdated").is_hidden()
     expect(page.locator("#ready")).to_have_text("Disconnected")  # the server is gone
     expect(page.locator("#picture")).to_be_visible()
     page.close()

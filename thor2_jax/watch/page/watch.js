@@ -65,6 +65,7 @@ function show(message) {
   setState(message.state);
   setOptional("message", message.state === "failed" ? "" : message.message);
   setOptional("problem", message.state === "failed" ? message.message : message.error);
+  element("outdated").hidden = !(message.error && message.image);
   if (message.image) {
     element("picture").src = `data:image/jpeg;base64,${message.image}`;
     element("picture").hidden = false;
