@@ -163,10 +163,13 @@ class Service:
             raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
     def close(self) -> None:
-        """Refuse new requests, finish those in progress, then stop processes and threads."""
+        """Refuse new requests, finish those in progress, then stop processes and threads.
+
+        A compilation that has begun cannot be interrupted; its thread ends later.
+        """
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
-        self._compiler.shutdown(cancel_futures=True)
+        self._compiler.shutdown(wait=False, cancel_futures=True)
         self._pool.close()
         self._batcher.close()
         self._explainer.shutdown(cancel_futures=True)

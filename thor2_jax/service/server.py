@@ -12,7 +12,6 @@ import logging
 import multiprocessing
 import os
 import signal
-import sys
 import tempfile
 import threading
 from multiprocessing.process import BaseProcess
@@ -47,6 +46,8 @@ MAX_HEAD = 2**20
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:
     """Serve until SIGTERM or SIGINT, then finish the accepted requests and return.
 
+    With one worker, SIGTERM ends this process instead, with exit code 0.
+
     Args:
         settings: settings of each worker.
         host: address to listen on.
@@ -78,8 +79,8 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         if workers == 1:
             config.load()
             log.info("listening at %s", url)
-            # uvicorn raises the signal again after the shutdown, which then is a normal exit.
-            signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+            # uvicorn raises the signal again after the shutdown. A normal exit would wait for the compiling thread.
+            signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
             with contextlib.suppress(KeyboardInterrupt):
                 uvicorn.Server(config).run([listener])
         else:

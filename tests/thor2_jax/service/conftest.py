@@ -113,8 +113,11 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
 
 
 SERVE = """
-from thor2_jax.service import engine
+import sys, threading
+from thor2_jax.service import engine, pipeline
 engine.POINT_BUCKETS = (engine.MIN_BATCH_POINTS,)  # the tests send no larger clouds
+if "--warm-why" in sys.argv:
+    pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
 from training.cli import main
 main()
 """

@@ -47,7 +47,9 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
 
 @pytest.mark.parametrize("workers", [1, *slow(2)])
 def test_sigterm_answers_accepted_requests(workers: int, start_server: Callable[..., Any], files: Files) -> None:
-    server, answered = start_server("--workers", str(workers), "--processes", "1"), list[int]()
+    """It does not wait for explanations to be compiled, which takes up to a minute."""
+    options = ("--workers", str(workers), "--processes", "1", "--warm-why")
+    server, answered = start_server(*options), list[int]()
     wait_until(lambda: server.log.read_text().count("ready: ") == workers, server.log.read_text)
 
     def call(_: int) -> None:
