@@ -27,6 +27,7 @@ from training.embedding.distractors import render_clouds, sample_objects
 from training.embedding.fit import fit_embedding
 from training.fitting.loop import Checkpoints
 from training.fitting.samples import Samples, describe_batch
+from training.storage.jobs import save_arrays
 from training.views import normalized_views
 
 NETWORK = colornet.load_default()
@@ -115,6 +116,22 @@ def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest
     for _ in range(2):
         np.testing.assert_equal(vars(sample(pool=stopped, directory=tmp_path / "samples")), vars(whole))
         assert rendered == [0, 6] and done[:3] == [(3, 8), (6, 8), (8, 8)]
+
+
+def test_only_damaged_files_are_rendered_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 2)
+    sample = functools.partial(sample_objects, OBJECTS[:4], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
+    whole, damaged = sample(), tmp_path / "000002.safetensors"
+    content = damaged.read_bytes()
+    save_arrays(tmp_path / "incomplete", {"label": whole.label}, {})
+    incomplete = (tmp_path / "incomplete").read_bytes()
+    with mock.patch.object(module, "render_clouds", wraps=render_clouds) as render:
+        for bad in (content[:-1] + bytes([content[-1] ^ 1]), content[:-1], incomplete):
+            damaged.write_bytes(bad)
+            np.testing.assert_equal(vars(sample()), vars(whole))
+            assert damaged.read_bytes() == content
+            np.testing.assert_equal(vars(sample()), vars(whole))
+    assert [set(call.args[0]) for call in render.call_args_list] == [{2, 3}] * 3
 
 
 @pytest.fixture(scope="module")
