@@ -6,7 +6,7 @@ import functools
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,15 +19,102 @@ from training.cli import options
 from training.cli.app import app, console, finish, print_note
 
 if TYPE_CHECKING:
+    from thor2_jax.frames.frames import RGBDFrame
     from thor2_jax.model.recognition import Recognition
+    from thor2_jax.model.result_files import ResultTables
+    from training.frame_recognition import FrameAnswer
 
 MAX_LISTED = 5
 """Largest number of failed frames that the last line lists."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """Options of the files for the answers."""
+
+    out: Annotated[
+        Path | None, typer.Option(help="Directory for recognition.json and overlay.png; OUT/<frame> for each FRAME.")
+    ] = None
+    coco: Annotated[Path | None, typer.Option(metavar="FILE", help="Write COCO results (JSON with masks).")] = None
+    bop: Annotated[Path | None, typer.Option(metavar="FILE", help="Write BOP results (CSV, without poses).")] = None
+    names: Annotated[
+        Path | None, typer.Option(help="YAML or JSON table for --coco and --bop: number -> name of the object.")
+    ] = None
+    rerun: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write an .rrd file for the Rerun viewer (extra rerun).")
+    ] = None
+    out_bag: Annotated[
+        Path | None, options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag.")
+    ] = None
+
+
+class _AnswerFiles:
+    """The files for the answers, of which unusable ones are refused before any frame is recognized."""
+
+    def __init__(self, given: OutputOptions, frames: Sequence[str], in_folders: bool) -> None:
+        """Check the paths.
+
+        Args:
+            given: the paths.
+            frames: name of each frame; empty for a recording, whose frames are not known yet.
+            in_folders: whether each frame has a folder of its name in `given.out`.
+        """
+        from thor2_jax.files import check_output_directory, check_output_file
+        from thor2_jax.model import result_files
+        from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
+        from training.readers.bop import read_object_names
+
+        self._given, self._frames, self._in_folders = given, frames, in_folders
+        if given.out is not None:
+            resumable = {name.split("/")[0] for name in frames} if in_folders else result_files.RESULT_FILES
+            check_output_directory(given.out, resumable=resumable)
+            for name in frames if in_folders else [""]:
+                result_files.check_no_foreign_results(given.out / name)
+        if given.coco is not None and given.bop is not None and given.coco.absolute() == given.bop.absolute():
+            raise InputError(f"coco and bop are {given.coco}; expected two files")
+        self._bag = None if given.out_bag is None else DetectionBag(given.out_bag)
+        self._rerun = None if given.rerun is None else RerunFile(given.rerun)
+        self._numbers = None if given.names is None else read_object_names(given.names)
+        check_output_file("coco", given.coco, result_files.is_coco_file)
+        check_output_file("bop", given.bop, result_files.is_bop_file)
+
+    @contextlib.contextmanager
+    def opened(self, classes: Sequence[str]) -> Iterator["ResultTables"]:
+        """Open the files and yield the tables of COCO and BOP results; all files are completed at the end."""
+        from thor2_jax.model.result_files import ResultTables
+
+        self._tables = ResultTables(self._frames, classes, self._numbers)
+        with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
+            yield self._tables
+        self._tables.write(self._given.coco, self._given.bop)
+
+    def write(self, answer: "FrameAnswer", frame: "RGBDFrame") -> None:
+        """Write the answers for a frame."""
+        from thor2_jax.model.result_files import write_recognitions
+
+        place, out = answer.recorded, self._given.out
+        if self._given.coco or self._given.bop:
+            self._tables.add(answer.name, frame, answer.detections, answer.seconds)
+        if out is not None:
+            write_recognitions(out / answer.name if self._in_folders else out, frame, answer.recognitions)
+        if self._bag is not None and place is not None:
+            self._bag.write(frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
+        if self._rerun is not None:
+            stamp = None if place is None else place.stamp
+            self._rerun.write(frame, answer.detections, name=answer.name, stamp=stamp)
+
+    @property
+    def written(self) -> str:
+        """The paths that exist now, separated by commas."""
+        given = self._given
+        paths = given.out, given.out_bag, given.coco, given.bop, given.rerun
+        return ", ".join(str(path) for path in paths if path and path.exists())
+
+
 @app.command()
 @options.grouped_options
 def recognize(
+    *,
     model: options.ModelOption,
     given: options.FrameOptions,
     processes: options.WorkerOptions,
@@ -40,41 +127,24 @@ def recognize(
     poses: Annotated[
         Path | None, typer.Option(help="JSON of camera poses for --track: frame -> 4 x 4 matrix, camera to world.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Directory for recognition.json and overlay.png; OUT/<frame> for each FRAME.")
-    ] = None,
+    outputs: OutputOptions,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each frame.")] = False,
-    coco: Annotated[Path | None, typer.Option(metavar="FILE", help="Write COCO results (JSON with masks).")] = None,
-    bop: Annotated[Path | None, typer.Option(metavar="FILE", help="Write BOP results (CSV, without poses).")] = None,
-    names: Annotated[
-        Path | None, typer.Option(help="YAML or JSON table for --coco and --bop: number -> name of the object.")
-    ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write an .rrd file for the Rerun viewer (extra rerun).")
-    ] = None,
-    out_bag: Annotated[
-        Path | None, options.recording_option(help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag.")
-    ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
 
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
     the frames are a sequence of one camera, in the order of their names, and an object has one name in all frames.
     """
-    from thor2_jax.files import check_output_directory, check_output_file
-    from thor2_jax.model import result_files
-    from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
     from thor2_jax.segmentation.segmenters import TABLE
     from training.frame_recognition import RecognizerArguments, recognize_frames, segmentation_failure, track_frames
-    from training.readers.bop import read_object_names
     from training.readers.frames import segmented_source
 
     given.check()
-    frames, recording = given.frames, given.bag
-    in_workers = options.given_values(processes)
-    options.check_alone("bag", recording, names=names, coco=coco, bop=bop, poses=poses, **in_workers)
-    options.check_belongs("--bag", recording, out_bag=out_bag)
-    options.check_belongs("--coco and --bop", coco or bop, names=names)
+    frames, recording, table = given.frames, given.bag, {"coco": outputs.coco, "bop": outputs.bop}
+    alone = {"names": outputs.names, **table, "poses": poses} | options.given_values(processes)
+    options.check_alone("bag", recording, **alone)
+    options.check_belongs("--bag", recording, out_bag=outputs.out_bag)
+    options.check_belongs("--coco and --bop", any(table.values()), names=outputs.names)
     options.check_belongs("--track", track, poses=poses)
     pool = processes.pool()
     if pool is not None and (track or not frames):
@@ -96,25 +166,13 @@ def recognize(
         from thor2_jax.tracking.viewpoints import read_poses  # imports SciPy
 
         frame_poses = read_poses(poses, [source.name for source in sources])
-    if out is not None:
-        resumable = {source.name.split("/")[0] for source in sources} if frames else result_files.RESULT_FILES
-        check_output_directory(out, resumable=() if recording else resumable)
-        for directory in [out / source.name for source in sources] if frames else [out]:
-            result_files.check_no_foreign_results(directory)
-    if coco is not None and bop is not None and coco.absolute() == bop.absolute():
-        raise InputError(f"coco and bop are {coco}; expected two files")
-    detection_bag = None if out_bag is None else DetectionBag(out_bag)
-    rerun_file = None if rerun is None else RerunFile(rerun)
-    numbers = None if names is None else read_object_names(names)
-    check_output_file("coco", coco, result_files.is_coco_file)
-    check_output_file("bop", bop, result_files.is_bop_file)
+    files = _AnswerFiles(outputs, [source.name for source in sources], in_folders=bool(frames or recording))
     as_json, failed, empty, unknown, damage = as_json or recording is not None, [], [], False, None
     with contextlib.ExitStack() as stack:
         if bag is not None:
             for note in stack.enter_context(bag).notes:
                 print_note(f"note: {note}")
         recognizer = load()
-        tables = result_files.ResultTables([source.name for source in sources], recognizer.classes, numbers)
         if bag is not None:
             recorded = itertools.islice(bag.frames(), 0, None, given.every)
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
@@ -125,8 +183,7 @@ def recognize(
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:
             answers = recognize_frames(recognizer.recognize, sources)
-        stack.enter_context(detection_bag or contextlib.nullcontext())
-        stack.enter_context(rerun_file or contextlib.nullcontext())
+        results = stack.enter_context(files.opened(recognizer.classes))
         try:
             for answer in answers:
                 if answer.frame is None:
@@ -142,38 +199,27 @@ def recognize(
                 unknown |= any(each.name is None for each in answer.recognitions)
                 if not as_json:
                     _print_table(answer.name if frames else None, answer.recognitions)
-                if coco or bop:
-                    tables.add(answer.name, answer.frame, answer.detections, answer.seconds)
-                if out is not None:
-                    directory = out / answer.name if frames or recording else out
-                    result_files.write_recognitions(directory, answer.frame, answer.recognitions)
-                place = answer.recorded
-                if detection_bag is not None and place is not None:
-                    detection_bag.write(answer.frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
-                if rerun_file is not None:
-                    stamp = None if place is None else place.stamp
-                    rerun_file.write(answer.frame, answer.detections, name=answer.name, stamp=stamp)
+                files.write(answer, answer.frame)
         except InputError as error:
             if bag is None:
                 raise
             damage = str(error)
-    tables.write(coco, bop)
-    written = ", ".join(str(path) for path in (out, out_bag, coco, bop, rerun) if path and path.exists())
     if damage is not None:
-        before = f"; {len(empty)} frames were recognized before" + (f" and are in {written}" if written else "")
+        before = f"; {len(empty)} frames were recognized before"
+        before += f" and are in {files.written}" if files.written else ""
         raise InputError(damage + (before if empty else ""))
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
+    result = f"written to {files.written}" if files.written else f"frames recognized: {len(empty)}"
     notes = sys.stderr if as_json else None
     if unknown:
         print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
     segments = ["--segment", segment] if segment else []
     next_command = ("explain", *given.arguments, *segments, *options.given_options(arguments), "--out", "why")
     finish(result, "see why", *next_command, file=notes)
-    if tables.n_without_number:
-        print_note(f"{tables.n_without_number} instances have a name that {names} does not number")
+    if results.n_without_number:
+        print_note(f"{results.n_without_number} instances have a name that {outputs.names} does not number")
     if failed:
         total, listed = len(failed) + len(empty), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
