@@ -36,9 +36,9 @@ from .conftest import Files
 class Device:
     """Double numbers; wait for permission before each batch."""
 
-    def __init__(self, permits: int = 0) -> None:
+    def __init__(self) -> None:
         self.batches: list[list[int]] = []
-        self.permits, self.called = threading.Semaphore(permits), threading.Event()
+        self.permits, self.called = threading.Semaphore(0), threading.Event()
 
     def __call__(self, numbers: list[int]) -> list[int]:
         self.called.set()
@@ -119,16 +119,9 @@ def app(run_dir: Path) -> FastAPI:
     return create_app(Settings(run_dir, token="secret", queue=2, deadline=HANG, teach=True))
 
 
-def frame_request(files: Files, *then: Callable[[httpx.Response], None]) -> Callable[..., Any]:
-    """Return a function that sends a frame, and calls `then` with its answer."""
-
-    async def send(client: httpx.AsyncClient) -> httpx.Response:
-        answer = await client.post("/v1/recognize", files=files)
-        for call in then:
-            call(answer)
-        return answer
-
-    return send
+def frame_request(files: Files) -> Callable[[httpx.AsyncClient], Any]:
+    """Return a function that sends a frame."""
+    return lambda client: client.post("/v1/recognize", files=files)
 
 
 NOTHING = PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
@@ -203,17 +196,13 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
 def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused, done, timeout = [], asyncio.Event(), asyncio.timeout
-    deadlines = dict[float, asyncio.Timeout]()
+    refused = app.state.service.metrics.requests.labels("/v1/recognize", "429")._value
+    deadlines, timeout = dict[float, asyncio.Timeout](), asyncio.timeout
 
-    async def slow(*_: Any) -> Any:
-        await done.wait()
+    async def wait_for_refusals(*_: Any) -> Any:
+        while refused.get() < 3:
+            await asyncio.sleep(0.01)
         return NOTHING
-
-    def count(answer: httpx.Response) -> None:
-        refused.append(answer)
-        if len(refused) == 3:
-            done.set()
 
     def record(seconds: float) -> asyncio.Timeout:
         return deadlines.setdefault(seconds, timeout(seconds))
@@ -222,8 +211,8 @@ def test_full_queue_is_429_and_deadline_504(
         deadlines[app.state.service.settings.deadline].reschedule(0)  # it passes now
         await asyncio.sleep(HANG)
 
-    recognize.side_effect = slow
-    answers = calls(app, *[frame_request(files, count)] * 5)
+    recognize.side_effect = wait_for_refusals
+    answers = calls(app, *[frame_request(files)] * 5)
     assert sorted(answer.status_code for answer in answers) == [200, 200, 429, 429, 429]
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
     assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.
