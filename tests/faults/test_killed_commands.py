@@ -161,8 +161,7 @@ def test_evaluate(frames: Path, model: Path, refused: Command, tmp_path: Path) -
 
 
 def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
-    images = frame_options(frames / "one")
-    command, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "out"
+    command, out = ("recognize", "--model", model, *frame_options(frames / "one"), "--out"), tmp_path / "out"
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
     assert finish(*command, out) == finish(*command, tmp_path / "whole")

@@ -31,7 +31,6 @@ def test_recognize_matches_the_library(
         (tmp_path / name).write_bytes(content)
     recognitions = Client(server.url, timeout=HANG).recognize(**{name: tmp_path / name for name in files})
     expected = thor2.Recognizer.load(run_dir).recognize(frame)
-    assert [r.label for r in recognitions] == [3, 5, 7, 200]
     assert_same_answers(recognitions, expected, 1e-5)
     for one, other in zip(recognitions, expected, strict=True):
         fields = "occluded", "overflow", "kept_by_fallback"

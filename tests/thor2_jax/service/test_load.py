@@ -109,8 +109,7 @@ def document(server: Any) -> Any:
 
 OPERATIONS = {
     **dict.fromkeys([f"/v1/{name}" for name in ("recognize", "explain", "why", "describe")], "POST"),
-    **dict.fromkeys([f"/v1/{name}" for name in ("model", "objects", "colornet")], "GET"),
-    **dict.fromkeys(["/metrics", "/healthz", "/readyz"], "GET"),
+    **dict.fromkeys(["/v1/model", "/v1/objects", "/v1/colornet", "/metrics", "/healthz", "/readyz"], "GET"),
 }
 
 
