@@ -8,6 +8,7 @@ from unittest.mock import create_autospec
 import numpy as np
 import pytest
 from slow_tier import slow
+from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run
 
 import thor2_jax as thor2
@@ -94,10 +95,8 @@ def test_a_run_that_answers_by_classifiers_teaches_with_both(tmp_path: Path) -> 
 
 
 def views(count: int) -> list[PreparedInstance]:
-    rng = np.random.default_rng(count)
-    points = rng.uniform(0, (0.1, 0.06, 0.04), (count, 100, 3)).astype(np.float32)
-    colors = (rng.integers(20, 200, (count, 1, 3)) + rng.integers(0, 40, (count, 100, 3))).astype(np.uint8)
-    return [PreparedInstance(k, points[k], colors[k], np.zeros(100, bool)) for k in range(count)]
+    clouds = random_clouds(count, [100] * count)
+    return [PreparedInstance(k, *cloud, np.zeros(100, bool)) for k, cloud in enumerate(clouds)]
 
 
 def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:

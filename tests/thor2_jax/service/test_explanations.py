@@ -83,7 +83,6 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
 
 def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
     labels = np.random.default_rng(0).integers(0, 3, (240, 320)).astype(np.uint8)  # 51,000 runs
-    assert (np.diff(labels.ravel()) != 0).sum() > MAX_LABEL_RUNS
     label_map = prepare_frame(files | {"labels": encode_image(labels)}, DescriptorConfig(), True, None).label_map
     assert label_map is not None and len(label_map.labels) <= MAX_LABEL_RUNS
     np.testing.assert_array_equal(decoded(label_map), labels[::2, ::2])
