@@ -1,4 +1,4 @@
-"""Unit tests of batching, preparation processes, request limits and the compilation counter."""
+"""Unit tests of batching, preparation processes, segmenters, request limits and the compilation counter."""
 
 import asyncio
 import math
@@ -14,18 +14,20 @@ from unittest.mock import AsyncMock
 
 import httpx
 import jax
+import numpy as np
 import pytest
 from fastapi import FastAPI
 from processes import HANG, finish_programs, start_program
 from service_requests import calls, check_refused
 
+import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
-from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds
+from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
@@ -109,6 +111,36 @@ def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch
     idle.process.join()
     pool._idle.put(idle)  # The pool does not notice the death of an idle process.
     assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
+
+
+def failing(frame: thor2.RGBDFrame) -> np.ndarray:
+    raise RuntimeError("no weights\nin this folder")
+
+
+def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
+    raise SystemExit(3)
+
+
+def many(frame: thor2.RGBDFrame) -> np.ndarray:
+    return np.arange(frame.depth.size).reshape(frame.depth.shape)
+
+
+@pytest.mark.parametrize(
+    ("segmenter", "status", "words"),
+    [
+        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
+        (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
+        (many, 422, "labels has 76799 instances"),
+        (None, 422, "labels is missing"),
+    ],
+)
+def test_without_labels_of_a_segmenter_the_request_fails(
+    unlabelled: Files, segmenter: Any, status: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preparation, "_segmenter", lambda name: segmenter)
+    with pytest.raises(RequestError, match=words) as caught:
+        prepare_frame(unlabelled, thor2.DescriptorConfig(), False, segmenter and "chosen")
+    assert (caught.value.status, caught.value.field) == (status, "labels")
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,13 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
     assert f"{name.replace('-', '_')} is " in error and value in error
 
 
+def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings(tmp_path).segmenter == "table"
+    assert_refused("segmenter is 'sam'; expected one of table", Settings, tmp_path, segmenter="sam")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert Settings(tmp_path).segmenter is None
+
+
 def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty one does not switch authentication off."""
     for token in ("", "é", "a "):
