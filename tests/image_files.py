@@ -41,11 +41,16 @@ def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int
     return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
 
 
+def png_of_zeros(width: int, height: int, bits: int = 8) -> bytes:
+    """Return an RGB image as a PNG; a large image is cut off, as Pillow could not write it."""
+    header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(min((width * 3 * bits // 8 + 1) * height, 2**26)), 1)
+    return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
+
+
 def deep_png(height: int, width: int) -> bytes:
     """Return a PNG of 16 bits per channel, which Pillow cannot write: an RGB image of zeros."""
-    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    rows = zlib.compress(bytes(1 + 6 * width) * height)
-    return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
+    return png_of_zeros(width, height, 16)
 
 
 def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:

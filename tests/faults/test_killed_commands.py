@@ -7,17 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from commands import Command, frame_options, run_thor2
-from flax import nnx
 from image_files import small_frame, write_frame_files
 from processes import HANG
 from rendered_objects import write_box
 from small_runs import untrained_run
 
-from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import baseline_file, read_baseline
 from training.storage.jobs import MANIFEST
 from training.train_run import read_metrics
@@ -111,36 +109,28 @@ def test_render(meshes: Path, refused: Command, tmp_path: Path) -> None:
     assert expected.keys() | {".lock"} == {path.name for path in out.iterdir()}
 
 
-def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
-    """Return whether two runs are equal."""
-    weights = ([nnx.state(classifier) for classifier in run.classifiers.values()] for run in (one, other))
-    same = jax.tree.all(jax.tree.map(np.array_equal, *weights))
-    return same and (one.classes, one.config, one.record) == (other.classes, other.config, other.record)
-
-
 def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> None:
     options = (*STEPS, "--paper", "--batch-size", 16, "--classifiers", "ce", "--baselines", "forest", "--epochs", 2)
     command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
-    expected, run = finish(*command, whole), load_run(whole)
-    kept = "checkpoints/fold-0/ce/1.safetensors"
+    expected = finish(*command, whole)
+    kept, compared = "checkpoints/fold-0/ce/1.safetensors", ("curves.png", "network.npz", "run.json", "weights/")
     for place in (kept, "curves.png", "run.json", "baselines/forest.safetensors", ".thor2-*/views"):
         kill(f"{'after' if place == kept else 'before'} {place}", *command, out)
         written = files(out)
-        assert all(written[name] == expected[name] for name in {"curves.png", "network.npz"} & written.keys())
+        assert all(written[name] == expected[name] for name in written if name.startswith(compared))
         assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
         if "run.json" in written:
-            assert equal_models(load_run(out), run)
+            assert load_run(out).classes == ("brick", "stick")
         else:
             assert f"{out} is not a run directory" in refused("evaluate", "frames", frames, "--model", out)
         if "checkpoints/begun.json" in written:
             assert f"{out} was written with epochs 2, not 3" in refused(*command, out, "--epochs", 3, at_once=False)
     written = finish(*command, out)
-    assert equal_models(load_run(out), run)
     assert not list(out.glob(".*")) and not (out / "views").exists()
     assert written.keys() == expected.keys()
     different = {name for name in written if written[name] != expected[name]}  # these two hold measured times
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
-    first, second = (read_baseline(baseline_file(folder, "forest"), run.classes) for folder in (out, whole))
+    first, second = (read_baseline(baseline_file(folder, "forest"), ("brick", "stick")) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
 
 
@@ -171,18 +161,7 @@ def test_evaluate(frames: Path, model: Path, refused: Command, tmp_path: Path) -
 
 
 def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
-    images = frame_options(frames / "one")
-    command, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "out"
+    command, out = ("recognize", "--model", model, *frame_options(frames / "one"), "--out"), tmp_path / "out"
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
     assert finish(*command, out) == finish(*command, tmp_path / "whole")
-
-
-def test_enroll(meshes: Path, tmp_path: Path) -> None:
-    command = "enroll", "brick", "--mesh", meshes / "brick.ply", "--model", tmp_path / "run"
-    for place in ("before ../.thor2-*/run/gallery/index.json", "before ."):
-        kill(place, *command)
-        (left,) = tmp_path.iterdir()  # what the process before has left is removed
-        assert left.name.startswith(".thor2-")
-    assert run_thor2(*command) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -3,6 +3,7 @@
 import builtins
 import dataclasses
 import errno
+import functools
 import io
 import os
 from collections.abc import Callable
@@ -63,23 +64,18 @@ class Disk:
                 return function(path, mode, *rest, **more)
             self.step(path)
             stream = function(path, mode, *rest, **more)
-            self._failing_writes(stream, path)
+            stream.write = functools.partial(self._write, path, stream.write)
             return stream
 
         return wrapper
 
-    def _failing_writes(self, stream: Any, path: Any) -> None:
-        write = stream.write
-
-        def failing_write(content: Any) -> Any:
-            try:
-                self.step(path)
-            except OSError:
-                write(content[: len(content) // 2])  # the part that still fits
-                raise
-            return write(content)
-
-        stream.write = failing_write
+    def _write(self, path: Any, write: Callable[..., Any], content: Any) -> Any:
+        try:
+            self.step(path)
+        except OSError:
+            write(content[: len(content) // 2])  # the part that still fits
+            raise
+        return write(content)
 
     def fail_from(self, step: int) -> None:
         """Restart the count; fail from a step on, or never if it is 0."""

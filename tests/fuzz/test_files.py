@@ -14,7 +14,7 @@ import pytest
 from dataset_files import ocid_scene, pack_pcd, points_of
 from hypothesis import given
 from hypothesis import strategies as st
-from image_files import encode_image, encode_npy, png_file, with_checksums
+from image_files import encode_image, encode_npy, png_file, png_of_zeros, with_checksums
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
@@ -59,6 +59,10 @@ def write_answers(path: Path) -> None:
     for number in range(2):
         instances = [prediction, InstancePrediction(2, "can", reason="few")]
         file.append(FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, instances))
+
+
+def write_mug_baseline(path: Path) -> None:
+    write_baseline(path, BASELINE, ["mug"], 2.0)
 
 
 def is_image(image: np.ndarray) -> bool:
@@ -108,11 +112,7 @@ READERS: dict[str, tuple[bytes, Callable[[Path], Any], Callable[[Any], bool]]] =
     "names.yaml": (b"mug: 025_mug\nbowl: 024_bowl\n", read_names, are_names),
     "answers.jsonl": (written(write_answers), lambda path: AnswerFile(path, EVALUATION), are_answers),
     "metrics.jsonl": ("".join(json.dumps(row) + "\n" for row in ROWS).encode(), read_metrics, are_metrics),
-    "baseline.safetensors": (
-        written(lambda path: write_baseline(path, BASELINE, ["mug"], 2.0)),
-        lambda path: read_baseline(path, ["mug"]),
-        is_the_baseline,
-    ),
+    "baseline.safetensors": (written(write_mug_baseline), lambda path: read_baseline(path, ["mug"]), is_the_baseline),
 }
 color, depth, labels = ocid_scene()
 for kind in ("ascii", "binary"):
@@ -159,10 +159,8 @@ def test_damaged_png_chunks_with_valid_checksums(name: str, data: st.DataObject,
 @pytest.mark.parametrize("size", [(65_000, 65_000), (2**31 - 1, 2**31 - 1), (13_000, 13_000), (170_000_000, 1)])
 def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attempt: Any, tmp_path: Path) -> None:
     """The file has a few hundred kilobytes of compressed zeros, or little more than a header."""
-    rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 1)
-    header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
     path = tmp_path / "bomb.png"
-    path.write_bytes(png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))))
+    path.write_bytes(png_of_zeros(*size))
     pixels = rf"bomb\.png .*({size[0] * size[1]}|{size[0]} x {size[1]}) pixels"
     assert_refused(pixels, attempt, lambda: read_color(path), ())
 

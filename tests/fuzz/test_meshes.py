@@ -2,7 +2,6 @@
 
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,28 +46,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 NAMES = ("textured.glb", "painted.glb", "quad.obj", "binary.ply", "text.ply")
 
 
-@pytest.fixture
-def check(attempt: Any) -> Callable[[Path], None]:
-    """Return a function that reads a mesh, which is refused or can be rendered."""
-
-    def read(path: Path) -> None:
-        mesh = attempt(lambda: load_mesh(path))
-        if mesh is None:
-            return
-        assert np.isfinite(mesh.vertices).all() and 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
-        face = np.arange(len(mesh.faces))
-        colors = mesh.colors_at(face, np.full((len(face), 2), 0.3))
-        assert colors.shape == (len(face), 3) and colors.dtype == np.uint8
-
-    return read
+def check(path: Path, attempt: Any) -> None:
+    """Read a mesh, which is refused or can be rendered."""
+    mesh = attempt(lambda: load_mesh(path))
+    if mesh is None:
+        return
+    assert np.isfinite(mesh.vertices).all() and 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+    face = np.arange(len(mesh.faces))
+    colors = mesh.colors_at(face, np.full((len(face), 2), 0.3))
+    assert colors.shape == (len(face), 3) and colors.dtype == np.uint8
 
 
 @pytest.mark.parametrize("name", [*NAMES, "material.mtl", "material_0.png"])
 @given(data=st.data())
-def test_damaged_files(name: str, data: st.DataObject, folder: Path, check: Any) -> None:
+def test_damaged_files(name: str, data: st.DataObject, folder: Path, attempt: Any) -> None:
     """A damaged material or texture is read with the OBJ file that refers to it."""
     with other_content(folder / name, data.draw(damaged((folder / name).read_bytes()))):
-        check(folder / (name if name in NAMES else "quad.obj"))
+        check(folder / (name if name in NAMES else "quad.obj"), attempt)
 
 
 def write_glb(path: Path, table: Any, binary: bytes) -> Path:
@@ -88,10 +82,10 @@ def parts_of(path: Path) -> tuple[bytes, bytes]:
 
 @pytest.mark.parametrize("name", ["textured.glb", "painted.glb"])
 @given(data=st.data(), table_first=st.booleans())
-def test_glb_with_valid_lengths(name: str, data: st.DataObject, table_first: bool, folder: Path, check: Any) -> None:
+def test_glb_with_valid_lengths(name: str, data: st.DataObject, table_first: bool, folder: Path, attempt: Any) -> None:
     parts = list(parts_of(folder / name))
     parts[not table_first] = data.draw(damaged(parts[not table_first], 2))
-    check(write_glb(folder / "damaged.glb", *parts))
+    check(write_glb(folder / "damaged.glb", *parts), attempt)
 
 
 def numbers_in(table: Any) -> list[tuple[Any, Any]]:
@@ -103,13 +97,13 @@ def numbers_in(table: Any) -> list[tuple[Any, Any]]:
 
 @pytest.mark.parametrize("name", ["textured.glb", "painted.glb"])
 @pytest.mark.parametrize("value", [-1, 0, 3, 2**31 - 1, 10**12])
-def test_every_number_of_a_glb_table(name: str, value: int, folder: Path, check: Any) -> None:
+def test_every_number_of_a_glb_table(name: str, value: int, folder: Path, attempt: Any) -> None:
     """Replaces counts, offsets, types and indices of nodes; some values would fill memory or form a cycle."""
     text, binary = parts_of(folder / name)
     table = json.loads(text)
     for place, key in numbers_in(table):
         before, place[key] = place[key], value
-        check(write_glb(folder / "damaged.glb", table, binary))
+        check(write_glb(folder / "damaged.glb", table, binary), attempt)
         place[key] = before
 
 

@@ -1,6 +1,7 @@
 """Runs with random weights, a frame, running services that tests share, and their page in headless Chromium."""
 
 import contextlib
+import dataclasses
 import functools
 import json
 import re
@@ -37,6 +38,7 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
+from thor2_jax.service.pipeline import Service
 from thor2_jax.service.settings import Settings
 
 Files = dict[str, bytes]
@@ -67,13 +69,16 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with two classes and a small embedding, which compiles quickly."""
-    folder = tmp_path_factory.mktemp("teaching") / "run"
-    save_run(untrained_run(("a", "b"), ("tops", "tops2")), folder)
+def write_run(folder: Path, trained: tuple[str, ...] = ("a", "b"), record: dict[str, object] | None = None) -> Path:
+    """Write a run with trained classes and a small embedding, which compiles quickly."""
+    save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), folder)
     small_embedding().save(folder / EMBEDDING_FILE)
     return folder
+
+
+@pytest.fixture(scope="session")
+def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("teaching") / "run")
 
 
 @pytest.fixture(scope="session")
@@ -83,11 +88,8 @@ def frame() -> thor2.RGBDFrame:
 
 
 def frame_files(frame: thor2.RGBDFrame, *images: str) -> Files:
-    intrinsics = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
-    return {
-        **{name: encode_image(getattr(frame, name)) for name in images},
-        "intrinsics": json.dumps(intrinsics).encode(),
-    }
+    contents = {name: encode_image(getattr(frame, name)) for name in images}
+    return contents | {"intrinsics": json.dumps(dataclasses.asdict(frame.intrinsics)).encode()}
 
 
 @pytest.fixture(scope="session")
@@ -197,9 +199,16 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}"
 
 
-def assert_conforms(document: Any, path: str, method: str, examples: int) -> None:
-    """Send generated requests for an operation and check the answers against the document."""
-    everything = list(HealthCheck)
+@pytest.fixture
+def service(teaching_url: str, teaching_app: FastAPI) -> Service:
+    """The service behind this URL, for tests that replace its attributes."""
+    assert isinstance(teaching_app.state.service, Service)
+    return teaching_app.state.service
+
+
+def assert_conforms(url: str, path: str, method: str, examples: int) -> None:
+    """Send generated requests for an operation and check the answers against the service's OpenAPI document."""
+    document, everything = schemathesis.openapi.from_url(f"{url}/openapi.json"), list(HealthCheck)
 
     @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
     @hypothesis.given(case=document[path][method].as_strategy())

@@ -20,6 +20,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
 from thor2_jax.frames.intrinsics import parse_intrinsics
+from thor2_jax.segmentation.table import segment_table
 
 from .conftest import CLASSES, Files
 
@@ -31,7 +32,6 @@ def test_recognize_matches_the_library(
         (tmp_path / name).write_bytes(content)
     recognitions = Client(server.url, timeout=HANG).recognize(**{name: tmp_path / name for name in files})
     expected = thor2.Recognizer.load(run_dir).recognize(frame)
-    assert [r.label for r in recognitions] == [3, 5, 7, 200]
     assert_same_answers(recognitions, expected, 1e-5)
     for one, other in zip(recognitions, expected, strict=True):
         fields = "occluded", "overflow", "kept_by_fallback"
@@ -58,6 +58,24 @@ def test_frames_without_instances_or_depth(http: httpx.Client, files: Files) -> 
     blind = encode_image(np.zeros((240, 320), np.uint16))
     instances = http.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
     assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
+
+
+def test_a_frame_without_labels_is_segmented(
+    server: Any, http: httpx.Client, scene: thor2.RGBDFrame, unlabelled: Files
+) -> None:
+    client = Client(server.url, timeout=HANG)
+    recognitions, labels = client.recognize_frame(**unlabelled)
+    np.testing.assert_array_equal(labels, segment_table(scene))
+    assert [r.label for r in recognitions] == [1, 2, 3]
+    assert [r.points_used > 100 for r in recognitions] == [True] * 3
+    again, none = client.recognize_frame(**unlabelled, labels=labels)
+    assert none is None
+    assert [(r.name, r.confidence) for r in again] == [(r.name, r.confidence) for r in recognitions]
+    answer = http.post("/v1/recognize", files=unlabelled).json()
+    assert answer["label_map"]["width"] == 320 and answer["timings"]["segment"] > 0
+    explained = http.post("/v1/explain", files=unlabelled).json()
+    assert len(explained["instances"]) == 3 and set(explained["label_map"]["labels"]) == {0, 1, 2, 3}
+    assert http.get("/v1/model").json()["segmenter"] == "table"
 
 
 def check_described(server: Any, inputs: list[tuple[np.ndarray, np.ndarray]]) -> thor2.Descriptors:

@@ -1,4 +1,4 @@
-"""Unit tests of batching, preparation processes, request limits and the compilation counter."""
+"""Unit tests of batching, preparation processes, segmenters, request limits and the compilation counter."""
 
 import asyncio
 import math
@@ -14,18 +14,20 @@ from unittest.mock import AsyncMock
 
 import httpx
 import jax
+import numpy as np
 import pytest
 from fastapi import FastAPI
 from processes import HANG, finish_programs, start_program
 from service_requests import calls, check_refused
 
+import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
-from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds
+from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
@@ -36,9 +38,9 @@ from .conftest import Files
 class Device:
     """Double numbers; wait for permission before each batch."""
 
-    def __init__(self, permits: int = 0) -> None:
+    def __init__(self) -> None:
         self.batches: list[list[int]] = []
-        self.permits, self.called = threading.Semaphore(permits), threading.Event()
+        self.permits, self.called = threading.Semaphore(0), threading.Event()
 
     def __call__(self, numbers: list[int]) -> list[int]:
         self.called.set()
@@ -97,16 +99,13 @@ def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
 
 def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
-    before = pool.submit(FAR, os.getpid).result(HANG)
     for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
+        replaced = pool.submit(FAR, os.getpid).result(HANG)
         with pytest.raises(RequestError) as error:
             pool.submit(time.monotonic() + seconds, function, argument).result(HANG)
         assert error.value.status == status
-        after = pool.submit(FAR, os.getpid).result(HANG)
         with pytest.raises(ProcessLookupError):
-            os.kill(before, 0)
-        assert after != before
-        before = after
+            os.kill(replaced, 0)
     idle = pool._idle.get()
     idle.process.kill()
     idle.process.join()
@@ -114,21 +113,44 @@ def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch
     assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
 
 
+def failing(frame: thor2.RGBDFrame) -> np.ndarray:
+    raise RuntimeError("no weights\nin this folder")
+
+
+def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
+    raise SystemExit(3)
+
+
+def many(frame: thor2.RGBDFrame) -> np.ndarray:
+    return np.arange(frame.depth.size).reshape(frame.depth.shape)
+
+
+@pytest.mark.parametrize(
+    ("segmenter", "status", "words"),
+    [
+        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
+        (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
+        (many, 422, "labels has 76799 instances"),
+        (None, 422, "labels is missing"),
+    ],
+)
+def test_without_labels_of_a_segmenter_the_request_fails(
+    unlabelled: Files, segmenter: Any, status: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preparation, "_segmenter", lambda name: segmenter)
+    with pytest.raises(RequestError, match=words) as caught:
+        prepare_frame(unlabelled, thor2.DescriptorConfig(), False, segmenter and "chosen")
+    assert (caught.value.status, caught.value.field) == (status, "labels")
+
+
 @pytest.fixture(scope="module")
 def app(run_dir: Path) -> FastAPI:
     return create_app(Settings(run_dir, token="secret", queue=2, deadline=HANG, teach=True))
 
 
-def frame_request(files: Files, *then: Callable[[httpx.Response], None]) -> Callable[..., Any]:
-    """Return a function that sends a frame, and calls `then` with its answer."""
-
-    async def send(client: httpx.AsyncClient) -> httpx.Response:
-        answer = await client.post("/v1/recognize", files=files)
-        for call in then:
-            call(answer)
-        return answer
-
-    return send
+def frame_request(files: Files) -> Callable[[httpx.AsyncClient], Any]:
+    """Return a function that sends a frame."""
+    return lambda client: client.post("/v1/recognize", files=files)
 
 
 NOTHING = PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
@@ -203,17 +225,13 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
 def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused, done, timeout = [], asyncio.Event(), asyncio.timeout
-    deadlines = dict[float, asyncio.Timeout]()
+    refused = app.state.service.metrics.requests.labels("/v1/recognize", "429")._value
+    deadlines, timeout = dict[float, asyncio.Timeout](), asyncio.timeout
 
-    async def slow(*_: Any) -> Any:
-        await done.wait()
+    async def wait_for_refusals(*_: Any) -> Any:
+        while refused.get() < 3:
+            await asyncio.sleep(0.01)
         return NOTHING
-
-    def count(answer: httpx.Response) -> None:
-        refused.append(answer)
-        if len(refused) == 3:
-            done.set()
 
     def record(seconds: float) -> asyncio.Timeout:
         return deadlines.setdefault(seconds, timeout(seconds))
@@ -222,8 +240,8 @@ def test_full_queue_is_429_and_deadline_504(
         deadlines[app.state.service.settings.deadline].reschedule(0)  # it passes now
         await asyncio.sleep(HANG)
 
-    recognize.side_effect = slow
-    answers = calls(app, *[frame_request(files, count)] * 5)
+    recognize.side_effect = wait_for_refusals
+    answers = calls(app, *[frame_request(files)] * 5)
     assert sorted(answer.status_code for answer in answers) == [200, 200, 429, 429, 429]
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
     assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.

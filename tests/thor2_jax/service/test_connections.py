@@ -48,15 +48,12 @@ def serve(app: Any, *sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
 
 
 @pytest.fixture
-def short_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "HEAD_SECONDS", WORK / 2)
-    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", WORK)
-
-
-@pytest.fixture
-def address(short_limits: None) -> Iterator[Any]:
-    with serve(application) as (listening_address, _):
-        yield listening_address
+def connection(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """A connection to the application without time limits."""
+    monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
+    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", HANG)
+    with serve(application) as (address, _), socket.create_connection(address, timeout=HANG) as connected:
+        yield connected
 
 
 def until_closed(connection: socket.socket, then: bytes) -> int:
@@ -83,8 +80,9 @@ def receive_all(connection: socket.socket) -> bytes:
     return b"".join(iter(lambda: connection.recv(2**16), b""))
 
 
-@pytest.mark.usefixtures("short_limits")
-def test_truncated_heads_and_slow_bytes_do_not_keep_a_connection_open() -> None:
+def test_truncated_heads_and_slow_bytes_keep_no_connection_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "HEAD_SECONDS", WORK / 2)
+    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", WORK)
     cases = {
         **{(CUT, b""): 0, (QUICK + CUT, b""): 1, (SLOW + CUT, b""): 1, (SLOW + SLOW + CUT, b""): 2},
         **{(SLOW + SLOW + QUICK, b""): 3, (b"", b"\r\n"): 0, (QUICK, b""): 1, (QUICK, b"\r\n"): 1, (UPLOAD, b"x"): 1},
@@ -94,33 +92,28 @@ def test_truncated_heads_and_slow_bytes_do_not_keep_a_connection_open() -> None:
         assert dict(zip(cases, clients.map(until_closed, connections, then), strict=True)) == cases
 
 
-def test_body_may_arrive_after_its_answer(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", HANG)
-    with socket.create_connection(address, timeout=HANG) as connection:
-        connection.sendall(UPLOAD)
-        while not connection.recv(4096).endswith(b"done"):
-            pass
-        connection.sendall(bytes(1000) + QUICK)
-        assert receive_all(connection).count(b"done") == 1
+def test_body_may_arrive_after_its_answer(connection: socket.socket) -> None:
+    connection.sendall(UPLOAD)
+    while not connection.recv(4096).endswith(b"done"):
+        pass
+    connection.sendall(bytes(1000) + LAST)
+    assert receive_all(connection).count(b"done") == 1
 
 
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
-def test_endless_head_closes_the_connection(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
-    with socket.create_connection(address, timeout=HANG) as connection, pytest.raises(ConnectionError):
+def test_endless_head_closes_the_connection(connection: socket.socket, start: bytes) -> None:
+    with pytest.raises(ConnectionError):
         connection.sendall(start)
         for _ in range(64):
             connection.sendall(b"x" * 2**20)
 
 
-def test_many_pipelined_requests(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_pipelined_requests(connection: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     """Together the requests are larger than the limit for one head, which is larger than what is received at once."""
-    monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
     monkeypatch.setattr(serving, "MAX_HEAD", 2**19)
-    count = serving.MAX_HEAD // len(QUICK) + 1000
-    with socket.create_connection(address, timeout=HANG) as connection:
-        threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
-        assert receive_all(connection).count(b"done") == count
+    count = 2 * serving.MAX_HEAD // len(QUICK)
+    threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
+    assert receive_all(connection).count(b"done") == count
 
 
 def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) -> None:

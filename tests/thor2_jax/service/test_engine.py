@@ -8,7 +8,8 @@ from unittest.mock import create_autospec
 import numpy as np
 import pytest
 from slow_tier import slow
-from small_runs import SMALL_CONFIG, assert_same_answers, small_embedding, untrained_embedding_run, untrained_run
+from small_clouds import random_clouds
+from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run
 
 import thor2_jax as thor2
 from thor2_jax import capacity
@@ -18,10 +19,12 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instanc
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import ColorTransform
-from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.model.run_directory import save_run
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
+
+from .conftest import write_run
 
 BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
 
@@ -31,13 +34,6 @@ def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
     monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
     monkeypatch.setattr(estimate, "CAPACITY", 512)
-
-
-def write_run(folder: Path, trained: tuple[str, ...], record: dict[str, object]) -> Path:
-    """Write a run with trained classes and an embedding."""
-    save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), folder)
-    small_embedding().save(folder / EMBEDDING_FILE)
-    return folder
 
 
 def check_answers(run: Path, frame: thor2.RGBDFrame) -> list[float | None]:
@@ -94,15 +90,13 @@ def test_confidences_use_the_temperatures_of_both_classifiers(run_dir: Path) -> 
 
 
 def test_a_run_that_answers_by_classifiers_teaches_with_both(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", ("a", "b"), BY_CLASSIFIERS)
+    run = write_run(tmp_path / "run", record=BY_CLASSIFIERS)
     assert InferenceEngine(Settings(run, teach=True)).model.answer_by == "both"
 
 
 def views(count: int) -> list[PreparedInstance]:
-    rng = np.random.default_rng(count)
-    points = rng.uniform(0, (0.1, 0.06, 0.04), (count, 100, 3)).astype(np.float32)
-    colors = (rng.integers(20, 200, (count, 1, 3)) + rng.integers(0, 40, (count, 100, 3))).astype(np.uint8)
-    return [PreparedInstance(k, points[k], colors[k], np.zeros(100, bool)) for k in range(count)]
+    clouds = random_clouds(count, [100] * count)
+    return [PreparedInstance(k, *cloud, np.zeros(100, bool)) for k, cloud in enumerate(clouds)]
 
 
 def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:

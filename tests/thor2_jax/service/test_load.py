@@ -12,7 +12,6 @@ from typing import Any
 
 import httpx
 import pytest
-import schemathesis
 from processes import HANG, wait_until
 from slow_tier import slow
 
@@ -104,20 +103,14 @@ def test_ready_workers_share_a_port_and_end_with_their_parent(start_server: Call
     assert "Traceback" not in server.log.read_text()
 
 
-@pytest.fixture(scope="module")
-def document(server: Any) -> Any:
-    return schemathesis.openapi.from_url(f"{server.url}/openapi.json")
-
-
 OPERATIONS = {
-    **dict.fromkeys([f"/v1/{name}" for name in ("recognize", "explain", "why", "describe")], "POST"),
-    **dict.fromkeys([f"/v1/{name}" for name in ("model", "objects", "colornet")], "GET"),
-    **dict.fromkeys(["/metrics", "/healthz", "/readyz"], "GET"),
+    **dict.fromkeys([f"/v1/{name}" for name in ("recognize", "explain", "why", "describe")], "post"),
+    **dict.fromkeys(["/v1/model", "/v1/objects", "/v1/colornet", "/metrics", "/healthz", "/readyz"], "get"),
 }
 
 
 @pytest.mark.parametrize("path", OPERATIONS)
-def test_openapi_requests_conform(document: Any, path: str) -> None:
-    operations = [operation.ok() for operation in document.get_all_operations()]
-    assert {operation.path: operation.method.upper() for operation in operations} == OPERATIONS
-    assert_conforms(document, path, OPERATIONS[path], 40)
+def test_openapi_requests_conform(server: Any, path: str) -> None:
+    paths = httpx.get(f"{server.url}/openapi.json").json()["paths"]
+    assert {(each, method) for each, methods in paths.items() for method in methods} == set(OPERATIONS.items())
+    assert_conforms(server.url, path, OPERATIONS[path], 40)

@@ -59,6 +59,13 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
     assert f"{name.replace('-', '_')} is " in error and value in error
 
 
+def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings(tmp_path).segmenter == "table"
+    assert_refused("segmenter is 'sam'; expected one of table", Settings, tmp_path, segmenter="sam")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert Settings(tmp_path).segmenter is None
+
+
 def test_invalid_tokens(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty one does not switch authentication off."""
     for token in ("", "é", "a "):
@@ -84,40 +91,31 @@ def test_ctrl_c_while_the_model_is_loaded(run_dir: Path, monkeypatch: pytest.Mon
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("start", ["init_processes", "keep_subprocess_alive"])
+def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a busy worker is killed, the health check ends at once; otherwise it would last for its timeout, a minute."""
     masks: list[set[signal.Signals]] = []
 
-    def record(_: object) -> None:
+    def start_worker(supervisor: Any) -> None:
         masks.append(set(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
+        supervisor.processes = [Process(uvicorn.Config("no application"), [])]  # not started: it holds no pipe
 
-    monkeypatch.setattr(Multiprocess, "init_processes", record)
-    monkeypatch.setattr(Multiprocess, "keep_subprocess_alive", record)
+    monkeypatch.setattr(Multiprocess, start, start_worker)
     supervisor = object.__new__(server._Supervisor)
     supervisor.processes = []
-    supervisor.init_processes()
-    supervisor.keep_subprocess_alive()
-    assert all(signal.SIGINT in mask and signal.SIGTERM not in mask for mask in masks) and len(masks) == 2
-    # A new process, whose fork server is that of the pool. The fork server imports modules for seconds.
+    getattr(supervisor, start)()
+    assert [(signal.SIGINT in mask, signal.SIGTERM in mask) for mask in masks] == [(True, False)]
+    assert supervisor.processes[0].parent_conn.poll(0)  # the end of the pipe
+
+
+def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
+    """A new process, whose fork server is that of the pool. The fork server imports modules for seconds."""
     code = (
         "import signal, time; from thor2_jax.service.preparation import PreparationPool; pool = PreparationPool(1); "
         f"call = pool.submit(time.monotonic() + {HANG}, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
         "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
     )
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
-
-
-def test_health_check_ends_when_the_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A SIGKILL of a busy worker leaves the check unanswered; it would last for its whole timeout, a minute."""
-
-    def start(supervisor: Any) -> None:
-        supervisor.processes = [Process(uvicorn.Config("no application"), [])]  # not started: it holds no pipe
-
-    monkeypatch.setattr(Multiprocess, "init_processes", start)
-    monkeypatch.setattr(Multiprocess, "keep_subprocess_alive", start)
-    supervisor = object.__new__(server._Supervisor)
-    for start_workers in (supervisor.init_processes, supervisor.keep_subprocess_alive):
-        start_workers()
-        assert supervisor.processes[0].parent_conn.poll(0)  # the end of the pipe
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
