@@ -9,6 +9,7 @@ import jax.export
 import numpy as np
 import pytest
 from refusals import assert_refused
+from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
 
 import thor2_jax as thor2
@@ -38,11 +39,7 @@ np.savez(sys.argv[3], **outputs)
 
 @pytest.mark.slow
 def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    sizes = [(0.2, 0.1, 0.06), (0.1, 0.1, 0.02), (0.3, 0.05, 0.05)]
-    clouds = [
-        (rng.uniform(0, s, (n, 3)) + [0, 0, 0.6], rng.random((n, 3))) for n, s in zip((500, 31, 0), sizes, strict=True)
-    ]
+    clouds = random_clouds(3, (500, 31, 0))
     rims = [points[:, 0] < 0.3 * points[:, 0].max(initial=0) for points, _ in clouds]
     packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512, rim=[*rims, None])
     blob = export_recognizer(run, n_points=512, n_clouds=4)
@@ -72,8 +69,8 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
-    points = np.random.default_rng(0).uniform(0, (0.2, 0.1, 0.06), (300, 3))
-    packed = thor2.PointClouds.pack([(points, points / 0.2)], 512, rim=[points[:, 0] < 0.05])
+    ((points, colors),) = random_clouds(0, [300])
+    packed = thor2.PointClouds.pack([(points, colors)], 512, rim=[points[:, 0] < 0.05])
     packed = jax.device_put(packed, jax.devices("cpu")[0])
     outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
     assert set(outputs) == {"tops", "overflow"}

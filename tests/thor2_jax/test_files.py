@@ -144,9 +144,10 @@ def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> No
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory, elsewhere = tmp_path / "views", tmp_path / "elsewhere"
-    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz"):
-        write_below(directory / name)
-    write_below(elsewhere / "0.npz")
+    names = ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz")
+    for path in (elsewhere / "0.npz", *(directory / name for name in names)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
     (directory / "link").symlink_to(elsewhere)
     killed(directory / "crops")
     remove_written(directory, r"manifest\.json", r"(.*/)?0\.npz")
@@ -160,11 +161,6 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory.symlink_to(elsewhere)
     remove_written(directory, r"0\.npz")
     assert directory.is_symlink() and elsewhere.is_dir() and not list(elsewhere.iterdir())
-
-
-def write_below(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
 
 
 @pytest.mark.parametrize(

@@ -129,13 +129,12 @@ def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClou
 
 
 def test_block_weights_are_the_shares_of_the_similarity(clouds: thor2.PointClouds) -> None:
-    values, learned = [], []
+    values = []
     for weights in ([1.0, 2.0], [2.0, 0.0]):
         embedding = random_embedding()
         embedding.model.block_weights[...] = jnp.asarray(weights)
         values.append(np.asarray(embedding.embed(clouds)))
-        learned.append(values[-1][:, :8])
-    np.testing.assert_allclose(learned[0] * np.sqrt(3), learned[1], atol=1e-4)
+    np.testing.assert_allclose(values[0][:, :8] * np.sqrt(3), values[1][:, :8], atol=1e-4)
     assert not values[1][:, 8:].any()
 
 
@@ -147,12 +146,17 @@ def rewritten(path: Path, keep: Callable[[str], bool] = lambda name: True, **cha
     path.write_bytes(safetensors.numpy.save(arrays, {"embedding": json.dumps({**about, **changes})}))
 
 
+def stored_earlier(embedding: Embedding, directory: Path, *added: str) -> Embedding:
+    """Save and load an embedding; the file lacks some sizes, which a later version added."""
+    path = directory / "embedding.safetensors"
+    embedding.save(path)
+    rewritten(path, sizes={name: value for name, value in dataclasses.asdict(SIZES).items() if name not in added})
+    return Embedding.load(path)
+
+
 def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, clouds: thor2.PointClouds) -> None:
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
-    Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, balanced=False)).save(path)
-    del sizes["balanced"], sizes["shape"]
-    rewritten(path, sizes=sizes)
-    loaded = Embedding.load(path)
+    earlier = Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, balanced=False))
+    loaded = stored_earlier(earlier, tmp_path, "balanced", "shape")
     values = np.asarray(loaded.embed(clouds))
     assert not loaded.sizes.balanced and values.shape == (3, 8 + 6 + 22)
     statistics = describe_looks(clouds, loaded.network, loaded.config, 1).statistics[:, 0, 12 : 12 + 22]
@@ -164,16 +168,12 @@ def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, cloud
 
 def test_files_of_earlier_versions_compare_no_images(tmp_path: Path, clouds: thor2.PointClouds) -> None:
     embedding = random_embedding()
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
     oriented = describe_looks(clouds, embedding.network, embedding.config, 1).with_balanced(clouds)
     flat = dataclasses.replace(oriented.each, images=jnp.ones_like(oriented.each.images))
     earlier = Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, shape=False))
     n_colors = earlier.model.color_basis.shape[0]
     earlier.model.color_basis[...] = embedding.model.color_basis[...][:n_colors]
-    earlier.save(path)
-    del sizes["shape"]
-    rewritten(path, sizes=sizes)
-    loaded = Embedding.load(path)
+    loaded = stored_earlier(earlier, tmp_path, "shape")
     assert (loaded.sizes.version, embedding.sizes.version) == (1, 2)
     assert embedding.model.color_basis.shape[0] == n_colors + 2 * 4**2  # cells of two slices
     for each, changes in ((loaded, False), (embedding, True)):
@@ -184,15 +184,12 @@ def test_files_of_earlier_versions_compare_no_images(tmp_path: Path, clouds: tho
 
 
 def test_files_of_earlier_versions_sum_the_distractors(tmp_path: Path, clouds: thor2.PointClouds) -> None:
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
     embedding = ensemble()
     summed = dataclasses.replace(embedding, sizes=dataclasses.replace(SIZES, nearest=False))
-    summed.save(path)
-    del sizes["nearest"]
-    rewritten(path, sizes=sizes)
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     loaded, expected, nearest = (
-        np.asarray(each.class_probabilities(oriented)) for each in (Embedding.load(path), summed, embedding)
+        np.asarray(each.class_probabilities(oriented))
+        for each in (stored_earlier(summed, tmp_path, "nearest"), summed, embedding)
     )
     assert np.array_equal(loaded, expected)
     assert np.abs(nearest.sum(axis=1) - expected.sum(axis=1)).min() > 1e-3
