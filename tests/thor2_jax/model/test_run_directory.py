@@ -59,8 +59,7 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
 
 
 def test_a_run_directory_has_four_files_and_is_readable(saved: Path) -> None:
-    weights = ["weights/ce.safetensors", "weights/tops.safetensors"]
-    assert sorted(files_of(saved)) == ["network.npz", "run.json", *weights]
+    assert sorted(files_of(saved)) == ["network.npz", "run.json", "weights/ce.safetensors", "weights/tops.safetensors"]
     assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
     assert saved.stat().st_mode & 0o777 == 0o755
     description = json.loads((saved / "run.json").read_text())
