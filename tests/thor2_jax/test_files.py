@@ -13,7 +13,6 @@ import pytest
 from processes import HANG
 from refusals import assert_refused
 
-from thor2_jax import files
 from thor2_jax.files import (
     atomic_directory,
     atomic_write,
@@ -192,8 +191,8 @@ def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
 
 
 def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_YAML_BYTES", 20)
-    monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_BYTES", 20)
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_VALUES", 5)
     assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
     many = "more than 5 values"
     for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[{1},1,1]", many), (b"[&a [1,2],*a,*a]", many)):

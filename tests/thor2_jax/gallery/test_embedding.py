@@ -1,4 +1,4 @@
-"""Embeddings: their length, invariances, files, and damaged files."""
+"""Embeddings: their length, invariances, files, damaged files, and the file of reference views."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from small_runs import SMALL_CONFIG
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References, load_default
+from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
 from thor2_jax.networks import EmbeddingSizes
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
@@ -226,3 +226,38 @@ def test_other_damaged_and_missing_files_are_rejected(tmp_path: Path) -> None:
 def test_the_packaged_embedding_is_small_enough() -> None:
     embedding = load_default()
     assert embedding.size <= 256 and len(embedding._content) <= 5_500_000
+
+
+VIEWS = np.eye(4, dtype=np.float16)[[0, 1, 2]]
+REFERENCES = References(VIEWS, np.array([0, 1, BACKGROUND], np.int32), ("mug", "bowl"))
+
+
+def test_references_are_read_as_written(tmp_path: Path) -> None:
+    REFERENCES.save(tmp_path / "r", "print")
+    loaded = References.load(tmp_path / "r", "print", 4)
+    np.testing.assert_array_equal(loaded.embeddings, VIEWS)
+    np.testing.assert_array_equal(loaded.label, REFERENCES.label)
+    assert loaded.classes == ("mug", "bowl")
+
+
+def test_references_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r"
+    REFERENCES.save(path, "print")
+    assert_refused("of another embedding.*copy both files", References.load, path, "other", 4)
+    assert_refused("embeddings are float16", References.load, path, "print", 5)
+    path.write_bytes(path.read_bytes()[:-3])
+    assert_refused("cannot be used", References.load, path, "print", 4)
+    References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(path, "print")
+    assert_refused("out of range", References.load, path, "print", 4)
+
+
+def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:
+    packaged = load_default()
+    assert packaged.references is not None and packaged.references.embeddings.shape == (1024, packaged.size)
+    assert (packaged.references.label == BACKGROUND).all() and packaged.references.classes == ()
+    packaged.save(tmp_path / "embedding.safetensors")
+    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    assert loaded.fingerprint == packaged.fingerprint and loaded.references is not None
+    np.testing.assert_array_equal(loaded.references.embeddings, packaged.references.embeddings)
+    (tmp_path / REFERENCES_FILE).unlink()
+    assert Embedding.load(tmp_path / "embedding.safetensors").references is None

@@ -219,19 +219,14 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
             assert (len(views.clouds), views.source, views.date) == (len(other.clouds), other.source, other.date)
 
 
-def without_name(path: Path) -> str:
-    """Write an object's file as version 0.2 wrote it, and return its digest."""
-    content = safetensors.numpy.save(safetensors.numpy.load_file(path))
-    digest = hashlib.sha256(content).hexdigest()
-    path.unlink()
-    path.with_name(f"{digest}.safetensors").write_bytes(content)
-    return digest
-
-
 def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> None:
     index = json.loads((directory / "index.json").read_text())
     for entry, name in zip(index["objects"], ("mug ", "unknown"), strict=True):
-        entry |= {"name": name, "file": without_name(directory / "objects" / f"{entry['file']}.safetensors")}
+        path = directory / "objects" / f"{entry['file']}.safetensors"
+        content = safetensors.numpy.save(safetensors.numpy.load_file(path))  # without a name, as version 0.2 wrote it
+        entry |= {"name": name, "file": hashlib.sha256(content).hexdigest()}
+        path.unlink()
+        path.with_name(f"{entry['file']}.safetensors").write_bytes(content)
         del entry["source"], entry["date"]
     for name in ("index.json", "previous.json"):
         (directory / name).write_text(json.dumps(index))

@@ -38,11 +38,6 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def copied(saved: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(saved, tmp_path / "run"))
-
-
 def test_saving_and_loading_round_trips(saved: Path) -> None:
     run, loaded = make_run(), load_run(saved)
     assert (loaded.config, loaded.classes, loaded.record) == (run.config, run.classes, run.record)
@@ -145,12 +140,12 @@ def small_heap() -> None:
 
 @pytest.mark.usefixtures("small_heap")
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_run_directory_is_refused_in_one_line(name: str, copied: Path) -> None:
+def test_a_damaged_run_directory_is_refused_in_one_line(name: str, saved: Path, tmp_path: Path) -> None:
     """A failed read leaves no open file, which would warn at garbage collection; warnings are errors here."""
     damage, expected = DAMAGES[name]
-    damage(copied)
+    damage(shutil.copytree(saved, tmp_path / "run"))
     with pytest.raises(thor2.InputError) as caught:
-        load_run(copied)
+        load_run(tmp_path / "run")
     gc.collect()
     message = str(caught.value)
     assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700
