@@ -3,14 +3,13 @@
 import dataclasses
 import io
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from failures import Pickled
+from processes import finish_programs, start_program
 
 import colornet
 from colornet.files import read_arrays, read_file, write_arrays
@@ -129,6 +128,5 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path: Path) -> None
 
 def test_loading_imports_neither_kmapper_nor_other_packages() -> None:
     script = "import colornet, sys; colornet.load_default().membership; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert not loaded & {"kmapper", "sklearn", "colour", "matplotlib", "jax", "thor2_jax", "training"}
+    (modules,) = finish_programs(start_program(script))
+    assert not set(modules.split()) & {"kmapper", "sklearn", "colour", "matplotlib", "jax", "thor2_jax", "training"}

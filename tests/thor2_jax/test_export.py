@@ -1,13 +1,12 @@
 """Exported recognizers."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import jax.export
 import numpy as np
 import pytest
+from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
@@ -39,18 +38,16 @@ np.savez(sys.argv[3], **outputs)
 
 @pytest.mark.slow
 def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_path: Path) -> None:
-    clouds = random_clouds(3, (500, 31, 0))
+    clouds = random_clouds(0, (500, 31, 0))
     rims = [points[:, 0] < 0.3 * points[:, 0].max(initial=0) for points, _ in clouds]
     packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512, rim=[*rims, None])
     blob = export_recognizer(run, n_points=512, n_clouds=4)
-    (tmp_path / "loader.py").write_text(LOADER)
-    (tmp_path / "recognizer.jax").write_bytes(blob)
+    paths = [tmp_path / name for name in ("recognizer.jax", "clouds.npz", "outputs.npz")]
+    paths[0].write_bytes(blob)
     names = ("points", "colors", "mask", "camera", "boundary", "rim")
-    np.savez(tmp_path / "clouds.npz", **{name: np.asarray(getattr(packed, name)) for name in names})
-    arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "outputs.npz")]
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    outputs = np.load(tmp_path / "outputs.npz")
+    np.savez(paths[1], **{name: np.asarray(getattr(packed, name)) for name in names})
+    finish_programs(start_program(LOADER, *paths))
+    outputs = np.load(paths[2])
     assert set(outputs) == {*FEATURES, "embedding", "overflow"}
 
     described = describe_looks(packed, run.network, CONFIG)  # gudhi: the other backend
@@ -66,7 +63,6 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
 
 def test_an_embedding_of_other_classes_is_not_exported() -> None:
     run = untrained_embedding_run("abc", ("tops",), dataclasses.replace(SMALL_CONFIG, looks=1))
-    assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
     ((points, colors),) = random_clouds(0, [300])

@@ -11,8 +11,7 @@ from flax import nnx
 from refusals import assert_refused
 from slow_tier import slow
 
-import thor2_jax as thor2
-from thor2_jax.networks import FEATURES, MLP, SPARSE_BATCH, check_features, feature_of
+from thor2_jax.networks import FEATURES, MLP, SPARSE_BATCH, check_features
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))
@@ -98,12 +97,3 @@ def test_features_come_in_one_order(names: object) -> None:
 @pytest.mark.parametrize("names", [(), [], ["tops", "tops"], ["shape"], "tops", None, ["tops", None], 3])
 def test_bad_features_are_refused(names: object) -> None:
     assert_refused(rf"^classifiers is {re.escape(repr(names))}.*ce, tops, tops2", check_features, names)
-
-
-def test_each_feature_is_its_descriptor() -> None:
-    descriptors = thor2.Descriptors(
-        jnp.asarray(RNG.random((2, 7, 32, 32))), jnp.asarray(RNG.random((2, 7, 22, 31))), jnp.zeros(2, jnp.int32)
-    )
-    sizes = {name: feature_of(descriptors, name).shape for name in FEATURES}
-    assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
-    np.testing.assert_array_equal(feature_of(descriptors, "ce"), descriptors.color)

@@ -15,6 +15,7 @@ from small_clouds import random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.networks import feature_of
 
 RNG = np.random.default_rng(0)
 
@@ -114,15 +115,15 @@ def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
     assert_refused(".*".join(map(re.escape, expected)), thor2.PointClouds.pack, **given)
 
 
-def test_layout_of_the_flat_descriptors() -> None:
+def test_layout_of_the_flat_descriptors_and_features() -> None:
     """TOPS2 has a block [image | embedding] for each slice, both flattened in C order."""
     images = RNG.random((2, 7, 32, 32)).astype(np.float32)
     embeddings = RNG.random((2, 7, 22, 31)).astype(np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
     blocks = [images.reshape(2, 7, 32 * 32), embeddings.reshape(2, 7, 22 * 31)]
-    np.testing.assert_array_equal(descriptors.tops, blocks[0].reshape(2, -1))
-    np.testing.assert_array_equal(descriptors.color, blocks[1].reshape(2, -1))
-    np.testing.assert_array_equal(descriptors.tops2, np.concatenate(blocks, axis=2).reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "tops"), blocks[0].reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "ce"), blocks[1].reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "tops2"), np.concatenate(blocks, axis=2).reshape(2, -1))
 
 
 def test_records_are_frozen() -> None:
