@@ -50,8 +50,7 @@ def clouds() -> thor2.PointClouds:
 
 
 def on(device: jax.Device, clouds: thor2.PointClouds) -> thor2.PointClouds:
-    placed: thor2.PointClouds = jax.device_put(clouds, device)
-    return placed
+    return jax.device_put(clouds, device)
 
 
 def assert_near_except_at_borders(

@@ -44,8 +44,7 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
     blob = export_recognizer(run, n_points=512, n_clouds=4)
     paths = [tmp_path / name for name in ("recognizer.jax", "clouds.npz", "outputs.npz")]
     paths[0].write_bytes(blob)
-    names = ("points", "colors", "mask", "camera", "boundary", "rim")
-    np.savez(paths[1], **{name: np.asarray(getattr(packed, name)) for name in names})
+    np.savez(paths[1], **{field.name: getattr(packed, field.name) for field in dataclasses.fields(packed)})
     finish_programs(start_program(LOADER, *paths))
     outputs = np.load(paths[2])
     assert set(outputs) == {*FEATURES, "embedding", "overflow"}

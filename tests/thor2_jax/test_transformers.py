@@ -80,15 +80,17 @@ def test_another_network() -> None:
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
 def test_columns_of_data_frames_follow_the_layout(transformer: Any) -> None:
-    names: list[str] = []
-    for s in range(2):
-        names += [f"slice{s}_birth{b}_persistence{p}" for b, p in np.ndindex(8, 8)]
-        if transformer is thor2.Tops2Transformer:
-            names += [f"slice{s}_region{r}_strip{j}" for r, j in np.ndindex(NETWORK.n_regions, 5)]
+    images = np.zeros((1, 2, 8, 8), object)
+    colors = np.zeros((1, 2, NETWORK.n_regions, 5), object)
+    for s, b, p in np.ndindex(2, 8, 8):
+        images[0, s, b, p] = f"slice{s}_birth{b}_persistence{p}"
+    for s, r, j in np.ndindex(2, NETWORK.n_regions, 5):
+        colors[0, s, r, j] = f"slice{s}_region{r}_strip{j}"
+    blocks = [images.reshape(2, -1)] + [colors.reshape(2, -1)] * (transformer is thor2.Tops2Transformer)
     clouds, plain = random_clouds(0, SIZES[:3]), transformer(config=SMALL_CONFIG)
     frame = clone(plain).set_output(transform="pandas").fit_transform(clouds)
     assert isinstance(frame, pd.DataFrame)
-    assert list(frame.columns) == names
+    assert list(frame.columns) == list(np.concatenate(blocks, axis=1).reshape(-1))
     np.testing.assert_array_equal(frame.to_numpy(), plain.transform(clouds))
 
 

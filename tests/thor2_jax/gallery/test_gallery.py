@@ -8,6 +8,7 @@ import threadpoolctl
 from refusals import assert_refused
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
+from small_clouds import random_clouds
 
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import search
@@ -21,9 +22,8 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 def view(seed: int, n: int = 40) -> PreparedInstance:
-    rng = np.random.default_rng(seed)
-    points = (rng.random((n, 3)) * 0.2 + (0.1, -0.3, 0.6)).astype(np.float32)
-    return PreparedInstance(1, points, rng.integers(0, 256, (n, 3), np.uint8), rng.random(n) < 0.2)
+    (cloud,) = random_clouds(seed, [n])
+    return PreparedInstance(1, *cloud, np.random.default_rng(seed).random(n) < 0.2)
 
 
 def views_around(center: int, count: int = 6, spread: float = 0.3, size: int = 16, seed: int = 0) -> np.ndarray:

@@ -301,8 +301,7 @@ def write_at_once(*writers: tuple[Path, list[str], str, bool]) -> list[int]:
     A process with the name of a function of the store is killed before that step, or after it.
     """
     (out,) = finish_programs(start_program(PROGRAM, Path(__file__).parent, json.dumps(writers, default=str)))
-    exits: list[int] = json.loads(out)
-    return exits
+    return json.loads(out)
 
 
 STEPS = [("_write_durably", True), ("write_text", False), ("write_text", True)]
