@@ -75,15 +75,9 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"n_points": 500}, "n_points is 500"),
-        ({"n_clouds": 3}, "n_clouds is 3"),
-        ({"run": "run"}, "run is a str"),
-        ({"platforms": ("abacus",)}, "platforms is"),
-        ({"platforms": ()}, "platforms is"),
-    ],
-)
-def test_invalid_sizes_and_platforms_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
-    assert_refused(expected, export_recognizer, **{"run": run, "n_points": 512, "n_clouds": 1, **options})
+def test_invalid_runs_sizes_and_platforms_are_refused(run: TrainedRun) -> None:
+    assert_refused("n_points is 500", export_recognizer, run, n_points=500, n_clouds=1)
+    assert_refused("n_clouds is 3", export_recognizer, run, n_points=512, n_clouds=3)
+    assert_refused("run is a str", export_recognizer, "run", n_points=512, n_clouds=1)
+    for platforms in (("abacus",), ()):
+        assert_refused("platforms is", export_recognizer, run, n_points=512, n_clouds=1, platforms=platforms)

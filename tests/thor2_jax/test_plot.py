@@ -144,21 +144,15 @@ def test_reliability_draws_accuracy_and_counts() -> None:
     assert lower.get_xlabel() == "confidence" and not upper.get_xlabel()
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments", "match"),
-    [
-        (plot.cloud, ([[1.0, 2.0, 3.0], [1.0]], COLORS[:2]), "points is .*numbers"),
-        (plot.cloud, (POINTS, COLORS, ["red"] * len(POINTS)), "values is .*numbers"),
-        (plot.slices, (POINTS, COLORS, None), "config is a NoneType"),
-        (plot.persistence_diagram, (np.zeros((7, 2)), CONFIG), "diagrams is a ndarray"),
-        (plot.persistence_image, (np.zeros((32, 32)), NETWORK), "config is a ColorNetwork"),
-        (plot.color_matrix, (NETWORK, np.zeros((31, 22))), "network is a ndarray"),
-        (plot.color_vectors, ("red", NETWORK), "matrix is 'red'"),
-        (plot.color_network, (NETWORK, np.full(22, np.nan)), "weights is .nan"),
-        (plot.confusion, ([[1, 2], [3]], "ab"), "counts is .*numbers"),
-        (plot.reliability, ({"answers": [], "accuracy": []},), "bins is"),
-        (plot.reliability, ({"answers": [3, 5], "accuracy": [0.5]},), "bins is"),
-    ],
-)
-def test_input_that_cannot_be_drawn_is_refused(ax, function, arguments, match: str) -> None:
-    assert_refused(match, function, ax, *arguments)
+def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
+    assert_refused("points is .*numbers", plot.cloud, ax, [[1.0, 2.0, 3.0], [1.0]], COLORS[:2])
+    assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
+    assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)
+    assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CONFIG)
+    assert_refused("config is a ColorNetwork", plot.persistence_image, ax, np.zeros((32, 32)), NETWORK)
+    assert_refused("network is a ndarray", plot.color_matrix, ax, NETWORK, np.zeros((31, 22)))
+    assert_refused("matrix is 'red'", plot.color_vectors, ax, "red", NETWORK)
+    assert_refused("weights is .nan", plot.color_network, ax, NETWORK, np.full(22, np.nan))
+    assert_refused("counts is .*numbers", plot.confusion, ax, [[1, 2], [3]], "ab")
+    assert_refused("bins is", plot.reliability, ax, {"answers": [], "accuracy": []})
+    assert_refused("bins is", plot.reliability, ax, {"answers": [3, 5], "accuracy": [0.5]})
