@@ -148,9 +148,10 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun, max_points: int, sizes:
         assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
         assert compiled
         compiled.clear()
-        squares = {1: (10, 10, (200, 30, 30)), 2: (60, 100, (30, 30, 200))}
-        for frame in (frame_of_squares({1: squares[1]}), frame_of_squares(squares)):
-            assert all(answer.name for answer in fresh.recognize(frame))
+        one = frame_of_squares({1: (10, 10, (200, 30, 30))})
+        two = frame_of_squares({1: (10, 10, (200, 30, 30)), 2: (60, 100, (30, 30, 200))})
+        for count, frame in enumerate((one, two), 1):
+            assert [answer.name in CLASSES for answer in fresh.recognize(frame)] == [True] * count
         assert compiled == []
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
