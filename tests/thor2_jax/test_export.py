@@ -1,14 +1,14 @@
 """Exported recognizers."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import jax.export
 import numpy as np
 import pytest
+from processes import finish_programs, start_program
 from refusals import assert_refused
+from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
 
 import thor2_jax as thor2
@@ -38,22 +38,15 @@ np.savez(sys.argv[3], **outputs)
 
 @pytest.mark.slow
 def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    sizes = [(0.2, 0.1, 0.06), (0.1, 0.1, 0.02), (0.3, 0.05, 0.05)]
-    clouds = [
-        (rng.uniform(0, s, (n, 3)) + [0, 0, 0.6], rng.random((n, 3))) for n, s in zip((500, 31, 0), sizes, strict=True)
-    ]
+    clouds = random_clouds(0, (500, 31, 0))
     rims = [points[:, 0] < 0.3 * points[:, 0].max(initial=0) for points, _ in clouds]
     packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512, rim=[*rims, None])
     blob = export_recognizer(run, n_points=512, n_clouds=4)
-    (tmp_path / "loader.py").write_text(LOADER)
-    (tmp_path / "recognizer.jax").write_bytes(blob)
-    names = ("points", "colors", "mask", "camera", "boundary", "rim")
-    np.savez(tmp_path / "clouds.npz", **{name: np.asarray(getattr(packed, name)) for name in names})
-    arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "outputs.npz")]
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    outputs = np.load(tmp_path / "outputs.npz")
+    paths = [tmp_path / name for name in ("recognizer.jax", "clouds.npz", "outputs.npz")]
+    paths[0].write_bytes(blob)
+    np.savez(paths[1], **{field.name: getattr(packed, field.name) for field in dataclasses.fields(packed)})
+    finish_programs(start_program(LOADER, *paths))
+    outputs = np.load(paths[2])
     assert set(outputs) == {*FEATURES, "embedding", "overflow"}
 
     described = describe_looks(packed, run.network, CONFIG)  # gudhi: the other backend
@@ -69,11 +62,10 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
 
 def test_an_embedding_of_other_classes_is_not_exported() -> None:
     run = untrained_embedding_run("abc", ("tops",), dataclasses.replace(SMALL_CONFIG, looks=1))
-    assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
-    points = np.random.default_rng(0).uniform(0, (0.2, 0.1, 0.06), (300, 3))
-    packed = thor2.PointClouds.pack([(points, points / 0.2)], 512, rim=[points[:, 0] < 0.05])
+    ((points, colors),) = random_clouds(0, [300])
+    packed = thor2.PointClouds.pack([(points, colors)], 512, rim=[points[:, 0] < 0.05])
     packed = jax.device_put(packed, jax.devices("cpu")[0])
     outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
     assert set(outputs) == {"tops", "overflow"}
@@ -83,15 +75,9 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"n_points": 500}, "n_points is 500"),
-        ({"n_clouds": 3}, "n_clouds is 3"),
-        ({"run": "run"}, "run is a str"),
-        ({"platforms": ("abacus",)}, "platforms is"),
-        ({"platforms": ()}, "platforms is"),
-    ],
-)
-def test_invalid_sizes_and_platforms_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
-    assert_refused(expected, export_recognizer, **{"run": run, "n_points": 512, "n_clouds": 1, **options})
+def test_invalid_runs_sizes_and_platforms_are_refused(run: TrainedRun) -> None:
+    assert_refused("n_points is 500", export_recognizer, run, n_points=500, n_clouds=1)
+    assert_refused("n_clouds is 3", export_recognizer, run, n_points=512, n_clouds=3)
+    assert_refused("run is a str", export_recognizer, "run", n_points=512, n_clouds=1)
+    for platforms in (("abacus",), ()):
+        assert_refused("platforms is", export_recognizer, run, n_points=512, n_clouds=1, platforms=platforms)

@@ -13,7 +13,6 @@ import pytest
 from processes import HANG
 from refusals import assert_refused
 
-from thor2_jax import files
 from thor2_jax.files import (
     atomic_directory,
     atomic_write,
@@ -144,9 +143,10 @@ def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> No
 
 def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory, elsewhere = tmp_path / "views", tmp_path / "elsewhere"
-    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz"):
-        write_below(directory / name)
-    write_below(elsewhere / "0.npz")
+    names = ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/deep/0.npz")
+    for path in (elsewhere / "0.npz", *(directory / name for name in names)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
     (directory / "link").symlink_to(elsewhere)
     killed(directory / "crops")
     remove_written(directory, r"manifest\.json", r"(.*/)?0\.npz")
@@ -160,11 +160,6 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
     directory.symlink_to(elsewhere)
     remove_written(directory, r"0\.npz")
     assert directory.is_symlink() and elsewhere.is_dir() and not list(elsewhere.iterdir())
-
-
-def write_below(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
 
 
 @pytest.mark.parametrize(
@@ -196,8 +191,8 @@ def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
 
 
 def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_YAML_BYTES", 20)
-    monkeypatch.setattr(files, "MAX_YAML_VALUES", 5)
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_BYTES", 20)
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_VALUES", 5)
     assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
     many = "more than 5 values"
     for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[{1},1,1]", many), (b"[&a [1,2],*a,*a]", many)):

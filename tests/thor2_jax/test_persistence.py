@@ -29,11 +29,6 @@ def gudhi_pairs(heights: np.ndarray, edges: np.ndarray | None = None) -> np.ndar
     return np.array(sorted(pairs)).reshape(-1, 2)
 
 
-def pairs_of(diagrams: thor2.Diagrams) -> np.ndarray:
-    pairs = zip(diagrams.births[diagrams.mask], diagrams.deaths[diagrams.mask], strict=True)
-    return np.array(sorted(pairs)).reshape(-1, 2)
-
-
 def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> None:
     """Compare a batch [B, N] line by line."""
     diagrams = persistence.sublevel_diagrams(heights, edges)
@@ -41,8 +36,9 @@ def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> Non
     assert diagrams.births.dtype == diagrams.deaths.dtype == heights.dtype
     for b in range(len(heights)):
         one = jax.tree.map(lambda a: np.asarray(a[b]), diagrams)  # noqa: B023  used at once
+        pairs = sorted(zip(one.births[one.mask], one.deaths[one.mask], strict=True))
         expected = gudhi_pairs(heights[b], None if edges is None else edges[b])
-        np.testing.assert_array_equal(pairs_of(one), expected)
+        np.testing.assert_array_equal(np.reshape(pairs, (-1, 2)), expected)
         assert not one.births[~one.mask].any() and not one.deaths[~one.mask].any()
         np.testing.assert_array_equal(one.births[one.mask], heights[b][one.mask])
 

@@ -1,7 +1,10 @@
 """Plots: they show the given values on the given axes."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from refusals import assert_refused
@@ -18,10 +21,12 @@ COLORS = RNG.integers(0, 256, (300, 3), np.uint8)
 
 
 @pytest.fixture
-def ax() -> object:
+def ax() -> Iterator[Axes]:
+    """Axes, which are rendered after the test."""
     figure = Figure()
-    FigureCanvasAgg(figure)
-    return figure.add_subplot()
+    canvas = FigureCanvasAgg(figure)
+    yield figure.add_subplot()
+    canvas.draw()
 
 
 def test_cloud_is_seen_by_the_camera(ax) -> None:
@@ -33,7 +38,6 @@ def test_cloud_is_seen_by_the_camera(ax) -> None:
     assert ax.yaxis_inverted()
     plot.cloud(ax, POINTS, COLORS)  # A second cloud does not turn the axis back.
     assert ax.yaxis_inverted()
-    ax.figure.canvas.draw()
     assert_refused("colors is int64", plot.cloud, ax, POINTS, COLORS.astype(np.int64))
 
 
@@ -59,7 +63,6 @@ def test_slices_have_their_borders(ax) -> None:
     top = float(aligned.points[..., 2].max())
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
-    ax.figure.canvas.draw()
 
 
 def test_slices_leave_out_points_without_a_place(ax) -> None:
@@ -76,7 +79,6 @@ def test_diagram_has_every_pair(ax) -> None:
     mask = np.asarray(one.mask)
     expected = np.column_stack([np.asarray(one.births)[mask], np.asarray(one.deaths)[mask]])
     np.testing.assert_array_equal(drawn, expected)
-    ax.figure.canvas.draw()
     assert_refused("diagrams", plot.persistence_diagram, ax, diagrams, CONFIG)
 
 
@@ -100,6 +102,8 @@ def test_color_matrix_has_mean_colors(ax) -> None:
     assert (np.delete(cells[..., 3], 3, axis=1) == 0).all()
     assert [label.get_text() for label in ax.get_yticklabels()] == ["4", "7"]
     assert_refused("matrix", plot.color_matrix, ax, matrix.T, NETWORK)
+    for region in (-1, NETWORK.n_regions):
+        assert_refused("regions is", plot.color_matrix, ax, matrix, NETWORK, regions=[region])
 
 
 def test_bars_add_up_to_the_points(ax) -> None:
@@ -119,7 +123,6 @@ def test_network_emphasizes_used_regions(ax) -> None:
     faces = {tuple(np.round(collection.get_facecolors()[0][:3], 4)) for collection in ax.collections}
     for region in range(22):
         assert (tuple(np.round(NETWORK.mean_rgb[region] / 255, 4)) in faces) == (region in (2, 9))
-    ax.figure.canvas.draw()
     for wrong in (weights[:-1], -weights):
         assert_refused("weights", plot.color_network, ax, NETWORK, wrong)
 
@@ -141,26 +144,15 @@ def test_reliability_draws_accuracy_and_counts() -> None:
     assert lower.get_xlabel() == "confidence" and not upper.get_xlabel()
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments", "match"),
-    [
-        (plot.cloud, ([[1.0, 2.0, 3.0], [1.0]], COLORS[:2]), "points is .*numbers"),
-        (plot.cloud, (POINTS, COLORS, ["red"] * len(POINTS)), "values is .*numbers"),
-        (plot.slices, (POINTS, COLORS, None), "config is a NoneType"),
-        (plot.persistence_diagram, (np.zeros((7, 2)), CONFIG), "diagrams is a ndarray"),
-        (plot.persistence_image, (np.zeros((32, 32)), NETWORK), "config is a ColorNetwork"),
-        (plot.color_matrix, (NETWORK, np.zeros((31, 22))), "network is a ndarray"),
-        (plot.color_vectors, ("red", NETWORK), "matrix is 'red'"),
-        (plot.color_network, (NETWORK, np.full(22, np.nan)), "weights is .nan"),
-        (plot.confusion, ([[1, 2], [3]], "ab"), "counts is .*numbers"),
-        (plot.reliability, ({"answers": [], "accuracy": []},), "bins is"),
-        (plot.reliability, ({"answers": [3, 5], "accuracy": [0.5]},), "bins is"),
-    ],
-)
-def test_input_that_cannot_be_drawn_is_refused(ax, function, arguments, match: str) -> None:
-    assert_refused(match, function, ax, *arguments)
-
-
-@pytest.mark.parametrize("region", [-1, NETWORK.n_regions])
-def test_regions_of_no_network_are_refused(ax, region: int) -> None:
-    assert_refused("regions is", plot.color_matrix, ax, np.zeros((31, NETWORK.n_regions)), NETWORK, regions=[region])
+def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
+    assert_refused("points is .*numbers", plot.cloud, ax, [[1.0, 2.0, 3.0], [1.0]], COLORS[:2])
+    assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
+    assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)
+    assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CONFIG)
+    assert_refused("config is a ColorNetwork", plot.persistence_image, ax, np.zeros((32, 32)), NETWORK)
+    assert_refused("network is a ndarray", plot.color_matrix, ax, NETWORK, np.zeros((31, 22)))
+    assert_refused("matrix is 'red'", plot.color_vectors, ax, "red", NETWORK)
+    assert_refused("weights is .nan", plot.color_network, ax, NETWORK, np.full(22, np.nan))
+    assert_refused("counts is .*numbers", plot.confusion, ax, [[1, 2], [3]], "ab")
+    assert_refused("bins is", plot.reliability, ax, {"answers": [], "accuracy": []})
+    assert_refused("bins is", plot.reliability, ax, {"answers": [3, 5], "accuracy": [0.5]})

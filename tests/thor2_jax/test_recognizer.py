@@ -6,7 +6,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from image_files import patches, tilted
+from image_files import frame_of_squares, patches, tilted
 from refusals import assert_refused
 from scipy.stats import gmean
 from small_clouds import random_clouds
@@ -34,13 +34,6 @@ def recognizer(run: TrainedRun) -> Recognizer:
     return Recognizer(run)
 
 
-def squares(count: int) -> np.ndarray:
-    labels = np.zeros((240, 320), np.uint8)
-    for number in range(count):
-        labels[20:80, 5 + 34 * number : 35 + 34 * number] = number + 1
-    return labels
-
-
 def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognizer) -> None:
     answers = recognizer.recognize(tilted(patches()))
     assert [a.label for a in answers] == [3, 5, 7, 200]
@@ -57,7 +50,10 @@ def test_answers_are_those_of_the_fused_classifiers(run: TrainedRun, rule: str |
     """By default, the probabilities are fused by the mean of their logarithms."""
     recognizer = Recognizer(run) if rule is None else Recognizer(run, rule=rule)  # type: ignore[arg-type]
     described = recognizer.describe(tilted(patches()))
-    probabilities = class_probabilities(recognizer, described.oriented, THOR2)
+    probabilities = class_probabilities(recognizer, described.oriented)
+    for name, classifier in run.classifiers.items():
+        expected = jax.nn.softmax(classifier(feature_of(described.descriptors, name)))
+        np.testing.assert_allclose(probabilities[name], expected, atol=1e-5)
     recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
     for row, answer in enumerate(recognized):
         pair = np.array([probabilities[name][row] for name in THOR2], np.float64)
@@ -119,13 +115,6 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
     assert [answer.name for answer in recognizer.recognize(absurd)] == [None] * 4
 
 
-def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
-    described = recognizer.describe(tilted(patches()))
-    for name, probabilities in class_probabilities(recognizer, described.oriented).items():
-        expected = jax.nn.softmax(run.classifiers[name](feature_of(described.descriptors, name)))
-        np.testing.assert_allclose(probabilities, expected, atol=1e-5)
-
-
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     shape_only = Recognizer(dataclasses.replace(run, classifiers={"tops": run.classifiers["tops"]}))
     assert_refused("'tops2'.*expected one or more of tops$", shape_only.recognize, tilted(patches()), classifiers=THOR2)
@@ -159,8 +148,10 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun, max_points: int, sizes:
         assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
         assert compiled
         compiled.clear()
-        for count in (1, 2):
-            assert len(fresh.recognize(tilted(squares(count)))) == count
+        one = frame_of_squares({1: (10, 10, (200, 30, 30))})
+        two = frame_of_squares({1: (10, 10, (200, 30, 30)), 2: (60, 100, (30, 30, 200))})
+        for count, frame in enumerate((one, two), 1):
+            assert [answer.name in CLASSES for answer in fresh.recognize(frame)] == [True] * count
         assert compiled == []
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)

@@ -15,11 +15,12 @@ from small_clouds import random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.networks import feature_of
 
 RNG = np.random.default_rng(0)
 
 
-def test_pack_pads_copies_of_every_size() -> None:
+def test_pack_pads_copies_of_every_size_and_unpack_undoes_it() -> None:
     sizes = (0, 1, 2, 7, 513)
     clouds, given = random_clouds(0, sizes), random_clouds(0, sizes)
     packed = thor2.PointClouds.pack(given)
@@ -34,6 +35,9 @@ def test_pack_pads_copies_of_every_size() -> None:
         np.testing.assert_array_equal(packed.points[i, :n], xyz)
         np.testing.assert_array_equal(packed.points[i, n:], 0)
         np.testing.assert_allclose(packed.colors[i, :n], rgb / 255.0, atol=1e-7)
+    for (points, colors), (xyz, rgb) in zip(packed.unpack(), clouds, strict=True):
+        np.testing.assert_array_equal(points, xyz)
+        np.testing.assert_allclose(colors, rgb / 255, atol=1e-6)
     assert not packed.camera.any() and not packed.boundary.any() and packed.rim is None
 
 
@@ -60,13 +64,6 @@ def test_pack_takes_colors_capacity_camera_boundary_and_rim() -> None:
     np.testing.assert_array_equal(packed.rim, padded)
     each = thor2.PointClouds.pack([cloud] * 2, camera=[[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(each.camera, [[1, 2, 3], [4, 5, 6]])
-
-
-def test_unpack_undoes_pack() -> None:
-    clouds = random_clouds(0, (7, 0, 300))
-    for (xyz, rgb), (points, colors) in zip(clouds, thor2.PointClouds.pack(clouds).unpack(), strict=True):
-        np.testing.assert_array_equal(points, xyz)
-        np.testing.assert_allclose(colors, rgb / 255, atol=1e-6)
 
 
 POINTS, COLORS = np.zeros((3, 3)), np.zeros((3, 3))
@@ -118,15 +115,15 @@ def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
     assert_refused(".*".join(map(re.escape, expected)), thor2.PointClouds.pack, **given)
 
 
-def test_layout_of_the_flat_descriptors() -> None:
+def test_layout_of_the_flat_descriptors_and_features() -> None:
     """TOPS2 has a block [image | embedding] for each slice, both flattened in C order."""
     images = RNG.random((2, 7, 32, 32)).astype(np.float32)
     embeddings = RNG.random((2, 7, 22, 31)).astype(np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
     blocks = [images.reshape(2, 7, 32 * 32), embeddings.reshape(2, 7, 22 * 31)]
-    np.testing.assert_array_equal(descriptors.tops, blocks[0].reshape(2, -1))
-    np.testing.assert_array_equal(descriptors.color, blocks[1].reshape(2, -1))
-    np.testing.assert_array_equal(descriptors.tops2, np.concatenate(blocks, axis=2).reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "tops"), blocks[0].reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "ce"), blocks[1].reshape(2, -1))
+    np.testing.assert_array_equal(feature_of(descriptors, "tops2"), np.concatenate(blocks, axis=2).reshape(2, -1))
 
 
 def test_records_are_frozen() -> None:

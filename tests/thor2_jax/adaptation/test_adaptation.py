@@ -117,8 +117,7 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
 
 
 def test_too_few_instances_are_refused_with_their_number() -> None:
-    unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
-    few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
+    few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(instances(1)[0], reason="too few points")]
     message = f"9 usable instances; expected at least {MIN_INSTANCES}: .* unusable ones .1.; .* too few points"
     assert_refused(message, estimate_transform, few, none_is_known)
 

@@ -136,11 +136,10 @@ def test_parts_keep_the_mask_of_each_look(instance: PreparedInstance) -> None:
     """Without the points of the rim, the second look, which has none of them, is unchanged; without others, empty."""
     rim = instance.rim
     assert rim is not None and 0 < rim.sum() < len(rim) / 2
-    sums = []
     for number in range(4):
         scores = toy(lambda oriented, k=number: oriented.each.images[:, k].sum(axis=(1, 2, 3)), FOUR)
-        sums.append(scores.of_masks(scores.orient(instance), np.array([rim | True, ~rim, rim]))[:, 1])
-    for number, (whole, inner, outer) in enumerate(sums):
+        masks = np.array([rim | True, ~rim, rim])
+        whole, inner, outer = scores.of_masks(scores.orient(instance), masks)[:, 1]
         assert whole > 1e-3
         assert (inner == pytest.approx(whole, rel=1e-6)) == (number == 1)
         assert (outer == 0) == (number == 1)
@@ -172,14 +171,12 @@ def red() -> ClassScores:
 
 
 def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: ClassScores) -> None:
-    scores, index = red, 1
-    cloud = scores.orient(instance)
-    left = attributions.leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
+    left = attributions.leave_out(red, red.orient(instance), 1, np.zeros(len(instance.points), np.float32))
     oriented = describe_looks(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
-    margin = jax.jit(lambda o: scores.margin(scores.of_descriptors(o), index)[0])
+    margin = jax.jit(lambda o: red.margin(red.of_descriptors(o), 1)[0])
     for number in range(2):
-        blank = lambda a, number=number: a * (np.arange(2) != number).reshape(2, *[1] * (a.ndim - 3))  # noqa: E731
-        blanked = {name: blank(np.asarray(getattr(oriented.each, name))) for name in ("images", "embeddings")}
+        kept = (np.arange(2) != number).reshape(2, 1, 1)
+        blanked = {name: getattr(oriented.each, name) * kept for name in ("images", "embeddings")}
         each = dataclasses.replace(oriented.each, **blanked)
         expected = float(margin(oriented) - margin(dataclasses.replace(oriented, each=each)))
         assert left.slices[number] == pytest.approx(expected, abs=1e-3)
@@ -191,12 +188,9 @@ def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> f
     config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
     aligned = scores.orient(instance)
     weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
-    constant = region_sets(NETWORK), config, weights
-    cut = [
-        relaxed_strips(aligned.points[k].T, aligned.colors[k], aligned.mask[k], *constant) for k in range(scores.count)
-    ]
-    together = jax.tree.map(lambda *a: jnp.stack(a), *cut)
-    oriented = scores.describe(aligned, together, config)
+    sets = region_sets(NETWORK)
+    cut = jax.vmap(lambda points, colors, mask: relaxed_strips(points.T, colors, mask, sets, config, weights))
+    oriented = scores.describe(aligned, cut(aligned.points, aligned.colors, aligned.mask), config)
     return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
 
 

@@ -1,4 +1,4 @@
-"""Embeddings: their length, invariances, files, and damaged files."""
+"""Embeddings: their length, invariances, files, damaged files, and the file of reference views."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from small_runs import SMALL_CONFIG
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References, load_default
+from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
 from thor2_jax.networks import EmbeddingSizes
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
@@ -129,13 +129,12 @@ def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClou
 
 
 def test_block_weights_are_the_shares_of_the_similarity(clouds: thor2.PointClouds) -> None:
-    values, learned = [], []
+    values = []
     for weights in ([1.0, 2.0], [2.0, 0.0]):
         embedding = random_embedding()
         embedding.model.block_weights[...] = jnp.asarray(weights)
         values.append(np.asarray(embedding.embed(clouds)))
-        learned.append(values[-1][:, :8])
-    np.testing.assert_allclose(learned[0] * np.sqrt(3), learned[1], atol=1e-4)
+    np.testing.assert_allclose(values[0][:, :8] * np.sqrt(3), values[1][:, :8], atol=1e-4)
     assert not values[1][:, 8:].any()
 
 
@@ -147,12 +146,17 @@ def rewritten(path: Path, keep: Callable[[str], bool] = lambda name: True, **cha
     path.write_bytes(safetensors.numpy.save(arrays, {"embedding": json.dumps({**about, **changes})}))
 
 
+def stored_earlier(embedding: Embedding, directory: Path, *added: str) -> Embedding:
+    """Save and load an embedding; the file lacks some sizes, which a later version added."""
+    path = directory / "embedding.safetensors"
+    embedding.save(path)
+    rewritten(path, sizes={name: value for name, value in dataclasses.asdict(SIZES).items() if name not in added})
+    return Embedding.load(path)
+
+
 def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, clouds: thor2.PointClouds) -> None:
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
-    Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, balanced=False)).save(path)
-    del sizes["balanced"], sizes["shape"]
-    rewritten(path, sizes=sizes)
-    loaded = Embedding.load(path)
+    earlier = Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, balanced=False))
+    loaded = stored_earlier(earlier, tmp_path, "balanced", "shape")
     values = np.asarray(loaded.embed(clouds))
     assert not loaded.sizes.balanced and values.shape == (3, 8 + 6 + 22)
     statistics = describe_looks(clouds, loaded.network, loaded.config, 1).statistics[:, 0, 12 : 12 + 22]
@@ -164,16 +168,12 @@ def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, cloud
 
 def test_files_of_earlier_versions_compare_no_images(tmp_path: Path, clouds: thor2.PointClouds) -> None:
     embedding = random_embedding()
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
     oriented = describe_looks(clouds, embedding.network, embedding.config, 1).with_balanced(clouds)
     flat = dataclasses.replace(oriented.each, images=jnp.ones_like(oriented.each.images))
     earlier = Embedding.create(SMALL_CONFIG, sizes=dataclasses.replace(SIZES, shape=False))
     n_colors = earlier.model.color_basis.shape[0]
     earlier.model.color_basis[...] = embedding.model.color_basis[...][:n_colors]
-    earlier.save(path)
-    del sizes["shape"]
-    rewritten(path, sizes=sizes)
-    loaded = Embedding.load(path)
+    loaded = stored_earlier(earlier, tmp_path, "shape")
     assert (loaded.sizes.version, embedding.sizes.version) == (1, 2)
     assert embedding.model.color_basis.shape[0] == n_colors + 2 * 4**2  # cells of two slices
     for each, changes in ((loaded, False), (embedding, True)):
@@ -184,15 +184,12 @@ def test_files_of_earlier_versions_compare_no_images(tmp_path: Path, clouds: tho
 
 
 def test_files_of_earlier_versions_sum_the_distractors(tmp_path: Path, clouds: thor2.PointClouds) -> None:
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
     embedding = ensemble()
     summed = dataclasses.replace(embedding, sizes=dataclasses.replace(SIZES, nearest=False))
-    summed.save(path)
-    del sizes["nearest"]
-    rewritten(path, sizes=sizes)
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     loaded, expected, nearest = (
-        np.asarray(each.class_probabilities(oriented)) for each in (Embedding.load(path), summed, embedding)
+        np.asarray(each.class_probabilities(oriented))
+        for each in (stored_earlier(summed, tmp_path, "nearest"), summed, embedding)
     )
     assert np.array_equal(loaded, expected)
     assert np.abs(nearest.sum(axis=1) - expected.sum(axis=1)).min() > 1e-3
@@ -229,3 +226,38 @@ def test_other_damaged_and_missing_files_are_rejected(tmp_path: Path) -> None:
 def test_the_packaged_embedding_is_small_enough() -> None:
     embedding = load_default()
     assert embedding.size <= 256 and len(embedding._content) <= 5_500_000
+
+
+VIEWS = np.eye(4, dtype=np.float16)[[0, 1, 2]]
+REFERENCES = References(VIEWS, np.array([0, 1, BACKGROUND], np.int32), ("mug", "bowl"))
+
+
+def test_references_are_read_as_written(tmp_path: Path) -> None:
+    REFERENCES.save(tmp_path / "r", "print")
+    loaded = References.load(tmp_path / "r", "print", 4)
+    np.testing.assert_array_equal(loaded.embeddings, VIEWS)
+    np.testing.assert_array_equal(loaded.label, REFERENCES.label)
+    assert loaded.classes == ("mug", "bowl")
+
+
+def test_references_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r"
+    REFERENCES.save(path, "print")
+    assert_refused("of another embedding.*copy both files", References.load, path, "other", 4)
+    assert_refused("embeddings are float16", References.load, path, "print", 5)
+    path.write_bytes(path.read_bytes()[:-3])
+    assert_refused("cannot be used", References.load, path, "print", 4)
+    References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(path, "print")
+    assert_refused("out of range", References.load, path, "print", 4)
+
+
+def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:
+    packaged = load_default()
+    assert packaged.references is not None and packaged.references.embeddings.shape == (1024, packaged.size)
+    assert (packaged.references.label == BACKGROUND).all() and packaged.references.classes == ()
+    packaged.save(tmp_path / "embedding.safetensors")
+    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    assert loaded.fingerprint == packaged.fingerprint and loaded.references is not None
+    np.testing.assert_array_equal(loaded.references.embeddings, packaged.references.embeddings)
+    (tmp_path / REFERENCES_FILE).unlink()
+    assert Embedding.load(tmp_path / "embedding.safetensors").references is None

@@ -9,6 +9,7 @@ import threadpoolctl
 from refusals import assert_refused
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
+from small_clouds import random_clouds
 
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import search
@@ -22,9 +23,8 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 def view(seed: int, n: int = 40) -> PreparedInstance:
-    rng = np.random.default_rng(seed)
-    points = (rng.random((n, 3)) * 0.2 + (0.1, -0.3, 0.6)).astype(np.float32)
-    return PreparedInstance(1, points, rng.integers(0, 256, (n, 3), np.uint8), rng.random(n) < 0.2)
+    (cloud,) = random_clouds(seed, [n])
+    return PreparedInstance(1, *cloud, np.random.default_rng(seed).random(n) < 0.2)
 
 
 def views_around(center: int, count: int = 6, spread: float = 0.3, size: int = 16, seed: int = 0) -> np.ndarray:
@@ -62,22 +62,19 @@ def test_thresholds_grow_with_the_views_of_each_object() -> None:
         clouds = CompactClouds.of([view(0)] * views)
         gallery = gallery.with_object(f"{views}", dataclasses.replace(enrolled(0), clouds=clouds))
     # Between two numbers of views, the logarithm: .25 + .04 log(2) / log(3), and so on.
-    odds = (np.array([0.25, 0.2752, 0.29, 0.3013, 0.31, 0.3294, 0.35, 0.43]) / 0.2) ** 3
-    np.testing.assert_allclose(gallery.unknown_below, odds / (1 + odds), atol=6e-4)
-    with_references = dataclasses.replace(gallery, references=references())
-    odds = (np.array([0.05, 0.0879, 0.11, 0.1128, 0.115, 0.1174, 0.12, 0.3]) / 0.2) ** 3
-    np.testing.assert_allclose(with_references.unknown_below, odds / (1 + odds), atol=6e-4)
-    balanced = dataclasses.replace(with_references, version=1)
-    odds = (np.array([0.17, 0.24, 0.27, 0.29]) / 0.2) ** 3
-    np.testing.assert_allclose(balanced.unknown_below[[0, 2, 4, 6]], odds / (1 + odds), atol=6e-4)
-    for views, kept in (
-        (None, [0.255, 0.345, 0.375, 0.43, 0.455]),
-        (references(("mug", 3)), [0.145, 0.235, 0.25, 0.305, 0.39]),
-        (references(), [0.185, 0.27, 0.305, 0.36, 0.45]),
+    for version, reference_views, scores in (
+        (0, None, {1: 0.25, 2: 0.2752, 3: 0.29, 4: 0.3013, 5: 0.31, 7: 0.3294, 10: 0.35, 120: 0.43}),
+        (0, references(), {1: 0.05, 2: 0.0879, 3: 0.11, 4: 0.1128, 5: 0.115, 7: 0.1174, 10: 0.12, 120: 0.3}),
+        (1, references(), {1: 0.17, 3: 0.24, 5: 0.27, 10: 0.29}),
+        (2, None, {1: 0.255, 3: 0.345, 5: 0.375, 10: 0.43, 120: 0.455}),
+        (2, references(("mug", 3)), {1: 0.145, 3: 0.235, 5: 0.25, 10: 0.305, 120: 0.39}),
+        (2, references(), {1: 0.185, 3: 0.27, 5: 0.305, 10: 0.36, 120: 0.45}),
     ):
-        odds = (np.array(kept) / 0.2) ** 3
-        latest = dataclasses.replace(gallery, references=views, version=2)
-        np.testing.assert_allclose(latest.unknown_below[[0, 2, 4, 6, 7]], odds / (1 + odds), atol=6e-4)
+        of_version = dataclasses.replace(gallery, references=reference_views, version=version)
+        thresholds = dict(zip(gallery.names, of_version.unknown_below, strict=True))
+        for views, score in scores.items():
+            odds = (score / 0.2) ** 3
+            assert thresholds[f"{views}"] == pytest.approx(odds / (1 + odds), abs=6e-4)
     assert Gallery("fingerprint").unknown_below.shape == (0,)
 
 
@@ -92,7 +89,7 @@ def references(*classes: tuple[str, int]) -> References:
     )
 
 
-def test_scores_against_a_gaussian_process() -> None:
+def test_scores_of_views_and_looks_against_a_gaussian_process() -> None:
     """All views are neighbours here, so that the regression is the mean of a Gaussian process of scikit-learn."""
     gallery = Gallery("f", references=references(("class", 5), ("mug", 0), ("forgotten", 6)), hidden=("forgotten",))
     for name, center, count in (("mug", 0, 4), ("bowl", 1, 24)):
@@ -110,6 +107,8 @@ def test_scores_against_a_gaussian_process() -> None:
     expected = scores * scores / (scores + values[:, 2:3])
     assert len(views) <= NEAREST and (expected.max(axis=1) > 0.05).sum() >= 10
     np.testing.assert_allclose(gallery.scores(queries), expected, atol=2e-3)
+    looks, mean = queries.reshape(5, 5, 16), expected.reshape(5, 5, 2).mean(axis=1)
+    np.testing.assert_allclose(gallery.scores(looks), mean, atol=2e-3)
 
 
 def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,12 +120,6 @@ def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: 
     monkeypatch.setattr(np.linalg, "solve", lambda a, b: inside.append(threads()) or solve(a, b))
     gallery.scores(views_around(0, 5, seed=1))
     assert inside == [{1}] and threads() == before
-
-
-def test_scores_of_orientations_are_averaged(gallery: Gallery) -> None:
-    queries = unit(np.random.default_rng(0).normal(size=(2, 4, 16))).astype(np.float32)
-    each = np.stack([gallery.scores(queries[:, k]) for k in range(4)], axis=1)
-    np.testing.assert_allclose(gallery.scores(queries), each.mean(axis=1), atol=1e-6)
 
 
 def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:

@@ -4,11 +4,8 @@ import dataclasses
 import functools
 import hashlib
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
@@ -16,7 +13,9 @@ from unittest import mock
 import numpy as np
 import pytest
 import safetensors.numpy
+from processes import finish_programs, start_program
 from refusals import assert_refused
+from small_clouds import random_clouds
 from written_files import files_of
 
 from thor2_jax.files import temporary_directory
@@ -29,11 +28,9 @@ FINGERPRINT = "f" * 64
 
 
 def enrolled(seed: int, n_views: int = 2) -> GalleryObject:
-    rng = np.random.default_rng(seed)
-    embeddings = rng.normal(size=(2 * n_views, 16))
+    embeddings = np.random.default_rng(seed).normal(size=(2 * n_views, 16))
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
-    points, colors = rng.random((n_views, 50, 3), np.float32), rng.integers(0, 256, (n_views, 50, 3), np.uint8)
-    views = [PreparedInstance(1, *each, np.zeros(50, bool)) for each in zip(points, colors, strict=True)]
+    views = [PreparedInstance(1, *cloud, np.zeros(50, bool)) for cloud in random_clouds(seed, [50] * n_views)]
     return GalleryObject(embeddings.astype(np.float16), CompactClouds.of(views), "frames", "2026-01-02")
 
 
@@ -47,6 +44,16 @@ def undo(directory: Path, generation: int) -> Callable[[Gallery], Gallery]:
 
 def object_files(gallery: Gallery) -> dict[str, str | None]:
     return {name: views.file for name, views in gallery.objects.items()}
+
+
+def assert_unusable(match: str, directory: Path, fingerprint: str = FINGERPRINT) -> None:
+    """Assert that a gallery can neither be loaded nor changed."""
+    before = files_of(directory)
+    with pytest.raises(GalleryError, match=match):
+        load_gallery(directory, fingerprint)
+    with pytest.raises(GalleryError, match=match):
+        update_gallery(directory, add("new", 5), fingerprint)
+    assert files_of(directory) == before
 
 
 @pytest.fixture
@@ -159,10 +166,7 @@ def test_a_failed_change_leaves_the_gallery_as_it_was(
 
 
 def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
-    before = files_of(directory)
-    for act in (lambda: load_gallery(directory, "0" * 64), lambda: update_gallery(directory, add("x", 1), "0" * 64)):
-        assert_refused("embedding ffffffff.*00000000", act)
-    assert files_of(directory) == before
+    assert_unusable("embedding ffffffff.*00000000", directory, "0" * 64)
 
 
 def test_files_and_links_of_the_user_stay_and_hinder_nothing(directory: Path, tmp_path: Path) -> None:
@@ -204,11 +208,7 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
     for names in (("index.json",), ("index.json", "previous.json")):
         for name in names:
             (directory / name).unlink(missing_ok=True)
-        before = files_of(directory)
-        for act in (lambda: load_gallery(directory), lambda: update_gallery(directory, add("new", 7), FINGERPRINT)):
-            with pytest.raises(GalleryError, match="thor2 objects --reembed") as caught:
-                act()
-            assert str(directory) in str(caught.value) and files_of(directory) == before
+        assert_unusable(f"{directory}.*thor2 objects --reembed", directory)
         rebuilt = update_gallery(
             directory, lambda gallery: dataclasses.replace(gallery, embedding=FINGERPRINT), rebuild=True
         )
@@ -219,19 +219,14 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
             assert (len(views.clouds), views.source, views.date) == (len(other.clouds), other.source, other.date)
 
 
-def without_name(path: Path) -> str:
-    """Write an object's file as version 0.2 wrote it, and return its digest."""
-    content = safetensors.numpy.save(safetensors.numpy.load_file(path))
-    digest = hashlib.sha256(content).hexdigest()
-    path.unlink()
-    path.with_name(f"{digest}.safetensors").write_bytes(content)
-    return digest
-
-
 def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> None:
     index = json.loads((directory / "index.json").read_text())
     for entry, name in zip(index["objects"], ("mug ", "unknown"), strict=True):
-        entry |= {"name": name, "file": without_name(directory / "objects" / f"{entry['file']}.safetensors")}
+        path = directory / "objects" / f"{entry['file']}.safetensors"
+        content = safetensors.numpy.save(safetensors.numpy.load_file(path))  # without a name, as version 0.2 wrote it
+        entry |= {"name": name, "file": hashlib.sha256(content).hexdigest()}
+        path.unlink()
+        path.with_name(f"{entry['file']}.safetensors").write_bytes(content)
         del entry["source"], entry["date"]
     for name in ("index.json", "previous.json"):
         (directory / name).write_text(json.dumps(index))
@@ -269,15 +264,12 @@ def cut(file: Path) -> None:
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_refused_in_one_line(damage: str, directory: Path) -> None:
     DAMAGES[damage](directory)
-    before = files_of(directory)
-    for act in (lambda: load_gallery(directory), lambda: update_gallery(directory, add("new", 5), FINGERPRINT)):
-        assert_refused(f"^gallery: .*{directory}", act)
-    assert files_of(directory) == before
+    assert_unusable(f"^gallery: .*{directory}", directory)
 
 
 PROGRAM = """
 import json, os, signal, sys
-sys.path[:0] = json.loads(sys.argv[1])
+sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from test_store import FINGERPRINT, add
 from thor2_jax.gallery import store
@@ -308,41 +300,28 @@ def write_at_once(*writers: tuple[Path, list[str], str, bool]) -> list[int]:
 
     A process with the name of a function of the store is killed before that step, or after it.
     """
-    from processes import HANG  # the program imports this file, and cannot import that one
-
-    tests = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    command = [sys.executable, "-c", PROGRAM, json.dumps(tests), json.dumps(writers, default=str)]
-    done = subprocess.run(
-        command, env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, check=True, timeout=HANG
-    )
-    exits: list[int] = json.loads(done.stdout)
-    return exits
+    (out,) = finish_programs(start_program(PROGRAM, Path(__file__).parent, json.dumps(writers, default=str)))
+    return json.loads(out)
 
 
 STEPS = [("_write_durably", True), ("write_text", False), ("write_text", True)]
 
 
-def test_a_killed_writer_leaves_the_gallery_before_or_after(directory: Path, tmp_path: Path) -> None:
-    before = load_gallery(directory).names
-    steps = [("_remove_orphans", True), *STEPS]
-    copies = [shutil.copytree(directory, tmp_path / str(k)) for k in range(len(steps))]
-    exits = write_at_once(*((copy, ["new"], *step) for copy, step in zip(copies, steps, strict=True)))
+@pytest.mark.parametrize("is_first", [False, True])
+def test_a_killed_writer_leaves_the_gallery_before_or_after(is_first: bool, directory: Path, tmp_path: Path) -> None:
+    """A first change also writes an index, of the empty gallery, before that of the change."""
+    steps = [("_write_durably", False) if is_first else ("_remove_orphans", True), *STEPS]
+    paths = [tmp_path / str(k) for k in range(len(steps))]
+    if not is_first:
+        for path in paths:
+            shutil.copytree(directory, path)
+    exits = write_at_once(*((path, ["new"], *step) for path, step in zip(paths, steps, strict=True)))
     assert exits == [-signal.SIGKILL] * len(steps)
-    for copy, step in zip(copies, steps, strict=True):
-        finished = step == ("write_text", True)
-        assert load_gallery(copy).names == (*before, *(["new"] if finished else [])), step
-        update_gallery(copy, lambda gallery: gallery, FINGERPRINT)
-        assert len(list((copy / "objects").iterdir())) == 2 + finished, step
-
-
-def test_a_killed_first_enrollment_leaves_an_empty_gallery(tmp_path: Path) -> None:
-    steps = {tmp_path / str(k): step for k, step in enumerate([("_write_durably", False), *STEPS])}
-    exits = write_at_once(*((path, ["mug"], *step) for path, step in steps.items()))
-    assert exits == [-signal.SIGKILL] * len(steps)
-    for path, step in steps.items():
-        assert load_gallery(path, FINGERPRINT).names == (), step
-        assert update_gallery(path, add("bowl", 1), FINGERPRINT).names == ("bowl",), step
-        assert len(list((path / "objects").iterdir())) == 1, step
+    for path, step in zip(paths, steps, strict=True):
+        names = () if is_first else ("mug", "bowl", *(["new"] if step == ("write_text", True) else []))
+        assert load_gallery(path, FINGERPRINT).names == names, step
+        assert update_gallery(path, add("box", 1), FINGERPRINT).names == (*names, "box"), step
+        assert len(list((path / "objects").iterdir())) == len(names) + 1, step
 
 
 def test_two_writers_at_once_both_succeed(directory: Path) -> None:

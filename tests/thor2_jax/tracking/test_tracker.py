@@ -10,7 +10,6 @@ from image_files import frame_of_squares
 from refusals import assert_refused
 from small_runs import assert_same_answers, untrained_run
 
-import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.recognizer import Recognizer
@@ -25,12 +24,10 @@ class ToyRecognizer:
     """Answers by the mean colour of an instance, whose channels are class probabilities in 1/255."""
 
     def __init__(self) -> None:
-        self._recognizer = Recognizer(run())
-        self.model = self._recognizer.model
+        recognizer = Recognizer(run())
+        self.model = recognizer.model
+        self.prepare = recognizer.prepare
         self.described: list[PreparedInstance] = []
-
-    def prepare(self, frame: thor2.RGBDFrame) -> Iterable[PreparedInstance]:
-        return self._recognizer.prepare(frame)
 
     def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]:
         given = list(instances)
@@ -111,8 +108,7 @@ def test_frames_and_poses_of_different_sequences_are_refused() -> None:
     tracker = Tracker(ToyRecognizer())
     image = frame_of_squares({1: (10, 10, SURE_A)})
     tracker.update(image)
-    small = thor2.RGBDFrame(image.color[:100], image.depth[:100], image.labels[:100], image.intrinsics)
-    assert_refused("160 x 100 pixels; expected 160 x 120", tracker.update, small)
+    assert_refused("160 x 100 pixels; expected 160 x 120", tracker.update, frame_of_squares({}, shape=(100, 160)))
     assert_refused("pose is given", tracker.update, image, np.eye(4))
     assert_refused("rigid", tracker.update, image, 2 * np.eye(4))
     assert tracker.update(image)[0].frames == 2
