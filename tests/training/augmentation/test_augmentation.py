@@ -60,8 +60,7 @@ each_and_all = pytest.mark.parametrize("on", [*({name: on} for name, on in AUGME
 @each_and_all
 def test_a_pure_function_of_its_arguments(on: dict[str, Any]) -> None:
     before = MUG.color.copy(), MUG.depth.copy()
-    results = [augmented_view(MUG, seed, **on) for seed in range(8)]
-    again = [augmented_view(MUG, seed, **on) for seed in range(8)]
+    results, again = ([augmented_view(MUG, seed, **on) for seed in range(8)] for _ in range(2))
     assert all(same(one, other) for one, other in zip(results, again, strict=True))
     assert sum(not same(result, MUG) for result in results) >= 4
     assert sum(not same(results[0], other) for other in results[1:]) >= 4
@@ -103,8 +102,7 @@ def test_all_objects_from_all_sides() -> None:
 
 def test_a_view_most_of_whose_pixels_fly_keeps_them() -> None:
     steep = flat_view(np.tile(1000 + 40 * np.arange(60, dtype=np.uint16), (60, 1)))
-    kept = augmented_view(steep, 0, segmentation=Segmentation(pixels=(0, 0)))
-    assert same(kept, steep)
+    assert same(augmented_view(steep, 0, segmentation=Segmentation(pixels=(0, 0))), steep)
 
 
 # Illumination.
@@ -146,9 +144,7 @@ def test_noise_of_colour() -> None:
 def test_shading_follows_normals() -> None:
     """Each side of a roof has one shade, in the ratio that Lambert's law predicts for the direction of light."""
     light = dataclasses.replace(NO_LIGHT, shading=(1, 1))
-    column = np.arange(120) - 59.5
-    width = 1.5 / 1099
-    rise = 0.8 * width * 1000 * np.abs(column)
+    rise = 0.8 * 1500 / 1099 * np.abs(np.arange(120) - 59.5)
     depth = np.rint(np.tile(1500 + rise, (100, 1))).astype(np.uint16)
     normals = np.array([[-0.8, 0, -1], [0.8, 0, -1]]) / np.hypot(0.8, 1)
     ratios = []
@@ -284,15 +280,13 @@ def test_the_background_is_a_plane_behind_the_object() -> None:
 
 
 def test_colors_are_shifted_against_depth() -> None:
-    depth = wall()
-    view = flat_view(depth, f=1500.0)  # pixels are 1 mm wide, as in a real frame
+    view = flat_view(wall(), f=1500.0)  # pixels are 1 mm wide, as in a real frame
     view.color[:, 30:] = (200, 50, 25)
     shifts = set()
     for seed in range(60):
         result = augmented_view(view, seed, registration=Registration(shifted=1, shift=4, **NO_BLUR))
-        assert np.array_equal(result.depth, depth)
-        column = int(np.flatnonzero((result.color[30, 10:50] == (200, 50, 25)).all(axis=1))[0]) + 10
-        shifts.add(column - 30)
+        assert np.array_equal(result.depth, view.depth)
+        shifts.add(np.flatnonzero((result.color[30, 10:50] == (200, 50, 25)).all(axis=1))[0] - 20)
     assert shifts == set(range(-4, 5))
 
 
