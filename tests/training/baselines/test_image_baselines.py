@@ -1,7 +1,7 @@
 """Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -177,14 +177,13 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     path = weights / f"{pretrained_files(SMALL)[0]}.safetensors"
     tensors, qkv = load_file(path), "blocks.0.attn.qkv.weight"
     wide, long = np.zeros(384, np.float32), np.zeros((1, 38, 192), np.float32)
-    cases: list[tuple[Callable[[], Any], str]] = [
+    for damage, message in (
         (lambda: save_file(tensors | {"norm.weight": wide}, path), r"norm\.weight in .* the shape \(384,\).*\(96,\)"),
         (lambda: save_file({k: a for k, a in tensors.items() if k != qkv}, path), f"no tensor {qkv}"),
         (lambda: save_file(tensors | {"pos_embed": long}, path), r"pos_embed .* \(1, 38, 192\)"),
         (lambda: path.write_bytes(b"no tensors"), "cannot be read"),
         (path.unlink, "does not exist"),
-    ]
-    for damage, message in cases:
+    ):
         damage()
         assert_refused(f"^weights: .*{message}", train_baselines, folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()

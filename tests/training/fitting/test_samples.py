@@ -30,9 +30,9 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
     monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []
-    show = lambda *done: progress.append(done)  # noqa: E731
-    samples, kept = sample_views(source, NETWORK, config, Form(PAPER_MIRRORS), progress=show)
-    assert len(samples) == 16 and kept == []
+    form = Form(PAPER_MIRRORS)
+    samples, kept = sample_views(source, NETWORK, config, form, progress=lambda *done: progress.append(done))
+    assert kept == []
     assert progress == [(3, 4), (4, 4)]
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
     assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
