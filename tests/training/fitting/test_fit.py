@@ -137,21 +137,16 @@ def test_invalid_options_are_refused_by_name() -> None:
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 
-def metrics(epoch: int) -> EpochMetrics:
-    return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
-
-
 def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
     """Only the epochs of one classifier and fold are discarded."""
     path = tmp_path / "metrics.jsonl"
-    train_run.append_metrics(path, 0, "ce", metrics(1))
+    train_run.append_metrics(path, 0, "ce", EpochMetrics(1, 1.0, 0.5, 1000.0))
     with path.open("a") as file:
         file.write('{"fold": 0, "cl')
     assert [row["epoch"] for row in train_run.read_metrics(path)] == [1]
     train_run.discard_later_epochs(path, 0, "ce", 1)
-    train_run.append_metrics(path, 0, "ce", metrics(2))
-    train_run.append_metrics(path, 0, "tops", metrics(2))
-    train_run.append_metrics(path, 1, "ce", metrics(2))
+    for fold, classifier in ((0, "ce"), (0, "tops"), (1, "ce")):
+        train_run.append_metrics(path, fold, classifier, EpochMetrics(2, 0.5, 0.5, 1000.0))
     assert [row["epoch"] for row in train_run.read_metrics(path)] == [1, 2, 2, 2]
     train_run.discard_later_epochs(path, 0, "ce", 1)
     kept = [(row["fold"], row["classifier"], row["epoch"]) for row in train_run.read_metrics(path)]

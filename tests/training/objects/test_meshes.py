@@ -126,19 +126,16 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
     check_refused(tmp_path / "missing.glb", "no such file")
     (tmp_path / "mesh.stl").touch()
     check_refused(tmp_path / "mesh.stl", ".glb, .obj, .ply")
-    trimesh.Trimesh(QUAD, QUAD_FACES, process=False).export(tmp_path / "grey.ply")
-    check_refused(tmp_path / "grey.ply", "no texture")
-    trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)).export(tmp_path / "points.ply")
-    check_refused(tmp_path / "points.ply", "no faces")
-    colored(QUAD * 1000).export(tmp_path / "millimetres.ply")
-    check_refused(tmp_path / "millimetres.ply", "longest side 100 .*millimetres")
-    colored(QUAD * 0).export(tmp_path / "nothing.ply")
-    check_refused(tmp_path / "nothing.ply", "longest side 0")
-    for value in (np.nan, np.inf):
-        broken = QUAD.copy()
-        broken[1, 2] = value
-        colored(broken).export(tmp_path / "broken.ply")
-        check_refused(tmp_path / "broken.ply", "1 vertices are not finite")
+    for mesh, message in (
+        (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
+        (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
+        (colored(QUAD * 1000), "longest side 100 .*millimetres"),
+        (colored(QUAD * 0), "longest side 0"),
+        (colored(QUAD + [[np.nan], [0], [0], [0]]), "1 vertices are not finite"),
+        (colored(QUAD + [[np.inf], [0], [0], [0]]), "1 vertices are not finite"),
+    ):
+        mesh.export(tmp_path / "mesh.ply")
+        check_refused(tmp_path / "mesh.ply", message)
     text = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
     (tmp_path / "far.ply").write_bytes(text.replace(b"3 0 1 2", b"3 0 1 -1"))
     check_refused(tmp_path / "far.ply", "invalid vertex indices")
