@@ -11,6 +11,7 @@ import pytest
 from flax import nnx
 from refusals import assert_refused
 from safetensors.numpy import load_file, save_file
+from slow_tier import slow
 from small_clouds import random_clouds
 from small_runs import untrained_run
 
@@ -39,7 +40,6 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")
-N_VIEWS = 20
 SMALL = "rgbd-vit-small"
 
 
@@ -59,7 +59,7 @@ class Views(MemoryViews):
         return crops_of(index, self.shards[index].views, size)
 
 
-CLOUDS = random_clouds(0, [40] * N_VIEWS)
+CLOUDS = random_clouds(0, [40] * 20)
 SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 
@@ -70,17 +70,6 @@ def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
     }  # fmt: skip
     save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
     return folder
-
-
-def frame_inputs(seed: int, rows: int = 4) -> BaselineInputs:
-    """Return the inputs of a red and a blue instance, and padding."""
-    packed = thor2.PointClouds.pack(CLOUDS[:1] * rows)
-
-    def crops(size: int) -> ViewCrops:
-        both = [crops_of(label, 1, size, seed) for label in (0, 1)]
-        return ViewCrops(np.concatenate([c.color for c in both]), np.concatenate([c.normals for c in both]))
-
-    return BaselineInputs(packed, np.zeros((rows, 1), np.float32), crops)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,25 +90,22 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def check_baseline(folder: Path, name: str) -> None:
+@pytest.mark.parametrize("name", [SMALL, *slow("templates", "rcfusion-small", "vit-cnn-small")])
+def test_network_and_templates_learn(trained: Path, tmp_path: Path, name: str) -> None:
+    """The inputs are a red and a blue instance, and padding; the templates need the backbone of the small network."""
+    folder = trained if name in (SMALL, "templates") else write_run(tmp_path / "run", epochs=12)
+    train_baselines(folder, SOURCE, [name])
     loaded = load_baselines(folder, load_run(folder))[name]
-    probabilities = loaded.predict(frame_inputs(5))
+
+    def crops(size: int) -> ViewCrops:
+        both = [crops_of(label, 1, size, seed=5) for label in (0, 1)]
+        return ViewCrops(np.concatenate([c.color for c in both]), np.concatenate([c.normals for c in both]))
+
+    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1] * 4), np.zeros((4, 1), np.float32), crops)
+    probabilities = loaded.predict(inputs)
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     assert probabilities[:2].argmax(axis=1).tolist() == [0, 1] and (probabilities[2:] == 0.5).all()
     assert loaded.weights == {} and loaded.temperature is not None and loaded.temperature > 0
-
-
-@pytest.mark.parametrize("name", [SMALL, pytest.param("templates", marks=pytest.mark.slow)])
-def test_network_and_templates_learn(trained: Path, name: str) -> None:
-    train_baselines(trained, SOURCE, [name])
-    check_baseline(trained, name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
-def test_other_networks_learn(tmp_path: Path, name: str) -> None:
-    train_baselines(write_run(tmp_path / "run", epochs=12), SOURCE, [name])
-    check_baseline(tmp_path / "run", name)
 
 
 def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,14 +30,10 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, 
 NETWORK = colornet.load_default()
 
 
-def source(views: int) -> MemoryViews:
-    return MemoryViews({name: random_clouds(k, [90] * views) for k, name in enumerate(("brick", "stick"))}, CONFIG)
-
-
 @pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])
 def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
-    views = source(2)
+    views = MemoryViews({"brick": random_clouds(0, [90] * 2), "stick": random_clouds(1, [90] * 2)}, CONFIG)
     samples, _ = sample_views(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 3, rngs=nnx.Rngs(0))  # the third class has no samples
     rows = np.array([7, 0, 7, 3, 5])

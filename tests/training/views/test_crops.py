@@ -183,11 +183,10 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
-    content = json.loads(manifest.read_text())
-    manifest.write_text(json.dumps({**content, "dataset": "0"}))
-    assert_refused("crops of other views", plain.read_crops, 0, 8)
-    manifest.write_text("[]")
-    assert_refused("manifest.json is damaged", plain.read_crops, 0, 8)
+    other = json.loads(manifest.read_text()) | {"dataset": "0"}
+    for content, message in ((other, "crops of other views"), ([], "manifest.json is damaged")):
+        manifest.write_text(json.dumps(content))
+        assert_refused(message, plain.read_crops, 0, 8)
 
 
 def test_reduced_crops_are_means_of_areas() -> None:
