@@ -23,7 +23,6 @@ from .conftest import augmented_view, flat_view, wall
 
 OBJECTS = builtin_objects()
 AUGMENTATIONS: dict[str, Any] = {name: kind() for name, (kind, _) in KINDS.items()} | {"base": Base(missing=1)}
-ALL = Augmentations(**AUGMENTATIONS)
 NO_LIGHT = Illumination(gamma=(1, 1), gain=(1, 1), cast=0, shading=(0, 0), saturation=(1, 1), veil=(0, 0), noise=(0, 0))
 NO_BLUR: dict[str, Any] = {"blur": (0, 0), "chroma": (0, 0)}
 
@@ -89,12 +88,12 @@ def test_empty_views_and_a_single_pixel(on: dict[str, Any]) -> None:
 
 def test_all_objects_from_all_sides() -> None:
     """Includes thin objects, views along an axis, and objects that fill their crop of the image."""
-    rng = np.random.default_rng(0)
+    rng, augmentations = np.random.default_rng(0), Augmentations(**AUGMENTATIONS)
     for mesh in OBJECTS.values():
         caster = RayCaster([mesh])
         for polar in (0.0, np.pi / 2, 2.5):
             view = render_view(caster, camera_pose(0.0, polar, mesh.centre))
-            shares = [(augment(view, ALL, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
+            shares = [(augment(view, augmentations, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
             # A fifth is visible, half of it in the eroded mask, .6 of that above the base, .8 of that outside of
             # patches, and .7 of the edges have depth.
             assert 0.2 * 0.5 * 0.6 * 0.8 * 0.7 < min(shares) <= max(shares) < 1.7

@@ -91,7 +91,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", [SMALL, *slow("templates", "rcfusion-small", "vit-cnn-small")])
-def test_network_and_templates_learn(trained: Path, tmp_path: Path, name: str) -> None:
+def test_image_baselines_learn(trained: Path, tmp_path: Path, name: str) -> None:
     """The inputs are a red and a blue instance, and padding; the templates need the backbone of the small network."""
     folder = trained if name in (SMALL, "templates") else write_run(tmp_path / "run", epochs=12)
     train_baselines(folder, SOURCE, [name])

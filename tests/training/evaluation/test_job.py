@@ -144,10 +144,8 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     assert report["temperatures"]["embedding"]["runs"] == 0
     confusion, confidences = np.zeros((3, 4), int), []
     recognizer = Recognizer.load(tmp_path / "run", unknown_below=0.0)
-    for number in range(5):
-        item = dataset[number]
-        answers = recognizer.recognize(item.frame)
-        answered = {answer.label: answer for answer in answers}
+    for item in dataset:
+        answered = {answer.label: answer for answer in recognizer.recognize(item.frame)}
         for label in (1, 2):
             answer = answered.get(label)  # every fourth frame has no label 2
             column = 3 if answer is None else CLASSES.index(answer.top["embedding"][0][0])
