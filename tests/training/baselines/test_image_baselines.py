@@ -129,12 +129,12 @@ def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: 
         np.testing.assert_allclose(resumed[path], expected[path], rtol=1e-5, atol=1e-6)
 
 
-def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
-    """Write the files of weights that a network reads, with random values."""
+def write_weights(folder: Path, seed: int = 0) -> Path:
+    """Write the files of weights that the small RGB-D ViT reads, with random values."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(seed)
-    model: Any = nnx.eval_shape(lambda: ARCHITECTURES[name].build(2, 0))
-    for backbone, file in ARCHITECTURES[name].weights.items():
+    model: Any = nnx.eval_shape(lambda: ARCHITECTURES[SMALL].build(2, 0))
+    for backbone, file in ARCHITECTURES[SMALL].weights.items():
         shapes = tensor_shapes(getattr(model, backbone))
         tensors = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
         save_file(tensors, folder / f"{file}.safetensors")

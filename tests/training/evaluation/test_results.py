@@ -16,11 +16,11 @@ CLASSES = ("bowl", "can", "mug")
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
 
 
-def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
-    """Return frames with two instances; every 7th instance is not described, every 11th is an unknown object."""
+def synthetic_frames() -> list[FrameAnswers]:
+    """Return 60 frames with two instances; every 7th instance is not described, every 11th is an unknown object."""
     rng = np.random.default_rng(0)
     frames = []
-    for k in range(n):
+    for k in range(60):
         instances = []
         for label in (1, 2):
             number = 2 * k + label
