@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -109,21 +110,14 @@ def test_image_baselines_learn(trained: Path, tmp_path: Path, name: str) -> None
 
 
 def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, steps = write_run(tmp_path / "run"), []
-    step = module._step
-
-    def interrupted(*arguments: Any) -> Any:
-        steps.append(1)
-        if len(steps) == 2:
-            raise KeyboardInterrupt
-        return step(*arguments)
-
-    monkeypatch.setattr(module, "_step", interrupted)
+    folder = write_run(tmp_path / "run")
+    step = mock.Mock(wraps=module._step, side_effect=[mock.DEFAULT, KeyboardInterrupt, mock.DEFAULT, mock.DEFAULT])
+    monkeypatch.setattr(module, "_step", step)
     with pytest.raises(KeyboardInterrupt):
         train_baselines(folder, SOURCE, [SMALL])
     assert not list((folder / "baselines").glob("*.safetensors"))
     train_baselines(folder, SOURCE, [SMALL])
-    assert len(steps) == 4  # one step in each of three epochs, one of them interrupted
+    assert step.call_count == 4  # one step in each of three epochs, one of them interrupted
     resumed, expected = (load_file(run / "baselines" / f"{SMALL}.safetensors") for run in (folder, trained))
     for path in expected:
         np.testing.assert_allclose(resumed[path], expected[path], rtol=1e-5, atol=1e-6)

@@ -243,12 +243,13 @@ def copy_of(folder: Path, **contents: bytes) -> FrameFiles:
 def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
     original = frame_files(SAMPLES / "crockery").read()
     photo = encode_image(original.color)
-    actual = {f.code for f in diagnose(copy_of(tmp_path, labels=photo, intrinsics=b"{}")).findings}
-    assert actual == {"unreadable-labels", "unreadable-intrinsics"}
-    actual = {f.code for f in diagnose(copy_of(tmp_path, color=b"", depth=photo)).findings}
-    assert actual == {"unreadable-color", "unreadable-depth"}
-    half = encode_image(np.ascontiguousarray(original.depth[::2, ::2]))
-    assert "size" in {f.code for f in diagnose(copy_of(tmp_path, depth=half)).findings}
+
+    def codes(**contents: bytes) -> set[str]:
+        return {finding.code for finding in diagnose(copy_of(tmp_path, **contents)).findings}
+
+    assert codes(labels=photo, intrinsics=b"{}") == {"unreadable-labels", "unreadable-intrinsics"}
+    assert codes(color=b"", depth=photo) == {"unreadable-color", "unreadable-depth"}
+    assert "size" in codes(depth=encode_image(np.ascontiguousarray(original.depth[::2, ::2])))
 
 
 def test_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str], printed: Command, refused: Command) -> None:
