@@ -79,8 +79,8 @@ def ocid_scene(seed: int = 0, first: int = 3, objects: int = 3) -> tuple[np.ndar
     return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8), depth, labels
 
 
-def points_of(depth: np.ndarray, camera: Intrinsics = CAMERA) -> np.ndarray:
-    points = backproject(depth / 1000.0, camera)
+def points_of(depth: np.ndarray) -> np.ndarray:
+    points = backproject(depth / 1000.0, CAMERA)
     points[depth == 0] = np.nan
     return points
 

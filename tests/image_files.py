@@ -100,10 +100,10 @@ def patches() -> NDArray[np.uint8]:
     return labels
 
 
-def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDFrame:
+def tilted(labels: np.ndarray) -> thor2.RGBDFrame:
     """Return a frame of a tilted plane with random colours; depth grows to the right."""
-    depth = np.broadcast_to(nearest + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-    color = np.random.default_rng(seed).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
 
 

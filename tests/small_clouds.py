@@ -7,9 +7,7 @@ import numpy as np
 from thor2_jax.types import Cloud
 
 
-def aligned_cloud(
-    seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)
-) -> tuple[np.ndarray, np.ndarray]:
+def aligned_cloud(seed: int, n: int, size: Sequence[float] = (0.76, 0.4, 0.68)) -> Cloud:
     """Return random points in the first octant, none within 1e-5 of a border of slices or strips, and colours."""
     rng = np.random.default_rng(seed)
     points = (rng.random((n, 3)) * size).astype(np.float32)

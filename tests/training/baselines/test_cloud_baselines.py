@@ -77,13 +77,12 @@ ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
 
 
 def pointnet(classes: int = 5) -> Predictor:
-    run: Any = SimpleNamespace(classes=("",) * classes)
-    return load_pointnet(ARRAYS, run)
+    return load_pointnet(ARRAYS, SimpleNamespace(classes=("",) * classes))  # type: ignore[arg-type]
 
 
 def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
-    packed = thor2.PointClouds.pack(random_clouds(seed, sizes))
-    return BaselineInputs(packed, np.zeros((len(sizes), 1), np.float32), None)
+    clouds = thor2.PointClouds.pack(random_clouds(seed, sizes))
+    return BaselineInputs(clouds, np.zeros((len(sizes), 1), np.float32), None)
 
 
 def test_probabilities_match_numpy() -> None:

@@ -1,16 +1,18 @@
 """Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 from flax import nnx
 from refusals import assert_refused
 from safetensors.numpy import load_file, save_file
+from slow_tier import slow
 from small_clouds import random_clouds
 from small_runs import untrained_run
 
@@ -39,7 +41,6 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")
-N_VIEWS = 20
 SMALL = "rgbd-vit-small"
 
 
@@ -59,7 +60,7 @@ class Views(MemoryViews):
         return crops_of(index, self.shards[index].views, size)
 
 
-CLOUDS = random_clouds(0, [40] * N_VIEWS)
+CLOUDS = random_clouds(0, [40] * 20)
 SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 
@@ -70,17 +71,6 @@ def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
     }  # fmt: skip
     save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
     return folder
-
-
-def frame_inputs(seed: int, rows: int = 4) -> BaselineInputs:
-    """Return the inputs of a red and a blue instance, and padding."""
-    packed = thor2.PointClouds.pack(CLOUDS[:1] * rows)
-
-    def crops(size: int) -> ViewCrops:
-        both = [crops_of(label, 1, size, seed) for label in (0, 1)]
-        return ViewCrops(np.concatenate([c.color for c in both]), np.concatenate([c.normals for c in both]))
-
-    return BaselineInputs(packed, np.zeros((rows, 1), np.float32), crops)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,54 +91,44 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def check_baseline(folder: Path, name: str) -> None:
+@pytest.mark.parametrize("name", [SMALL, *slow("templates", "rcfusion-small", "vit-cnn-small")])
+def test_image_baselines_learn(trained: Path, tmp_path: Path, name: str) -> None:
+    """The inputs are a red and a blue instance, and padding; the templates need the backbone of the small network."""
+    folder = trained if name in (SMALL, "templates") else write_run(tmp_path / "run", epochs=12)
+    train_baselines(folder, SOURCE, [name])
     loaded = load_baselines(folder, load_run(folder))[name]
-    probabilities = loaded.predict(frame_inputs(5))
+
+    def crops(size: int) -> ViewCrops:
+        both = [crops_of(label, 1, size, seed=5) for label in (0, 1)]
+        return ViewCrops(np.concatenate([c.color for c in both]), np.concatenate([c.normals for c in both]))
+
+    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1] * 4), np.zeros((4, 1), np.float32), crops)
+    probabilities = loaded.predict(inputs)
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     assert probabilities[:2].argmax(axis=1).tolist() == [0, 1] and (probabilities[2:] == 0.5).all()
     assert loaded.weights == {} and loaded.temperature is not None and loaded.temperature > 0
 
 
-@pytest.mark.parametrize("name", [SMALL, pytest.param("templates", marks=pytest.mark.slow)])
-def test_network_and_templates_learn(trained: Path, name: str) -> None:
-    train_baselines(trained, SOURCE, [name])
-    check_baseline(trained, name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
-def test_other_networks_learn(tmp_path: Path, name: str) -> None:
-    train_baselines(write_run(tmp_path / "run", epochs=12), SOURCE, [name])
-    check_baseline(tmp_path / "run", name)
-
-
 def test_an_interrupted_fit_resumes(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, steps = write_run(tmp_path / "run"), []
-    step = module._step
-
-    def interrupted(*arguments: Any) -> Any:
-        steps.append(1)
-        if len(steps) == 2:
-            raise KeyboardInterrupt
-        return step(*arguments)
-
-    monkeypatch.setattr(module, "_step", interrupted)
+    folder = write_run(tmp_path / "run")
+    step = mock.Mock(wraps=module._step, side_effect=[mock.DEFAULT, KeyboardInterrupt, mock.DEFAULT, mock.DEFAULT])
+    monkeypatch.setattr(module, "_step", step)
     with pytest.raises(KeyboardInterrupt):
         train_baselines(folder, SOURCE, [SMALL])
     assert not list((folder / "baselines").glob("*.safetensors"))
     train_baselines(folder, SOURCE, [SMALL])
-    assert len(steps) == 4  # one step in each of three epochs, one of them interrupted
+    assert step.call_count == 4  # one step in each of three epochs, one of them interrupted
     resumed, expected = (load_file(run / "baselines" / f"{SMALL}.safetensors") for run in (folder, trained))
     for path in expected:
         np.testing.assert_allclose(resumed[path], expected[path], rtol=1e-5, atol=1e-6)
 
 
-def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
-    """Write the files of weights that a network reads, with random values."""
+def write_weights(folder: Path, seed: int = 0) -> Path:
+    """Write the files of weights that the small RGB-D ViT reads, with random values."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(seed)
-    model: Any = nnx.eval_shape(lambda: ARCHITECTURES[name].build(2, 0))
-    for backbone, file in ARCHITECTURES[name].weights.items():
+    model: Any = nnx.eval_shape(lambda: ARCHITECTURES[SMALL].build(2, 0))
+    for backbone, file in ARCHITECTURES[SMALL].weights.items():
         shapes = tensor_shapes(getattr(model, backbone))
         tensors = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
         save_file(tensors, folder / f"{file}.safetensors")
@@ -177,14 +157,13 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     path = weights / f"{pretrained_files(SMALL)[0]}.safetensors"
     tensors, qkv = load_file(path), "blocks.0.attn.qkv.weight"
     wide, long = np.zeros(384, np.float32), np.zeros((1, 38, 192), np.float32)
-    cases: list[tuple[Callable[[], Any], str]] = [
+    for damage, message in (
         (lambda: save_file(tensors | {"norm.weight": wide}, path), r"norm\.weight in .* the shape \(384,\).*\(96,\)"),
         (lambda: save_file({k: a for k, a in tensors.items() if k != qkv}, path), f"no tensor {qkv}"),
         (lambda: save_file(tensors | {"pos_embed": long}, path), r"pos_embed .* \(1, 38, 192\)"),
         (lambda: path.write_bytes(b"no tensors"), "cannot be read"),
         (path.unlink, "does not exist"),
-    ]
-    for damage, message in cases:
+    ):
         damage()
         assert_refused(f"^weights: .*{message}", train_baselines, folder, SOURCE, [SMALL], weights=weights)
     assert not (folder / "baselines").exists()

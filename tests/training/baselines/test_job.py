@@ -68,11 +68,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def described(seed: int) -> Any:
-    packed = thor2.PointClouds.pack([cloud for each in clouds(seed, 4).values() for cloud in each])
-    return SimpleNamespace(packed=packed, descriptors=describe(packed, colornet.load_default(), CONFIG))
-
-
 @pytest.mark.parametrize("names", [("forest",), pytest.param(CLOUD_BASELINES, marks=pytest.mark.slow)])
 def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Baselines that a run has are not trained again."""
@@ -82,7 +77,9 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
     (run,) = load_runs([trained])
     assert run.predictors == ("tops", *names)
     assert set(run.temperatures) == {"tops", *names} and run.temperatures["tops"] == 1.5
-    inputs = baseline_inputs(described(5), CONFIG, None)
+    packed = thor2.PointClouds.pack([cloud for each in clouds(5, 4).values() for cloud in each])
+    described: Any = SimpleNamespace(packed=packed, descriptors=describe(packed, colornet.load_default(), CONFIG))
+    inputs = baseline_inputs(described, CONFIG, None)
     for name, baseline in run.baselines.items():
         probabilities = baseline.predict(inputs)
         np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)

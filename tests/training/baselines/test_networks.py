@@ -62,8 +62,7 @@ def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int)
 
 def test_gru_matches_torch() -> None:
     model = GRU(10, 7, rngs=nnx.Rngs(0))
-    for layer, kind in ((model.input, "ih"), (model.hidden, "hh")):
-        inputs = 10 if kind == "ih" else 7
+    for layer, kind, inputs in ((model.input, "ih", 10), (model.hidden, "hh", 7)):
         layer.kernel[...] = jnp.asarray(random_tensor(f"weight_{kind}_l0", (21, inputs)).T)
         assert layer.bias is not None
         layer.bias[...] = jnp.asarray(random_tensor(f"bias_{kind}_l0", (21,)))

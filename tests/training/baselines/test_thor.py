@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,39 +48,33 @@ def library() -> dict[Any, MLP]:
     return {(name, k): random_classifier(16 * k, 4, seed) for seed, (name, k) in pairs}
 
 
-def box(
-    size: tuple[float, float, float], camera: tuple[float, float, float], edge: float | None = None
-) -> tuple[Any, Any, Any]:
+def box(size: Sequence[float], camera: Sequence[float], edge: float | None = None) -> tuple[Any, Any, Any]:
     """Return points of a normalized box, its camera and its occlusion boundary, which lies at x = edge."""
     xyz = np.array(list(itertools.product(*(np.linspace(0, side, 9) for side in size))), np.float32)
     return xyz, camera, np.zeros(len(xyz), bool) if edge is None else np.isclose(xyz[:, 0], edge)
 
 
-def inputs(*boxes: tuple[Any, Any, Any]) -> BaselineInputs:
-    clouds = [(xyz, np.zeros_like(xyz)) for xyz, _, _ in boxes]
-    cameras = np.array([camera for _, camera, _ in boxes])
-    normal = thor2.PointClouds.pack(clouds, camera=cameras, boundary=[edge for *_, edge in boxes])
-    tops = np.random.default_rng(0).random((len(boxes), 48)).astype(np.float32)
-    return BaselineInputs(normal, tops, None)
-
-
 def test_most_confident_selected_classifier_decides() -> None:
     """Boxes of 0.2 x 0.1 x 0.05 have faces of 0.005 (x), 0.01 (y) and 0.02 (z); rotated, they have two slices."""
     size = (0.2, 0.1, 0.05)
-    clouds = inputs(
+    boxes = (
         box(size, (0.1, 0.05, -3.0)),  # largest face: front and side, all slices
         box(size, (-3.0, 0.05, 0.0)),  # smallest face: side and top
         box(size, (0.1, 0.05, -3.0), edge=size[0]),  # the far end is occluded: two slices
         box(size, (0.1, 0.05, -3.0), edge=0.0),  # the near end is occluded
         box((0.1, 0.1, 0.1), (0.0, -2.0, 0.0)),  # all equal: front
     )
+    points, cameras, boundaries = zip(*boxes, strict=True)
+    clouds = [(xyz, np.zeros_like(xyz)) for xyz in points]
+    normal = thor2.PointClouds.pack(clouds, camera=np.array(cameras), boundary=boundaries)
+    inputs = BaselineInputs(normal, np.random.default_rng(0).random((5, 48)).astype(np.float32), None)
     models = library()
     selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
     arrays, run = library_arrays(models), SimpleNamespace(config=CONFIG, classes=("",) * 4)
-    probabilities = load_thor(arrays, run)(clouds)
+    probabilities = load_thor(arrays, run)(inputs)
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (names, k) in enumerate(selected):
-        tops = clouds.tops[row : row + 1, : 16 * k]
+        tops = inputs.tops[row : row + 1, : 16 * k]
         rows = [np.asarray(apply(models[name, k], tops))[0] for name in names.split()]
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
     del arrays["side-2/head/bias"]

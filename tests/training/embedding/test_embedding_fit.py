@@ -96,8 +96,7 @@ def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest
     monkeypatch.setattr(module, "OBJECTS_PER_TASK", 3)
     rendered: list[int] = []
     done: list[Any] = []
-    show = lambda *numbers: done.append(numbers)  # noqa: E731
-    sample = functools.partial(sample_objects, OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=show)
+    sample = functools.partial(sample_objects, OBJECTS, NETWORK, SMALL_CONFIG, 2, progress=lambda *n: done.append(n))
     whole = sample(directory=tmp_path / "whole")
     assert done == [(0, 8), (3, 8), (6, 8), (8, 8)]
 

@@ -16,7 +16,7 @@ from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG, untrained_embedding_run
 from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
-from written_files import ParsedPage
+from written_files import ParsedPage, files_of
 
 import thor2_jax as thor2
 from thor2_jax.files import temporary_directory
@@ -123,9 +123,8 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
     assert dataset.numbers == [5, 6, 7, 8]
     assert without_times(resumed) == without_times(whole)
-    pictures = {p.relative_to(report): p.read_bytes() for p in report.rglob("*.jpg")}
-    other = tmp_path / "whole" / "report"
-    assert pictures == {p.relative_to(other): p.read_bytes() for p in other.rglob("*.jpg")}
+    for pictures in ("frames", "confusions"):
+        assert files_of(report / pictures) == files_of(tmp_path / "whole" / "report" / pictures) != {}
     assert without_times(evaluate_toys(tmp_path / "stopped", 9)) == without_times(whole)
     assert len((tmp_path / "stopped" / "log").read_text().split()) == 9
     assert {p.name for p in report.rglob(".*")} == {LOCK, ".answers.x.jsonl"}
@@ -145,10 +144,8 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     assert report["temperatures"]["embedding"]["runs"] == 0
     confusion, confidences = np.zeros((3, 4), int), []
     recognizer = Recognizer.load(tmp_path / "run", unknown_below=0.0)
-    for number in range(5):
-        item = dataset[number]
-        answers = recognizer.recognize(item.frame)
-        answered = {answer.label: answer for answer in answers}
+    for item in dataset:
+        answered = {answer.label: answer for answer in recognizer.recognize(item.frame)}
         for label in (1, 2):
             answer = answered.get(label)  # every fourth frame has no label 2
             column = 3 if answer is None else CLASSES.index(answer.top["embedding"][0][0])
@@ -256,14 +253,13 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
     runs, report = toys(tmp_path / "log"), tmp_path / "report"
     before = (report / "answers.jsonl").read_bytes()
     other = [Run("run0", "another digest", runs[0].recognizer), runs[1]]
-    cases: dict[str, tuple[Any, Any, Any]] = {
-        "another digest": (other, ToyDataset(3), DESCRIPTION),
-        "elsewhere": (runs, ToyDataset(3), DESCRIPTION | {"path": "elsewhere"}),
-        "frames 3, not 4": (runs, ToyDataset(4), DESCRIPTION),
-        "digest1": (runs[:1], ToyDataset(3), DESCRIPTION),
-    }
-    for value, (evaluated, dataset, description) in cases.items():
-        assert_refused(f"^out: .*{value}", evaluate_dataset, evaluated, dataset, description, report)
+    for value, evaluated, n, description in (
+        ("another digest", other, 3, DESCRIPTION),
+        ("elsewhere", runs, 3, DESCRIPTION | {"path": "elsewhere"}),
+        ("frames 3, not 4", runs, 4, DESCRIPTION),
+        ("digest1", runs[:1], 3, DESCRIPTION),
+    ):
+        assert_refused(f"^out: .*{value}", evaluate_dataset, evaluated, ToyDataset(n), description, report)
     assert (report / "answers.jsonl").read_bytes() == before
     (report / "answers.jsonl").write_bytes(b"".join(before.splitlines(keepends=True)[:3]))
     assert_refused("'frame0'.*'photo0'", evaluate_toys, tmp_path, ToyDataset(3, "photo"))
@@ -312,19 +308,13 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     recognizer.probabilities = lambda table: table
     ((item, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
     assert item is frame and answers.frame == "f1" and answers.attributes == {"light": "1"}
-    assert [(i.label, i.truth, i.reason, i.occluded) for i in answers.instances] == [
-        (2, "mug", None, False),
-        (4, "can", None, True),
-        (7, "bowl", None, False),
-        (9, "mug", "too few points", False),
-        (11, "dragon", "too few points", False),
-        (12, "can", "no pixels in the label image", False),
-    ]
-    for instance, expected in zip(answers.instances, zip(tops, tops2, strict=True), strict=False):
-        if instance.reason is None:
-            np.testing.assert_allclose(instance.probabilities, expected, rtol=1e-6)
-        else:
-            assert instance.probabilities is None
+    assert [(i.label, i.truth) for i in answers.instances] == sorted(truth.items())
+    reasons = [None] * 3 + ["too few points"] * 2 + ["no pixels in the label image"]
+    assert [i.reason for i in answers.instances] == reasons
+    assert [i.label for i in answers.instances if i.occluded] == [4]
+    probabilities = [i.probabilities for i in answers.instances]
+    np.testing.assert_allclose(probabilities[:3], np.stack([tops, tops2], axis=1)[:3], rtol=1e-6)
+    assert probabilities[3:] == [None] * 3
 
 
 def test_position_is_the_median_of_the_points() -> None:

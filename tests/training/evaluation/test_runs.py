@@ -45,14 +45,13 @@ def test_folds_have_names_and_digests(tmp_path: Path) -> None:
 
 def test_incompatible_runs_are_refused(tmp_path: Path) -> None:
     first = make(tmp_path / "first")
-    cases = {
-        "different classes (c)": make(tmp_path / "classes", ("a", "b", "c")),
-        "different classes (in another order)": make(tmp_path / "order", ("b", "a")),
-        "different descriptors": make(tmp_path / "config", config=dataclasses.replace(CONFIG, alpha=0.5)),
-        "the same run": first,
-        "run.json": tmp_path,
-    }
-    for message, other in cases.items():
+    for message, other in (
+        ("different classes (c)", make(tmp_path / "classes", ("a", "b", "c"))),
+        ("different classes (in another order)", make(tmp_path / "order", ("b", "a"))),
+        ("different descriptors", make(tmp_path / "config", config=dataclasses.replace(CONFIG, alpha=0.5))),
+        ("the same run", first),
+        ("run.json", tmp_path),
+    ):
         assert_refused(f"^model: .*{other}.*{re.escape(message)}", load_runs, [first, other])
 
 
@@ -83,12 +82,11 @@ def test_incompatible_sequence_runs_are_refused(tmp_path: Path) -> None:
     make(tmp_path / "runs/s2/fold-1", seed=1)
     make(tmp_path / "runs/s3", config=dataclasses.replace(CONFIG, alpha=0.5))
     (tmp_path / "runs" / "s4").mkdir()
-    cases = {
-        ("s1", "s2"): "different folds, classifiers or baselines",
-        ("s1", "s3"): "different descriptors or colour networks",
-        ("s1", "s4"): "s4",
-        ("s1", "s5"): "has no run for s5",
-    }
-    for sequences, message in cases.items():
-        frames = [f"{sequence}/frame" for sequence in sequences]
+    for other, message in (
+        ("s2", "different folds, classifiers or baselines"),
+        ("s3", "different descriptors or colour networks"),
+        ("s4", "s4"),
+        ("s5", "has no run for s5"),
+    ):
+        frames = ["s1/frame", f"{other}/frame"]
         assert_refused(f"^model: .*{message}", load_sequence_runs, tmp_path / "runs", frames)

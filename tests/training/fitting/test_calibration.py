@@ -15,7 +15,7 @@ from small_runs import SMALL_CONFIG, untrained_embedding_run
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.model.fusion import Calibration, with_temperature
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Cloud
@@ -30,14 +30,10 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, 
 NETWORK = colornet.load_default()
 
 
-def source(views: int) -> MemoryViews:
-    return MemoryViews({name: random_clouds(k, [90] * views) for k, name in enumerate(("brick", "stick"))}, CONFIG)
-
-
 @pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])
 def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
-    views = source(2)
+    views = MemoryViews({"brick": random_clouds(0, [90] * 2), "stick": random_clouds(1, [90] * 2)}, CONFIG)
     samples, _ = sample_views(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 3, rngs=nnx.Rngs(0))  # the third class has no samples
     rows = np.array([7, 0, 7, 3, 5])
@@ -69,7 +65,6 @@ def test_the_temperature_minimizes_the_likelihood_of_sklearn() -> None:
     rng = np.random.default_rng(1)
     logits, truth = rng.normal(0, 3, (50, 4)), rng.integers(0, 4, 50)
     probabilities = softmax(logits, axis=1)
-    np.testing.assert_allclose(with_temperature(probabilities, 2.5), softmax(logits / 2.5, axis=1), rtol=1e-6)
 
     def likelihood(temperature: float) -> float:
         return float(log_loss(truth, softmax(logits / temperature, axis=1), labels=range(4)))

@@ -80,9 +80,8 @@ def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fi
     mislabelled = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
     curve: list[EpochMetrics] = []
     model, best = fitted(samples=mislabelled, held_out=held_out, log=curve.append)
-    correct = answers(model, separable)[held_out] == 0
     assert max(metrics.held_out_accuracy or 0 for metrics in curve) == curve[best - 1].held_out_accuracy
-    assert curve[best - 1].held_out_accuracy == pytest.approx(correct.mean())
+    assert curve[best - 1].held_out_accuracy == pytest.approx((answers(model, separable)[held_out] == 0).mean())
     final = curve[-1]
     assert final.accuracy > 0.8 and final.held_out_accuracy == pytest.approx((separable.label[held_out] == 0).mean())
 
@@ -137,21 +136,16 @@ def test_invalid_options_are_refused_by_name() -> None:
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 
-def metrics(epoch: int) -> EpochMetrics:
-    return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
-
-
 def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
     """Only the epochs of one classifier and fold are discarded."""
     path = tmp_path / "metrics.jsonl"
-    train_run.append_metrics(path, 0, "ce", metrics(1))
+    train_run.append_metrics(path, 0, "ce", EpochMetrics(1, 1.0, 0.5, 1000.0))
     with path.open("a") as file:
         file.write('{"fold": 0, "cl')
     assert [row["epoch"] for row in train_run.read_metrics(path)] == [1]
     train_run.discard_later_epochs(path, 0, "ce", 1)
-    train_run.append_metrics(path, 0, "ce", metrics(2))
-    train_run.append_metrics(path, 0, "tops", metrics(2))
-    train_run.append_metrics(path, 1, "ce", metrics(2))
+    for fold, classifier in ((0, "ce"), (0, "tops"), (1, "ce")):
+        train_run.append_metrics(path, fold, classifier, EpochMetrics(2, 0.5, 0.5, 1000.0))
     assert [row["epoch"] for row in train_run.read_metrics(path)] == [1, 2, 2, 2]
     train_run.discard_later_epochs(path, 0, "ce", 1)
     kept = [(row["fold"], row["classifier"], row["epoch"]) for row in train_run.read_metrics(path)]

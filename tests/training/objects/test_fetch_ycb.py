@@ -142,8 +142,7 @@ def test_files_of_the_user_stay(server: Any, tmp_path: Path) -> None:
 
 def test_archive_writes_only_into_its_folder(server: Any, tmp_path: Path) -> None:
     names = ("../../google_16k/evil.txt", "/google_16k/absolute.txt", "evil.txt", "google_16k/..")
-    evil = dict.fromkeys(names, b"1")
-    server.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files() | evil)}
+    server.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files() | dict.fromkeys(names, b"1"))}
     fetch_ycb([NAME], tmp_path / "meshes", url=server.url)
     written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")}
     assert written <= {f"meshes/{NAME}/evil.txt", f"meshes/{NAME}/absolute.txt"}

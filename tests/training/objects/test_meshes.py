@@ -118,6 +118,9 @@ def colored(vertices: np.ndarray) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
 
 
+ASCII_PLY = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
+
+
 def check_refused(path: Path, message: str) -> None:
     assert_refused(f"{path.name}.*{message}", load_mesh, path)
 
@@ -126,21 +129,17 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
     check_refused(tmp_path / "missing.glb", "no such file")
     (tmp_path / "mesh.stl").touch()
     check_refused(tmp_path / "mesh.stl", ".glb, .obj, .ply")
-    trimesh.Trimesh(QUAD, QUAD_FACES, process=False).export(tmp_path / "grey.ply")
-    check_refused(tmp_path / "grey.ply", "no texture")
-    trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)).export(tmp_path / "points.ply")
-    check_refused(tmp_path / "points.ply", "no faces")
-    colored(QUAD * 1000).export(tmp_path / "millimetres.ply")
-    check_refused(tmp_path / "millimetres.ply", "longest side 100 .*millimetres")
-    colored(QUAD * 0).export(tmp_path / "nothing.ply")
-    check_refused(tmp_path / "nothing.ply", "longest side 0")
-    for value in (np.nan, np.inf):
-        broken = QUAD.copy()
-        broken[1, 2] = value
-        colored(broken).export(tmp_path / "broken.ply")
-        check_refused(tmp_path / "broken.ply", "1 vertices are not finite")
-    text = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
-    (tmp_path / "far.ply").write_bytes(text.replace(b"3 0 1 2", b"3 0 1 -1"))
+    for mesh, message in (
+        (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
+        (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
+        (colored(QUAD * 1000), "longest side 100 .*millimetres"),
+        (colored(QUAD * 0), "longest side 0"),
+        (colored(QUAD + [[np.nan], [0], [0], [0]]), "1 vertices are not finite"),
+        (colored(QUAD + [[np.inf], [0], [0], [0]]), "1 vertices are not finite"),
+    ):
+        mesh.export(tmp_path / "mesh.ply")
+        check_refused(tmp_path / "mesh.ply", message)
+    (tmp_path / "far.ply").write_bytes(ASCII_PLY.replace(b"3 0 1 2", b"3 0 1 -1"))
     check_refused(tmp_path / "far.ply", "invalid vertex indices")
 
 
@@ -155,8 +154,7 @@ def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
 
 
 def test_a_ply_without_its_texture_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    text = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
-    (tmp_path / "quad.ply").write_bytes(text.replace(b"1.0\n", b"1.0\ncomment TextureFile absent.png\n", 1))
+    (tmp_path / "quad.ply").write_bytes(ASCII_PLY.replace(b"1.0\n", b"1.0\ncomment TextureFile absent.png\n", 1))
     # pytest's own handlers keep the logging module from printing.
     with mock.patch.object(logging.getLogger(), "handlers", []):
         check_refused(tmp_path / "quad.ply", "'absent.png' is missing")
@@ -242,10 +240,8 @@ def put(folder: Path, *names: str) -> None:
 
 def test_finding_meshes(tmp_path: Path) -> None:
     put(tmp_path, *"mug.glb notes.txt can/can.ply can/can.png box/textured.obj box/other.glb none/a.txt".split())
-    meshes = find_meshes(tmp_path)
     expected = {"box": "box/textured.obj", "can": "can/can.ply", "mug": "mug.glb"}
-    assert {name: path.relative_to(tmp_path).as_posix() for name, path in meshes.items()} == expected
-    assert list(meshes) == sorted(meshes)
+    assert list(find_meshes(tmp_path).items()) == [(name, tmp_path / path) for name, path in expected.items()]
     put(tmp_path, "two/a.ply", "two/b.ply")
     assert_refused("2 mesh files .*keep one", find_meshes, tmp_path)
     by_class = find_meshes(tmp_path, {"soup": "can", "cup": "mug", "again": "mug"})

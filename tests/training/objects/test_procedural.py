@@ -9,13 +9,6 @@ from training.rendering.camera import RayCaster, camera_pose, render_view
 OBJECTS = [procedural_object(seed) for seed in range(60)]
 
 
-def test_a_seed_determines_the_object() -> None:
-    for seed in (0, 1, 13, 123_456):
-        one, other = procedural_object(seed), procedural_object(seed)
-        assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
-        assert all(np.array_equal(a, b) for a, b in zip(one.textures, other.textures, strict=True))
-
-
 def test_objects_stand_and_have_a_household_size() -> None:
     for mesh in OBJECTS:
         assert np.isfinite(mesh.vertices).all() and mesh.faces.max() < len(mesh.vertices)

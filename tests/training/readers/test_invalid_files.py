@@ -102,6 +102,9 @@ def camera(**changes: Any) -> dict[str, Any]:
     return {"1": {"cam_K": K, "depth_scale": 0.1, **changes}}
 
 
+POSES = "42/images/000000_poses.yaml"
+
+
 def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") -> dict[str, Any]:
     return {"image_filename": file, "answer": answer, "target": target}
 
@@ -131,26 +134,21 @@ def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") ->
         ("ocid", "names.json", {"seq35": "mug"}, "seq35 is 'mug';"),
         ("ocid", "names.json", {"seq35": ["mug", 7]}, "seq35 is ['mug', 7];"),
         ("ocid", "names.json", {"seq35": [""]}, "seq35 is [''];"),
-        ("ocid", "names.json", [], "lists no frame"),
-        ("ocid", "names.json", [vlg_item(file="seq99,b.png")], "lists no frame"),
+        *(("ocid", "names.json", items, "lists no frame") for items in ([], [vlg_item(file="seq99,b.png")])),
         ("ocid", "names.json", [{"image_filename": "seq36,b.png", "answer": 3}], "item 0 is"),
         ("ocid", "names.json", [vlg_item(), vlg_item(target="")], "item 1 is"),
-        ("ocid", "names.json", [vlg_item("mug")], "item 0 is"),
-        ("ocid", "names.json", [vlg_item(True)], "item 0 is"),
+        *(("ocid", "names.json", [vlg_item(answer)], "item 0 is") for answer in ("mug", True)),
         ("ocid", "names.json", [vlg_item(file="seq36")], "item 0 is"),
         ("ocid", "names.json", [7], "item 0 is 7"),
         ("ocid", "names.json", [vlg_item(), vlg_item(target="bowl")], "the names 'mug' and 'bowl'"),
-        ("uwis", "42/images/000000_poses.yaml", "mug: {label: 1", "does not hold"),
-        ("uwis", "42/images/000000_poses.yaml", "- mug\n", "does not hold"),
-        ("uwis", "42/images/000000_poses.yaml", "mug: 1\n", "does not hold"),
-        ("uwis", "42/images/000000_poses.yaml", "mug: {pose: [1, 2, 3]}\n", "does not hold"),
-        ("uwis", "42/images/000000_poses.yaml", "mug: {label: [1]}\n", "label [1] has the name 'mug'"),
-        ("uwis", "42/images/000000_poses.yaml", "mug: {label: true}\n", "label True has the name 'mug'"),
-        ("uwis", "42/images/000000_poses.yaml", "12: {label: 1}\n", "label 1 has the name 12"),
-        ("uwis", "42/images/000000_poses.yaml", "a: {label: 1}\nb: {label: 1}\n", "'a' and 'b'"),
+        *(("uwis", POSES, content, "does not hold") for content in ("mug: {label: 1", "- mug\n", "mug: 1\n")),
+        ("uwis", POSES, "mug: {pose: [1, 2, 3]}\n", "does not hold"),
+        ("uwis", POSES, "mug: {label: [1]}\n", "label [1] has the name 'mug'"),
+        ("uwis", POSES, "mug: {label: true}\n", "label True has the name 'mug'"),
+        ("uwis", POSES, "12: {label: 1}\n", "label 1 has the name 12"),
+        ("uwis", POSES, "a: {label: 1}\nb: {label: 1}\n", "'a' and 'b'"),
         ("folder", "b/labels.json", {}, "is invalid"),
-        ("folder", "b/labels.json", {"labels": ["mug"]}, "is invalid"),
-        ("folder", "b/labels.json", {"labels": {"1.0": "mug"}}, "is invalid"),
+        *(("folder", "b/labels.json", {"labels": names}, "is invalid") for names in (["mug"], {"1.0": "mug"})),
         ("folder", "b/labels.json", {"labels": {"1": None}}, "name None"),
         ("folder", "b/labels.json", {"labels": {"1": "mug", "01": "bowl"}}, "'mug' and 'bowl'"),
         ("folder", "b/labels.json", {"labels": {"7": "mug", "200": "can"}}, "has the labels 7, 200, but"),

@@ -7,12 +7,13 @@ import pytest
 import trimesh
 from refusals import assert_refused
 from rendered_objects import full_image
+from segmentation_scenes import surface
 
 from thor2_jax.frames.frames import Intrinsics
-from training.objects.mesh import TexturedMesh
 from training.rendering.camera import DISTANCE, Camera, RayCaster, camera_pose, pixel_rays, render_view, view_angles
 
 CAMERA = Camera.from_field_of_view(161, 121, 30.0)
+RED = (200, 30, 40)
 
 
 def test_default_views_are_the_papers() -> None:
@@ -45,11 +46,6 @@ def test_camera_pose(azimuth: float, polar: float) -> None:
     assert pose[3].tolist() == [0, 0, 0, 1] and (pose[2, 1] < 0 or polar in (0, math.pi))
 
 
-def painted(shape: trimesh.Trimesh, color: tuple[int, int, int] = (200, 30, 40)) -> TexturedMesh:
-    colors = np.tile(np.array(color, np.uint8), (len(shape.faces), 3, 1))
-    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
-
-
 def intersect_triangles(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Return the depth along each ray with the algorithm of Moeller and Trumbore in float64; 0 without a hit."""
     nearest = np.full(len(rays), np.inf)
@@ -76,7 +72,7 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
     shape.apply_translation([0.02, -0.01, 0.03])
     pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)
-    view = render_view(RayCaster([painted(shape)]), pose, camera)
+    view = render_view(RayCaster([surface(shape, RED)]), pose, camera)
     assert view.depth.size < camera.width * camera.height / 2
     _, depth = full_image(view, camera)
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
@@ -86,13 +82,13 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
 
 
 def test_an_object_outside_the_image_leaves_it_empty() -> None:
-    mesh = painted(trimesh.creation.box([0.1] * 3))
+    mesh = surface(trimesh.creation.box([0.1] * 3), RED)
     for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):
         view = render_view(RayCaster([mesh]), camera_pose(0.0, 1.5, np.array(centre)), CAMERA)
         assert not view.depth.any() and not view.color.any()
 
 
 def test_camera_inside_the_bounding_box_sees_the_whole_image() -> None:
-    view = render_view(RayCaster([painted(trimesh.creation.box([1.0] * 3))]), np.eye(4), CAMERA)
+    view = render_view(RayCaster([surface(trimesh.creation.box([1.0] * 3), RED)]), np.eye(4), CAMERA)
     assert view.depth.shape == (CAMERA.height, CAMERA.width) and set(np.unique(view.depth)) == {500}
     assert view.corner == (0, 0) and view.intrinsics == CAMERA.intrinsics

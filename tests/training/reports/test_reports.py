@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from commands import run_thor2
-from failures import Interrupted
+from failures import Interrupted, stop_when
 from PIL import Image
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG
@@ -110,14 +110,9 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": fit, "config": SMALL_CONFIG}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
-    for last in ("fit tops", "recognize scenes"):
-
-        def interrupt(stage: str, *_: object) -> None:
-            if stage.endswith(last):  # noqa: B023
-                raise Interrupted
-
+    for stage, step in (("stage 4 of 7: fit tops", 13), ("stage 7 of 7: recognize scenes", 1)):
         with pytest.raises(Interrupted):
-            demo.run_demo(tmp_path, 1, interrupt)
+            demo.run_demo(tmp_path, 1, stop_when(stage, step))
     assert not (tmp_path / "report.html").exists()
     assert_refused("^out: .*seed 1, not 2", demo.run_demo, tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}

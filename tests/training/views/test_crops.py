@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -164,12 +165,11 @@ def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset, monkeypatc
     before, first = files_of(directory), min(directory.glob("*.npz"))
     first.write_bytes(first.read_bytes()[:-1])
     assert_refused("is missing or damaged", dataset.read_crops, 0, SIZE)
-    written = []
-    encode = crops_module._encode
-    monkeypatch.setattr(crops_module, "_encode", lambda crops: written.append(len(crops)) or encode(crops))
+    encode = mock.Mock(wraps=crops_module._encode)
+    monkeypatch.setattr(crops_module, "_encode", encode)
     again = render_command(meshes, dataset.directory)
     assert run_thor2(*again, SIZE) == 0
-    assert len(written) == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
+    assert encode.call_count == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
     assert files_of(directory) == before
     assert run_thor2(*again, 0) == 2 and run_thor2(*again, 2 * SIZE) == 2
 
@@ -183,11 +183,10 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
-    content = json.loads(manifest.read_text())
-    manifest.write_text(json.dumps({**content, "dataset": "0"}))
-    assert_refused("crops of other views", plain.read_crops, 0, 8)
-    manifest.write_text("[]")
-    assert_refused("manifest.json is damaged", plain.read_crops, 0, 8)
+    other = json.loads(manifest.read_text()) | {"dataset": "0"}
+    for content, message in ((other, "crops of other views"), ([], "manifest.json is damaged")):
+        manifest.write_text(json.dumps(content))
+        assert_refused(message, plain.read_crops, 0, 8)
 
 
 def test_reduced_crops_are_means_of_areas() -> None:

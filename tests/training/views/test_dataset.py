@@ -40,29 +40,23 @@ OBJECTS = {name: builtin_objects()[name] for name in NAMES}
 JOB = RenderJob(OBJECTS, 180, 90)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _on_a_cpu() -> Iterator[None]:
-    """An accelerator may swap nearly equal sides of a cloud that it normalizes in a batch instead of alone."""
-    with jax.default_device(jax.devices("cpu")[0]):
-        yield
-
-
 """6 views an object: of 4 and 2 with the shards of these tests."""
 CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 
 
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
+@pytest.fixture(scope="module", autouse=True)
+def small_shards_on_a_cpu() -> Iterator[None]:
+    """An accelerator may swap nearly equal sides of a cloud that it normalizes in a batch instead of alone."""
+    with jax.default_device(jax.devices("cpu")[0]), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
+        yield
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of a job that nothing interrupted."""
     out = tmp_path_factory.mktemp("whole") / "deep" / "views"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
-        render_dataset(JOB, out)
+    render_dataset(JOB, out)
     return out
 
 
@@ -176,23 +170,22 @@ def test_another_job_is_refused(copied: Path) -> None:
     ball, screwdriver = OBJECTS["tennis_ball"], OBJECTS["screwdriver"]
     moved = dataclasses.replace(ball, vertices=ball.vertices + 1e-3)
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
-    for changes, message in [
+    for changes, message in (
         ({"azimuth_step": 90}, "azimuth_step 180.0, not 90.0"),
         ({"polar_step": 45}, "polar_step 90.0, not 45.0"),
         ({"meshes": OBJECTS | {"tennis_ball": moved}}, r"objects\[\d\].mesh "),
         ({"meshes": OBJECTS | {"screwdriver": painted}}, r"objects\[\d\].mesh "),
         ({"meshes": OBJECTS | {"apple": moved}}, r"objects\[2\] null, not \{"),
         ({"meshes": dict(reversed(OBJECTS.items()))}, r"objects\[0\].name "),
-    ]:
+    ):
         assert_refused(f"{copied} .*{message}", render_dataset, dataclasses.replace(JOB, **changes), copied)
         assert files_of(copied) == before
 
 
 def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 8)
-    ball = {"ball": resized(1)}
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
-    job = RenderJob(ball, 90, 90, light, 1)
+    job = RenderJob({"ball": resized(1)}, 90, 90, light, 1)
     dataset = render_dataset(job, out)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
     assert [shard.views for shard in dataset.shards] == [6] * 6
@@ -200,7 +193,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
     assert views.view.tolist() == [2, 2, 2, 3, 3, 3] and views.copy.tolist() == [0, 1, 2] * 2
     for changes in ({"augmentations": None}, {"seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
         assert_refused("variations", render_dataset, dataclasses.replace(job, **changes), out)
-    off = render_dataset(RenderJob(ball, 90, 90, Augmentations(), 2), tmp_path / "off")
+    off = render_dataset(dataclasses.replace(job, augmentations=Augmentations(), seed=2), tmp_path / "off")
     assert len(off) == 12 and off.record["job"]["variations"] is None
     assert_refused("variations null, not {", render_dataset, job, tmp_path / "off")
 
@@ -220,15 +213,14 @@ def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatc
 def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "views"
     (tmp_path / "bad.ply").write_text("not a mesh")
-    cases: list[tuple[dict[str, Any], str]] = [
+    for changes, message in (
         ({"meshes": {}}, "meshes is empty"),
         ({"azimuth_step": 0}, "azimuth_step"),
         ({"seed": -1}, "seed is -1"),
         ({"meshes": {**OBJECTS, "z": tmp_path / "bad.ply"}}, "bad.ply"),
         ({"meshes": {"speck": resized(0.1)}}, "object 'speck'"),
         ({"meshes": {"door": resized(20)}}, "object 'door' .*2.32 m"),
-    ]
-    for changes, message in cases:
+    ):
         assert_refused(message, render_dataset, dataclasses.replace(JOB, **changes), out)
         assert not out.exists()
 
@@ -335,10 +327,9 @@ def check_refused(directory: Path, message: str) -> None:
 def test_incomplete_and_other_datasets_are_refused(copied: Path) -> None:
     """The message has the name of the file and the reason; tests/fuzz/test_tables.py has all kinds of damage."""
     path = copied / "0000-0001.safetensors"
-    shutil.copy(copied / "0000-0000.safetensors", path)
-    check_refused(copied, "0000-0001.safetensors is missing or damaged")
-    path.unlink()
-    check_refused(copied, "0000-0001.safetensors is missing or damaged")
+    for damage in (lambda: shutil.copy(copied / "0000-0000.safetensors", path), path.unlink):
+        damage()
+        check_refused(copied, "0000-0001.safetensors is missing or damaged")
     assert len(ViewDataset.open(copied).read(0)) == 4
     manifest, path = ViewDataset.open(copied).manifest, copied / "manifest.json"
     Manifest({**manifest.job, "descriptor_version": 99}, manifest.shards).write(copied)

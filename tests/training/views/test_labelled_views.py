@@ -26,8 +26,8 @@ def instance(seed: int, n: int = 50) -> PreparedInstance:
     return PreparedInstance(1, points, rng.integers(0, 256, (n, 3), np.uint8), boundary, bool(seed % 2))
 
 
-def rendered(bowls: int = 30, mugs: int = 3) -> MemoryViews:
-    clouds = [(view.points, view.colors) for view in map(instance, range(bowls + mugs))]
+def rendered(bowls: int = 30) -> MemoryViews:
+    clouds = [(view.points, view.colors) for view in map(instance, range(bowls + 3))]
     return MemoryViews({"bowl": clouds[:bowls], "mug": clouds[bowls:]}, CONFIG)
 
 
