@@ -110,8 +110,7 @@ def occlusion_by_loop(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, 
 def test_against_a_loop_over_the_pixels(seed: int) -> None:
     """The instances fill the image, each at another depth and with a rough surface."""
     rng = np.random.default_rng(seed)
-    shape = (61, 83)
-    count = 9
+    shape, count = (61, 83), 9
     centres = rng.uniform(0, 1, (count, 2)) * shape
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     wobble = gaussian_filter(rng.normal(size=(count, *shape)), (0, 3, 3)) * 60
