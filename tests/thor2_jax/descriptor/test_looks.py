@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import assert_refused
-from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -141,9 +140,8 @@ def test_descriptors_and_statistics_are_those_of_each_look() -> None:
     assert described.statistics.shape[:2] == described.shape == (2, 4)
     np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CONFIG).tops2, atol=1e-4)
     for row in range(8):
-        points, colors = look(aligned, row // 4, row % 4, 4)
         # The cloud of the look alone: points of the rim are not there, instead of masked.
-        alone = dataclasses.replace(thor2.PointClouds.pack([(points, colors)]), camera=aligned.camera[row : row + 1])
+        alone = thor2.PointClouds.pack([look(aligned, row // 4, row % 4, 4)])
         descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
         expected = thor2.describe_aligned(alone, NETWORK, CONFIG)
         np.testing.assert_allclose(descriptors.tops2, expected.tops2[0], atol=1e-4)
@@ -169,12 +167,11 @@ def test_fused_probabilities_are_geometric_means() -> None:
 
 
 def test_statistics_of_a_cloud() -> None:
-    ((points, colors),) = random_clouds(0, [300])
-    clouds = thor2.PointClouds.pack([(points, colors)])
-    aligned = thor2.align(clouds, CONFIG)
+    colors = LONG[1]
+    aligned = thor2.align(thor2.PointClouds.pack([LONG]), CONFIG)
     described = strips(aligned, NETWORK, CONFIG)
     values = np.asarray(cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), aligned, described))[0]
-    scalars = [1, 0.5, 0.25, 0.75, np.sqrt(300) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
+    scalars = [1, 0.5, 0.25, 0.75, np.sqrt(404) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
     region_points = np.asarray(described.color).sum(axis=(0, 1, 2))
     expected = [*scalars, *np.sqrt(region_points / region_points.sum())]
     assert len(scalars) == N_SCALARS
@@ -199,12 +196,9 @@ def test_balanced_histograms_are_those_of_colour_science() -> None:
 
 
 def test_side_lengths_are_those_before_the_turn() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.random((300, 3)) * (0.2, 0.1, 0.05)
-    clouds = thor2.PointClouds.pack([(points.astype(np.float32), np.zeros((300, 3), np.uint8))])
-    normal = np.asarray(thor2.view_normalize(clouds, CONFIG).points)[0]
-    sides = side_lengths(thor2.align(clouds, CONFIG), CONFIG.alpha)[0]
-    np.testing.assert_allclose(sides, np.sort(np.ptp(normal, axis=0))[::-1], atol=1e-4)
+    extents = np.ptp(thor2.view_normalize(PACKED, CONFIG).points, axis=1)  # padding lies in a corner of the box
+    sides = side_lengths(thor2.align(PACKED, CONFIG), CONFIG.alpha)
+    np.testing.assert_allclose(sides, np.sort(extents)[:, ::-1], atol=1e-4)
 
 
 def test_statistics_of_one_color_have_gradients() -> None:

@@ -191,17 +191,10 @@ def test_definitions_of_messages_are_not_compiled(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("stored", "computed", "message"),
-    [
-        ("data", "timestamp AS ('x')", "damaged"),
-        ("data", "timestamp AS (NULL)", "damaged"),
-        ("timestamp", "data AS ('x')", "damaged"),
-        ("timestamp", "data AS (zeroblob(1000000))", "too big"),
-    ],
+    "computed", ["timestamp AS ('x')", "timestamp AS (NULL)", "data AS ('x')", "data AS (zeroblob(1000000))"]
 )
-def test_columns_of_other_types_and_sizes(
-    tmp_path: Path, stored: str, computed: str, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columns_of_other_types_and_sizes(tmp_path: Path, computed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored = "data" if computed.startswith("timestamp") else "timestamp"
     path = write_recording(tmp_path / "folder", FRAMES[:1])
     with sqlite3.connect(path / "folder.db3") as database:
         database.execute("ALTER TABLE messages RENAME TO old")
@@ -209,7 +202,7 @@ def test_columns_of_other_types_and_sizes(
         database.execute(f"INSERT INTO messages(topic_id, {stored}) SELECT topic_id, {stored} FROM old")
     database.close()
     monkeypatch.setattr(bags, "MAX_DECOMPRESSED", 2**18)
-    assert_refused(message, frames_of, path)
+    assert_refused("too big" if "zeroblob" in computed else "damaged", frames_of, path)
 
 
 def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
