@@ -122,7 +122,6 @@ def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) ->
 @pytest.mark.slow
 @given(aligned=batches(laws.aligned_clouds(CONFIG, max_points=256, margin=0.2)), factor=st.sampled_from([0.02, 0.01]))
 def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
-    def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
-        return thor2.describe_aligned(clouds, NETWORK, config)
-
-    laws.assert_relaxation_converges(describe_at, aligned, NETWORK, CONFIG, factor)
+    laws.assert_relaxation_converges(
+        lambda clouds, config: thor2.describe_aligned(clouds, NETWORK, config), aligned, NETWORK, CONFIG, factor
+    )

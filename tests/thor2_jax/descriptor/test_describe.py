@@ -127,19 +127,18 @@ def test_a_stream_against_one_batch(count: int) -> None:
 
 
 def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
-    read = 0
+    read: list[Cloud] = []
 
-    def counted() -> Iterator[Cloud]:
-        nonlocal read
+    def recorded() -> Iterator[Cloud]:
         for cloud in stream(40):
-            read += 1
+            read.append(cloud)
             yield cloud
 
-    batches = describe.describe_stream(counted(), NETWORK, CLOSED, capacity=512, batch=4)
-    assert read == 0
+    batches = describe.describe_stream(recorded(), NETWORK, CLOSED, capacity=512, batch=4)
+    assert len(read) == 0
     for done in range(1, 6):
         next(batches)
-        assert read == 4 * (done + 1)
+        assert len(read) == 4 * (done + 1)
 
 
 def test_bad_input_of_a_stream() -> None:

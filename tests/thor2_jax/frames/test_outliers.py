@@ -1,4 +1,4 @@
-"""The voxel grid against a dictionary of cubes, and outlier removal against loops and grids labelled by SciPy."""
+"""The voxel grid against cubes by NumPy, and outlier removal against loops and grids labelled by SciPy."""
 
 import math
 import re
@@ -18,14 +18,11 @@ CAMERA = Intrinsics(611.3, 620.0, 10.0, 8.0)
 # The voxel grid
 
 
-def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+def means_by_cube(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the means of points and values in each cube, in lexicographic order and float64."""
     points, values = points.astype(np.float64), values.astype(np.float64)
-    low = points.min(axis=0) - size / 2
-    cubes: dict[tuple[int, ...], list[int]] = {}
-    for i, point in enumerate(points):
-        cubes.setdefault(tuple(math.floor((point[k] - low[k]) / size) for k in range(3)), []).append(i)
-    members = [cubes[key] for key in sorted(cubes)]
+    cubes = np.floor((points - (points.min(axis=0) - size / 2)) / size)
+    members = [(cubes == cube).all(axis=1) for cube in np.unique(cubes, axis=0)]
     return np.array([points[m].mean(axis=0) for m in members]), np.array([values[m].mean(axis=0) for m in members])
 
 
@@ -38,7 +35,7 @@ def test_means_of_cubes(count: int, size: float) -> None:
     before = points.copy(), colors.copy()
     means = voxel_downsample(points, colors, size)
     np.testing.assert_array_equal((points, colors), before)
-    for mean, expected in zip(means, by_dictionary(points, colors, size), strict=True):
+    for mean, expected in zip(means, means_by_cube(points, colors, size), strict=True):
         np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-15)
 
 

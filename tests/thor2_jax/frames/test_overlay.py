@@ -89,25 +89,17 @@ def test_outlines_lie_on_the_inner_edge_of_touching_masks(tmp_path: Path, boxes:
 
 def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> None:
     labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (244, 320), (248, 320)], 40)
-    answers = [
-        named(1, "mug"),
-        named(2, "bowl", occluded=True),
-        Recognition(label=3, reason="too few points"),
-        Recognition(label=4, occluded=True, reason="too few points"),
-        Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
-        named(6, "pitcher"),
-        Recognition(label=7, name="spoon"),
-    ]
-    drawn(photo(), labels, answers, tmp_path / "a.png")
-    assert [text for _, text in boxes] == [
-        "mug 0.76\nTOPS2",
-        "bowl 0.76\nTOPS2, occluded",
-        "unrecognized",
-        "unrecognized\noccluded",
-        "plate 1.00\nTOPS",
-        "pitcher 0.76\nTOPS2",
-        "spoon",
-    ]
+    answers = {
+        "mug 0.76\nTOPS2": named(1, "mug"),
+        "bowl 0.76\nTOPS2, occluded": named(2, "bowl", occluded=True),
+        "unrecognized": Recognition(label=3, reason="too few points"),
+        "unrecognized\noccluded": Recognition(label=4, occluded=True, reason="too few points"),
+        "plate 1.00\nTOPS": Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
+        "pitcher 0.76\nTOPS2": named(6, "pitcher"),
+        "spoon": Recognition(label=7, name="spoon"),
+    }
+    drawn(photo(), labels, list(answers.values()), tmp_path / "a.png")
+    assert [text for _, text in boxes] == list(answers)
     areas = [(right + 1 - left) * (bottom + 1 - top) for (left, top, right, bottom), _ in boxes]
     assert min(areas) > 0
     assert sum(areas) == (~outside(boxes, labels.shape)).sum()  # smaller if labels overlap or leave the picture

@@ -54,9 +54,8 @@ def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
     with bag_writer(path) as write:
         files.write_images(write, FRAMES[0], camera=False)
     assert_refused("camera_topic", Bag(path).__enter__)
-    with Bag(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000) as bag:
-        (recorded,) = bag.frames()
-        assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
+    (recorded,) = frames_of(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000)
+    assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
 
 
 def test_rectified_images_have_the_camera_of_the_projection(tmp_path: Path) -> None:
@@ -127,8 +126,7 @@ def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
 )
 def test_decompression_is_limited(tmp_path: Path, name: str, compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_recording(tmp_path / name, FRAMES[:1], compression=compression)
-    with Bag(path) as bag:
-        np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
+    np.testing.assert_array_equal(frames_of(path)[0].read().depth, FRAMES[0].depth)
     monkeypatch.setattr(bags, "MAX_DECOMPRESSED", 2**16)
     monkeypatch.setattr(bags, "MAX_RATIO", 1)
     assert_refused("more than 65536 bytes", frames_of, path)
@@ -186,8 +184,7 @@ def test_definitions_of_messages_are_not_compiled(tmp_path: Path, name: str) -> 
     content = file.read_bytes()
     assert b"uint32 height" in content
     file.write_bytes(content.replace(b"uint32 height", b"import height"))
-    with Bag(path) as bag:
-        np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
+    np.testing.assert_array_equal(frames_of(path)[0].read().depth, FRAMES[0].depth)
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,11 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
     np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
 
 
-def test_only_pieces_of_one_known_object_are_merged() -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
+def test_two_or_three_pieces_of_one_known_object_are_merged() -> None:
+    quantiles = np.quantile(np.nonzero(TRUTH)[1], [0.45, 0.9])
+    three = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), quantiles), 0)
+    for pieces in (TRUTH, three):
+        np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
     np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
 
 
@@ -50,18 +53,10 @@ def test_a_piece_is_divided_although_all_of_it_resembles_one_object() -> None:
     apart = knows(TRUTH == 1, TRUTH == 2)
 
     def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        whole = int((TRUTH > 0).sum())
-        sizes = [int((frame.label_image == 1).sum()) for frame in frames]
-        return [("0", 0.985) if n == whole else each for n, each in zip(sizes, apart(frames), strict=True)]
+        are_whole = [(frame.label_image == 1).sum() == ONE_PIECE.sum() for frame in frames]
+        return [("0", 0.985) if whole else each for whole, each in zip(are_whole, apart(frames), strict=True)]
 
     assert (best_overlaps(segment_known(FRAME, ONE_PIECE, recognize), TRUTH) > 0.9).all()
-
-
-def test_more_than_two_pieces_of_one_object_are_merged() -> None:
-    column = np.nonzero(TRUTH)[1]
-    pieces = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), np.quantile(column, [0.45, 0.9])), 0)
-    assert pieces.max() == 3
-    np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
