@@ -42,11 +42,8 @@ def test_pairs_equal_those_of_all_pairs(seed: int) -> None:
         images += [StampedImage(is_color, stamp, stamp + late, None) for stamp in stamps[is_color]]
     images.sort(key=lambda image: image.arrival)
     tolerance = 15 * MS
-    expected = []
-    for color in stamps[True]:
-        nearest = min(stamps[False], key=lambda depth: abs(depth - color))
-        if abs(nearest - color) <= tolerance:
-            expected.append((color, nearest))
+    nearest = [(color, min(stamps[False], key=lambda depth: abs(depth - color))) for color in stamps[True]]
+    expected = [(color, depth) for color, depth in nearest if abs(depth - color) <= tolerance]
     pairs, counts = pairs_of(images, tolerance)
     assert pairs == expected
     assert (counts.color, counts.depth, counts.pairs) == (60, 60, len(expected))
