@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import expit
 from slow_tier import slow
 from small_clouds import aligned_cloud
 
@@ -37,17 +38,14 @@ def test_points_outside_the_hard_slices_are_left_out() -> None:
 
 
 def test_weights_of_intervals_are_differences_of_sigmoids() -> None:
-    at = np.linspace(0, 1.2, 500)
+    at = np.linspace(0, 1.2, 500)[:, None]
     lower, upper = (0.1 * (np.arange(7) + k) for k in (0, 1))
     for temperature in (0.003, 0.05, 1.0):
-
-        def below(edge: np.ndarray, temperature: float = temperature) -> np.ndarray:
-            return 1 / (1 + np.exp(-(at[:, None] - edge) / temperature))
-
-        expected = np.where(lower > 0, below(lower), 1) - below(upper)
-        weights = np.exp(interval_log_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
+        above_lower, above_upper = (expit((at - edges) / temperature) for edges in (lower, upper))
+        expected = np.where(lower > 0, above_lower, 1) - above_upper
+        weights = np.exp(interval_log_weights(jnp.asarray(at[:, 0], jnp.float32), 0.1, 7, temperature))
         np.testing.assert_allclose(weights, expected, atol=2e-5)
-        np.testing.assert_allclose(weights.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
+        np.testing.assert_allclose(weights.sum(axis=1), 1 - above_upper[:, -1], atol=2e-5)
 
 
 def test_cold_colours_are_in_the_hard_regions() -> None:

@@ -42,26 +42,19 @@ def among_others(points: np.ndarray) -> list[np.ndarray]:
     return [object_cloud(50), np.zeros((0, 3)), points, object_cloud(51)]
 
 
-def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return rotation and shift with after = before @ rotation + shift, and the largest error (Kabsch)."""
-    u, _, v = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ v))]) @ v
-    shift = after.mean(0) - before.mean(0) @ rotation
-    return rotation, shift, float(np.abs(before @ rotation + shift - after).max())
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_a_rotation_and_a_shift_of_cloud_and_camera(seed: int) -> None:
     points, camera = object_cloud(seed), np.random.default_rng(seed).normal(size=3)
     normal = thor2.view_normalize(pack(points, camera=camera), CONFIG)
-    after = np.asarray(normal.points[0, : len(points)], np.float64)
-    rotation, shift, error = rigid_motion(points * 2.5, after)
-    assert error < 2e-6
-    np.testing.assert_allclose(normal.camera[0], camera * 2.5 @ rotation + shift, atol=1e-5)
+    before, after = 2.5 * points, np.asarray(normal.points[0, : len(points)], np.float64)
+    rotation, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
+    shift = after.mean(axis=0) - rotation.apply(before.mean(axis=0))
+    np.testing.assert_allclose(after, rotation.apply(before) + shift, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(normal.camera[0], rotation.apply(2.5 * camera) + shift, atol=1e-5)
     sides = after.max(axis=0)
     np.testing.assert_array_equal(after.min(axis=0), 0)
     assert sides[0] >= sides[1] >= sides[2]
-    assert np.prod(sides) <= 1.05 * np.prod(trimesh.bounds.oriented_bounds(points * 2.5)[1])
+    assert np.prod(sides) <= 1.05 * np.prod(trimesh.bounds.oriented_bounds(before)[1])
     assert float(normal.camera[0, 2]) <= sides[2] / 2  # camera side
     assert after[:, 0].mean() <= sides[0] / 2  # sign rule
 
