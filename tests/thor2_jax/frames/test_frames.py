@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -201,9 +200,7 @@ def test_images_with_an_invalid_checksum_are_refused(tmp_path: Path) -> None:
         (read_labels, ("RGB", "RGBA", "LA", "1"), "^labels: .*integers"),
     ],
 )
-def test_images_of_other_modes_are_refused(
-    tmp_path: Path, read: Callable[[Path], Any], modes: tuple[str, ...], problem: str
-) -> None:
+def test_images_of_other_modes_are_refused(tmp_path: Path, read: Any, modes: tuple[str, ...], problem: str) -> None:
     for mode in modes:
         path = tmp_path / ("c.jpg" if mode == "CMYK" else "c.png")
         Image.new(mode, (7, 5)).save(path)

@@ -147,16 +147,12 @@ def test_the_largest_overlap_of_chunks() -> None:
     assert overlap((0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)) == 50
 
 
-@pytest.mark.parametrize(
-    ("limit", "value", "message"),
-    [("MAX_OVERLAPPING", 1000, "chunks of the same time; expected at most 1000"), ("MAX_TOPICS", 2, "3 topics of")],
-)
-def test_chunks_of_the_same_time_and_topics_have_a_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, message: str
-) -> None:
+def test_limits_of_chunks_and_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
-    monkeypatch.setattr(bags, limit, value)
-    assert_refused(message, Bag(path).__enter__)
+    monkeypatch.setattr(bags, "MAX_OVERLAPPING", 1000)
+    assert_refused("chunks of the same time; expected at most 1000", Bag(path).__enter__)
+    monkeypatch.setattr(bags, "MAX_TOPICS", 2)
+    assert_refused("3 topics of", Bag(path).__enter__)
 
 
 MANY_ALIASES = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
@@ -218,17 +214,12 @@ def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
     assert numbers[0] == 0 < numbers[1] < numbers[2] and numbers[2] > 8
 
 
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (lambda path: path.mkdir(), "metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"),
-        (lambda path: path.write_bytes(b"#ROSBAG V2.0\n"), "damaged or of another format"),
-    ],
-)
-def test_no_recording(tmp_path: Path, write: Any, message: str) -> None:
-    write(tmp_path / "x.bag")
-    with pytest.raises((InputError, OSError), match=message), Bag(tmp_path / "x.bag"):
-        pass
+def test_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "file.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert_refused("damaged or of another format", Bag(tmp_path / "file.bag").__enter__)
+    (tmp_path / "x.bag").mkdir()
+    message = "metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
+    assert_refused(message, Bag(tmp_path / "x.bag").__enter__)
 
 
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
