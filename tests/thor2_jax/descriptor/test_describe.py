@@ -38,8 +38,7 @@ def test_describe_with_jax_enable_x64() -> None:
         clouds = thor2.PointClouds.pack(random_clouds(1, [60]), capacity=64)
         tops2 = thor2.describe(clouds, NETWORK, CLOSED).tops2
     expected = thor2.describe(clouds, NETWORK, CLOSED).tops2
-    assert tops2.dtype == np.float32
-    np.testing.assert_allclose(tops2, expected, atol=1e-4)
+    np.testing.assert_allclose(tops2, expected, atol=1e-4, strict=True)
 
 
 def test_arguments_of_other_types_are_named() -> None:

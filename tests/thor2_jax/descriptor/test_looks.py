@@ -1,7 +1,7 @@
 """Looks: their order, geometry, colours and masks, against clouds that are changed and packed by NumPy; statistics."""
 
 import dataclasses
-from typing import Any
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -110,18 +110,12 @@ def test_other_counts_are_refused(count: int) -> None:
 
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])
 def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = describe_looks(PACKED, NETWORK, CONFIG, 4)
-    sizes = []
-
-    def record(chunk: thor2.PointClouds, config: thor2.DescriptorConfig, count: int) -> Any:
-        sizes.append(len(chunk.mask))
-        return aligned_looks(chunk, config, count)
-
+    whole, recorded = describe_looks(PACKED, NETWORK, CONFIG, 4), Mock(wraps=aligned_looks)
     monkeypatch.setattr(describe, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
-    monkeypatch.setattr(looks, "aligned_looks", record)
+    monkeypatch.setattr(looks, "aligned_looks", recorded)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     chunked = describe_looks(PACKED, NETWORK, CONFIG, 4)
-    assert len(sizes) == calls
+    assert recorded.call_count == calls
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked, whole)
 
 

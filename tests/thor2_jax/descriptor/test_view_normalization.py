@@ -70,7 +70,6 @@ AMBIGUOUS = {
 def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
     points = AMBIGUOUS[name]
     after = normalized(points)
-    assert np.isfinite(after).all()
     between = np.linalg.norm(points[:, None] - points, axis=-1) * 2.5
     np.testing.assert_allclose(np.linalg.norm(after[:, None] - after, axis=-1), between, atol=3e-6)
     assert (np.diff(after.max(axis=0)) <= 2e-6).all()

@@ -101,7 +101,6 @@ def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> 
     drawn(photo(), labels, list(answers.values()), tmp_path / "a.png")
     assert [text for _, text in boxes] == list(answers)
     areas = [(right + 1 - left) * (bottom + 1 - top) for (left, top, right, bottom), _ in boxes]
-    assert min(areas) > 0
     assert sum(areas) == (~outside(boxes, labels.shape)).sum()  # smaller if labels overlap or leave the picture
 
 

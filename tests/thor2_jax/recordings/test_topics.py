@@ -36,8 +36,7 @@ def test_pairs_equal_those_of_all_pairs(seed: int) -> None:
     rng = np.random.default_rng(seed)
     images, stamps = [], {}
     for is_color, period in ((True, 33), (False, int(rng.integers(15, 120)))):
-        steps = rng.uniform(0.5, 1.5, 60) * period * MS
-        stamps[is_color] = [int(stamp) for stamp in np.cumsum(steps)]
+        stamps[is_color] = np.cumsum(rng.uniform(0.5, 1.5, 60) * period * MS).astype(int).tolist()
         late = int(rng.integers(0, 300)) * MS
         images += [StampedImage(is_color, stamp, stamp + late, None) for stamp in stamps[is_color]]
     images.sort(key=lambda image: image.arrival)
