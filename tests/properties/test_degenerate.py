@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 from small_clouds import DEGENERATE
 
-import colornet
 import thor2_jax as thor2
 
-NETWORK = colornet.load_default()
-GUDHI = thor2.DescriptorConfig(n_slices=3, n_strips=8, image_size=12)
-CLOSED = dataclasses.replace(GUDHI, homology="closed_form")
+from .conftest import CLOSED, NETWORK, SMALL_CONFIGS
+
 CONFIGS = {
-    "closed_form": CLOSED,
-    "gudhi": GUDHI,
-    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
+    **SMALL_CONFIGS,
     "cold": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation(1e-5, 1e-6, 1e-5, 1e-4), persistence_weight=0.5),
     "warm": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation(1.0, 1.0, 1.0, 100.0), persistence_weight=2.0),
 }

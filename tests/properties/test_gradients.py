@@ -11,19 +11,12 @@ import numpy as np
 import pytest
 from slow_tier import slow
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor import view_normalization
 
-NETWORK = colornet.load_default()
-SMALL = {"n_slices": 3, "n_strips": 8, "image_size": 12}
-CLOSED, GUDHI = (thor2.DescriptorConfig(homology=name, **SMALL) for name in ("closed_form", "gudhi"))
-CONFIGS = {
-    "closed_form": CLOSED,
-    "gudhi": GUDHI,
-    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
-    "relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation()),
-}
+from .conftest import CLOSED, GUDHI, NETWORK, SMALL_CONFIGS
+
+CONFIGS = SMALL_CONFIGS | {"relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation())}
 COUNT, CAPACITY = 44, 48
 Loss = Callable[..., jax.Array]
 

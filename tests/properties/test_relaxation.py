@@ -10,14 +10,14 @@ from scipy.special import expit
 from slow_tier import slow
 from small_clouds import aligned_cloud
 
-import colornet
 import thor2_jax as thor2
 from colornet.colors import GRID_WHITE
 from colornet.colors import hyab as exact_hyab
 from colornet.colors import to_lab as exact_lab
 from thor2_jax.descriptor.slicing import interval_log_weights, region_sets, soft_regions
 
-NETWORK = colornet.load_default()
+from .conftest import NETWORK
+
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SETS = region_sets(NETWORK)
 shares_of = jax.jit(lambda colors, temperature: soft_regions(colors, SETS, temperature))

@@ -14,9 +14,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
-from .conftest import batches
+from .conftest import NETWORK, batches
 
-NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
 ALIGNED = batches(laws.aligned_clouds(CONFIG))
 
