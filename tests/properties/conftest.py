@@ -21,6 +21,7 @@ SMALL_CONFIGS = {
     "gudhi": GUDHI,
     "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
 }
+"""Descriptors that compile quickly."""
 
 
 def batches(clouds: Any, capacity: int = 512) -> Any:
