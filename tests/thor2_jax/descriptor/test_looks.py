@@ -49,23 +49,15 @@ PACKED = thor2.PointClouds.pack([LONG, SQUARE], rim=RIMS)
 def half_turned(cloud: Cloud) -> np.ndarray:
     """Return the points [n, 3] of a cloud that is packed alone and aligned after a half turn about z."""
     normal = thor2.mirror(thor2.view_normalize(thor2.PointClouds.pack([cloud]), CONFIG), "xy")
-    return np.asarray(thor2.turn(normal, CONFIG).points)[0, : len(cloud[0])]
-
-
-def look(aligned: thor2.PointClouds, number: int, which: int, count: int) -> Cloud:
-    """Return the points [n, 3] and colours [n, 3] of one look at a cloud, without masked ones."""
-    row = number * count + which
-    mask = np.asarray(aligned.mask)[row]
-    return np.asarray(aligned.points)[row][mask], np.asarray(aligned.colors)[row][mask]
+    return thor2.turn(normal, CONFIG).unpack()[0][0]
 
 
 def test_the_second_of_two_looks_or_without_a_rim_is_a_half_turn() -> None:
     unknown, none = (thor2.PointClouds.pack([LONG, SQUARE], rim=rim) for rim in (None, [None, None]))
     assert unknown.rim is None and none.rim is not None
     for clouds, count in ((PACKED, 2), (unknown, 4), (none, 4)):
-        aligned = aligned_looks(clouds, CONFIG, count)
-        for number, cloud in enumerate((LONG, SQUARE)):
-            points, colors = look(aligned, number, 1, count)
+        seconds = aligned_looks(clouds, CONFIG, count).unpack()[1::count]
+        for (points, colors), cloud in zip(seconds, (LONG, SQUARE), strict=True):
             np.testing.assert_allclose(points, half_turned(cloud), atol=2e-6)
             np.testing.assert_array_equal(colors, np.float32(cloud[1]) / np.float32(255))
 
@@ -75,20 +67,18 @@ def test_four_looks_are_those_of_changed_clouds() -> None:
     np.testing.assert_allclose(aligned.camera[::4], thor2.align(PACKED, CONFIG).camera, atol=1e-6)
     for number, ((points, colors), rim) in enumerate(zip((LONG, SQUARE), RIMS, strict=True)):
         assert 0 < rim.sum() < len(rim) / 2
-        given, shades = np.asarray(thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).points), colors / 255
+        given, shades = thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).unpack()[0][0], colors / 255
         inner = points[~rim], colors[~rim]
         expected = [
-            (given[0, : len(points)], shades),
+            (given, shades),
             (half_turned(inner), shades[~rim]),
             (half_turned((points, colors)), (shades * WARMER).clip(0, 1)),
-            (given[0, : len(points)], (shades / WARMER).clip(0, 1)),
+            (given, (shades / WARMER).clip(0, 1)),
         ]
-        for which, (places, tints) in enumerate(expected):
-            actual = look(aligned, number, which, 4)
+        looks_at_cloud = aligned.unpack()[4 * number : 4 * number + 4]
+        for actual, (places, tints) in zip(looks_at_cloud, expected, strict=True):
             np.testing.assert_allclose(actual[0], places, atol=5e-6)
             np.testing.assert_allclose(actual[1], tints, atol=1e-6)
-    warm, cool = (np.asarray(aligned.colors)[2 + k] for k in (0, 1))
-    assert warm.max() == cool.max() == 1 and (warm[:, 0] >= cool[:, 0]).all() and (warm[:, 2] <= cool[:, 2]).all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 3])
@@ -133,9 +123,8 @@ def test_descriptors_and_statistics_are_those_of_each_look() -> None:
     aligned = aligned_looks(PACKED, CONFIG, 4)
     assert described.statistics.shape[:2] == described.shape == (2, 4)
     np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CONFIG).tops2, atol=1e-4)
-    for row in range(8):
-        # The cloud of the look alone: points of the rim are not there, instead of masked.
-        alone = thor2.PointClouds.pack([look(aligned, row // 4, row % 4, 4)])
+    for row, cloud in enumerate(aligned.unpack()):
+        alone = thor2.PointClouds.pack([cloud])  # points of the rim are not there, instead of masked
         descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
         expected = thor2.describe_aligned(alone, NETWORK, CONFIG)
         np.testing.assert_allclose(descriptors.tops2, expected.tops2[0], atol=1e-4)

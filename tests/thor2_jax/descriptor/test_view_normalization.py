@@ -94,13 +94,12 @@ def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> Non
     clouds = pack(*among_others(object_cloud(1)))
     normal = thor2.view_normalize(clouds, CONFIG)
     aligned = thor2.turn(normal, config)
+    rotation = Rotation.from_euler("y", -alpha)
     for i in (0, 2, 3):
-        mask = np.asarray(normal.mask[i])
-        matrix = Rotation.from_euler("y", -alpha).as_matrix()
-        expected = np.asarray(normal.points[i], np.float64)[mask] @ matrix.T
+        expected = rotation.apply(normal.unpack()[i][0])
         low = expected.min(axis=0)
-        np.testing.assert_allclose(np.asarray(aligned.points[i])[mask], expected - low, atol=1e-6)
-        np.testing.assert_allclose(aligned.camera[i], np.asarray(normal.camera[i]) @ matrix.T - low, atol=1e-5)
+        np.testing.assert_allclose(aligned.unpack()[i][0], expected - low, atol=1e-6)
+        np.testing.assert_allclose(aligned.camera[i], rotation.apply(normal.camera[i]) - low, atol=1e-5)
     in_one_rotation = thor2.align(clouds, config)
     np.testing.assert_allclose(in_one_rotation.points, aligned.points, atol=1e-6)
 
@@ -119,8 +118,7 @@ def test_large_batches_of_small_rotations_are_exact() -> None:
 def test_mirror_keeps_the_box(axes: str) -> None:
     normal = thor2.view_normalize(pack(*among_others(object_cloud(1))), CONFIG)
     mirrored = thor2.mirror(normal, axes)
-    mask = np.asarray(normal.mask[2])
-    before, after = np.asarray(normal.points[2])[mask], np.asarray(mirrored.points[2])[mask]
+    before, after = normal.unpack()[2][0], mirrored.unpack()[2][0]
     for k, letter in enumerate("xyz"):
         expected = before[:, k].max() - before[:, k] if letter in axes else before[:, k]
         np.testing.assert_array_equal(after[:, k], expected)

@@ -66,18 +66,15 @@ def test_frames_without_pieces_or_without_depth_remain() -> None:
     np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown), ONE_PIECE)
 
 
-@pytest.mark.parametrize(
-    "recognize",
-    [
-        pytest.param(knows(TRUTH > 0), id="one known object"),
-        pytest.param(knows(TRUTH == 1), id="a known object beside an unknown one"),
-        pytest.param(lambda frames: [(None, 0.99)] * len(frames), id="unknown objects"),
-        pytest.param(lambda frames: [("a", 0.5)] * len(frames), id="without confidence"),
-        pytest.param(lambda frames: [("a", 0.99)] * len(frames), id="the same object everywhere"),
-    ],
-)
-def test_a_piece_without_two_known_objects_remains(recognize: Recognize) -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
+@pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1], ids=["all of it", "one half"])
+def test_a_piece_with_one_known_object_remains(known: NDArray[np.bool_]) -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, knows(known)), ONE_PIECE)
+
+
+@pytest.mark.parametrize("answer", [(None, 0.99), ("a", 0.5), ("a", 0.99)], ids=["unknown", "unsure", "one object"])
+def test_a_piece_with_one_answer_everywhere_remains(answer: Answer) -> None:
+    labels = segment_known(FRAME, ONE_PIECE, lambda frames: [answer] * len(frames))
+    np.testing.assert_array_equal(labels, ONE_PIECE)
 
 
 def test_candidates_are_shown_where_they_are() -> None:
