@@ -122,8 +122,7 @@ def test_default_parameters_are_those_of_network_and_config() -> None:
     config = dataclasses.replace(CLOSED, alpha=0.6, sigma_s=2.0, image_variance=0.0005, persistence_weight=1.5)
     by_default = thor2.describe(clouds, NETWORK, config)
     explicit = thor2.describe(clouds, NETWORK, CLOSED, thor2.Parameters.of(NETWORK, config))
-    for name in ("images", "embeddings", "overflow"):
-        np.testing.assert_array_equal(getattr(explicit, name), getattr(by_default, name))
+    jax.tree.map(np.testing.assert_array_equal, explicit, by_default)
     assert np.abs(np.asarray(by_default.tops2 - thor2.describe(clouds, NETWORK, CLOSED).tops2)).max() > 0.01
 
 

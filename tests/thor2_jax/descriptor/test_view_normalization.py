@@ -33,8 +33,8 @@ def pack(*clouds: np.ndarray, **options: object) -> thor2.PointClouds:
     return thor2.PointClouds.pack([(points, np.full(points.shape, COLOR)) for points in clouds], **options)
 
 
-def normalized(points: np.ndarray, **options: object) -> np.ndarray:
-    return np.asarray(thor2.view_normalize(pack(points, **options), CONFIG).points[0, : len(points)], np.float64)
+def normalized(points: np.ndarray) -> np.ndarray:
+    return np.asarray(thor2.view_normalize(pack(points), CONFIG).points[0, : len(points)], np.float64)
 
 
 def among_others(points: np.ndarray) -> list[np.ndarray]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,9 +36,9 @@ def flat(millimetres: int = 800) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), millimetres, np.uint16)
 
 
-def patch(*rectangles: tuple[int, int, int, int, int], kind: Any = np.uint8) -> np.ndarray:
+def patch(*rectangles: tuple[int, int, int, int, int]) -> np.ndarray:
     """Return labels; each rectangle is (label, first row, end row, first column, end column)."""
-    labels = np.zeros((HEIGHT, WIDTH), kind)
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     for label, top, bottom, left, right in rectangles:
         labels[top:bottom, left:right] = label
     return labels
@@ -113,8 +112,7 @@ def test_prepared_instances_have_a_rim_unless_they_are_narrow(width: int, has_ri
     frame = frame_of(flat(), patch((1, 100, 200, 50, 50 + width)))
     prepared, without = prepare_instance(frame, 1, 2.5), prepare_instance(frame, 1, 2.5, with_rim=False)
     assert without.rim is None
-    for one, other in ((prepared.points, without.points), (prepared.colors, without.colors)):
-        np.testing.assert_array_equal(one, other)
+    np.testing.assert_equal((prepared.points, prepared.colors), (without.points, without.colors))
     assert prepared.reason is None and prepared.rim is not None and bool(prepared.rim.any()) == has_rim
     packed = pack_instances([prepared], 2)
     assert packed.rim is not None and not packed.rim[1].any()
