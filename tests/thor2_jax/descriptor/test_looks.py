@@ -68,10 +68,9 @@ def test_four_looks_are_those_of_changed_clouds() -> None:
     for number, ((points, colors), rim) in enumerate(zip((LONG, SQUARE), RIMS, strict=True)):
         assert 0 < rim.sum() < len(rim) / 2
         given, shades = thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).unpack()[0][0], colors / 255
-        inner = points[~rim], colors[~rim]
         expected = [
             (given, shades),
-            (half_turned(inner), shades[~rim]),
+            (half_turned((points[~rim], colors[~rim])), shades[~rim]),
             (half_turned((points, colors)), (shades * WARMER).clip(0, 1)),
             (given, (shades / WARMER).clip(0, 1)),
         ]

@@ -24,11 +24,10 @@ from training.readers.frames import FrameFolder
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(600.0, 610.0, 159.5, 119.5)
+NOISE = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
-def frame_of(depth: np.ndarray, labels: np.ndarray, color: np.ndarray | None = None) -> RGBDFrame:
-    if color is None:
-        color = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+def frame_of(depth: np.ndarray, labels: np.ndarray, color: np.ndarray = NOISE) -> RGBDFrame:
     return RGBDFrame(color, depth, labels, CAMERA)
 
 
