@@ -24,7 +24,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 @pytest.mark.parametrize("convention", ["paper", "released"])
-def test_views_of_objects(golden_files: tuple[Path, ...], convention: str, homology: str) -> None:
+def test_each_stage_of_both_conventions(golden_files: tuple[Path, ...], convention: str, homology: str) -> None:
     """All views are one batch, and begin with the reference's alignment."""
     configs = {"paper": thor2.DescriptorConfig, "released": thor2.DescriptorConfig.released}
     config, network = configs[convention](homology=homology), colornet.load_default()

@@ -41,7 +41,7 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
     np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
 
 
-def test_two_or_three_pieces_of_one_known_object_are_merged() -> None:
+def test_only_pieces_of_one_known_object_are_merged() -> None:
     quantiles = np.quantile(np.nonzero(TRUTH)[1], [0.45, 0.9])
     three = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), quantiles), 0)
     for pieces in (TRUTH, three):
