@@ -107,13 +107,10 @@ def refined(axes: Array, points: Array, first: int, second: int) -> Array:
     """Rotate two axes so that the minimum-area rectangle of the projection onto them is axis-aligned."""
     plane = points @ axes[[first, second]].T
     hull = plane[ConvexHull(plane).vertices]
-    candidates = []
-    for x, y in np.roll(hull, -1, axis=0) - hull:
-        direction = np.array([x, y]) / np.hypot(x, y)
-        turn = np.array([direction, [-direction[1], direction[0]]])
-        candidates.append((np.prod(np.ptp(hull @ turn.T, axis=0)), turn))
+    edges = np.roll(hull, -1, axis=0) - hull
+    turns = [np.array([[x, y], [-y, x]]) / np.hypot(x, y) for x, y in edges]
     new = axes.copy()
-    new[[first, second]] = min(candidates, key=lambda candidate: candidate[0])[1] @ axes[[first, second]]
+    new[[first, second]] = min(turns, key=lambda turn: np.prod(np.ptp(hull @ turn.T, axis=0))) @ new[[first, second]]
     return new
 
 

@@ -22,45 +22,27 @@ def load(path: Path) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-@functools.cache
-def described(
-    paths: tuple[Path, ...], config: thor2.DescriptorConfig
-) -> tuple[thor2.Descriptors, thor2.Strips, thor2.Diagrams]:
-    """Descriptors of all views in one batch, from the reference's alignment."""
-    aligned = thor2.PointClouds.pack([(load(path)["aligned"], load(path)["colors"]) for path in paths])
-    network = colornet.load_default()
-    return (
-        thor2.describe_aligned(aligned, network, config),
-        thor2.strips(aligned, network, config),
-        thor2.diagrams(aligned, config),
-    )
-
-
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
-def test_paper_convention(golden_files: tuple[Path, ...], homology: str) -> None:
-    descriptors, strips, diagrams = described(golden_files, thor2.DescriptorConfig(homology=homology))
+@pytest.mark.parametrize("convention", ["paper", "released"])
+def test_each_stage_of_both_conventions(golden_files: tuple[Path, ...], convention: str, homology: str) -> None:
+    """All views are one batch, and begin with the reference's alignment."""
+    configs = {"paper": thor2.DescriptorConfig, "released": thor2.DescriptorConfig.released}
+    config, network = configs[convention](homology=homology), colornet.load_default()
+    clouds = thor2.PointClouds.pack([(load(path)["aligned"], load(path)["colors"]) for path in golden_files])
+    descriptors, strips = thor2.describe_aligned(clouds, network, config), thor2.strips(clouds, network, config)
+    diagrams = thor2.diagrams(clouds, config)
+    births, deaths, mask = (np.asarray(values) for values in (diagrams.births, diagrams.deaths, diagrams.mask))
     assert not np.asarray(descriptors.overflow).any()
-    for values in (diagrams.births, diagrams.deaths):
-        assert not np.asarray(values)[~np.asarray(diagrams.mask)].any()
+    assert not births[~mask].any() and not deaths[~mask].any()
     for row, path in enumerate(golden_files):
         golden, close = load(path), functools.partial(np.testing.assert_allclose, err_msg=path.name, atol=TOLERANCE)
-        close(descriptors.images[row], golden["paper_images"])
-        close(descriptors.embeddings[row], golden["paper_embedding"].transpose(0, 2, 1), rtol=TOLERANCE)
-        close(strips.color[row], golden["paper_color"])
-
-
-@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
-def test_released_convention(golden_files: tuple[Path, ...], homology: str) -> None:
-    descriptors, strips, diagrams = described(golden_files, thor2.DescriptorConfig.released(homology=homology))
-    assert not np.asarray(descriptors.overflow).any()
-    for row, path in enumerate(golden_files):
-        golden, close = load(path), functools.partial(np.testing.assert_allclose, err_msg=path.name, atol=TOLERANCE)
-        close(descriptors.images[row], golden["released_images"])
-        close(strips.color[row], golden["released_color"])
-        births, deaths, mask = (np.asarray(a[row]) for a in (diagrams.births, diagrams.deaths, diagrams.mask))
-        pairs = np.stack([np.nonzero(mask)[0], births[mask], deaths[mask]], axis=1)
-        close(pairs, golden["released_diagrams"])
-        assert not births[~mask].any() and not deaths[~mask].any()
+        close(descriptors.images[row], golden[f"{convention}_images"])
+        close(strips.color[row], golden[f"{convention}_color"])
+        if convention == "paper":
+            close(descriptors.embeddings[row], golden["paper_embedding"].transpose(0, 2, 1), rtol=TOLERANCE)
+        else:
+            pairs = [np.nonzero(mask[row])[0], births[row][mask[row]], deaths[row][mask[row]]]
+            close(np.stack(pairs, axis=1), golden["released_diagrams"])
 
 
 @pytest.mark.slow
@@ -73,5 +55,4 @@ def test_the_script_reproduces_the_files(monkeypatch: pytest.MonkeyPatch) -> Non
         made, kept = make_golden.golden(objects[name], *angles), load(make_golden.FOLDER / f"{name}.npz")
         assert set(made) == set(kept)
         for key, array in made.items():
-            assert array.dtype == kept[key].dtype
-            np.testing.assert_allclose(array, kept[key], rtol=1e-6, atol=1e-6, err_msg=f"{name} {key}")
+            np.testing.assert_allclose(array, kept[key], 1e-6, 1e-6, err_msg=f"{name} {key}", strict=True)

@@ -14,6 +14,14 @@ import thor2_jax as thor2
 from thor2_jax import testing as laws
 
 NETWORK = colornet.load_default()
+GUDHI = thor2.DescriptorConfig(n_slices=3, n_strips=8, image_size=12)
+CLOSED = dataclasses.replace(GUDHI, homology="closed_form")
+SMALL_CONFIGS = {
+    "closed_form": CLOSED,
+    "gudhi": GUDHI,
+    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
+}
+"""Descriptors that compile quickly."""
 
 
 def batches(clouds: Any, capacity: int = 512) -> Any:

@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 from small_clouds import DEGENERATE
 
-import colornet
 import thor2_jax as thor2
 
-NETWORK = colornet.load_default()
-GUDHI = thor2.DescriptorConfig(n_slices=3, n_strips=8, image_size=12)
-CLOSED = dataclasses.replace(GUDHI, homology="closed_form")
+from .conftest import CLOSED, NETWORK, SMALL_CONFIGS
+
 CONFIGS = {
-    "closed_form": CLOSED,
-    "gudhi": GUDHI,
-    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
+    **SMALL_CONFIGS,
     "cold": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation(1e-5, 1e-6, 1e-5, 1e-4), persistence_weight=0.5),
     "warm": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation(1.0, 1.0, 1.0, 100.0), persistence_weight=2.0),
 }
@@ -68,18 +64,11 @@ def test_values_and_gradients_are_finite(name: str, aligned: bool) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path((descriptors, gradients)):
         finite = np.isfinite(np.asarray(leaf)).reshape(len(CLOUDS), -1).all(axis=1)
         assert finite.all(), (jax.tree_util.keystr(path), np.array(list(CLOUDS))[~finite])
-    empty = jax.tree.map(lambda a: np.asarray(a[0]), (descriptors.tops2, gradients))
-    assert not any(leaf.any() for leaf in jax.tree.leaves(empty))
+    assert not any(leaf[0].any() for leaf in jax.tree.leaves((descriptors.tops2, gradients)))  # without points
     if name == "closed_form" and not aligned:
         described, persistent = (
-            [cloud for cloud, values in zip(CLOUDS, np.asarray(a), strict=True) if values.any()]
+            {cloud for cloud, values in zip(CLOUDS, np.asarray(a), strict=True) if values.any()}
             for a in (descriptors.embeddings, descriptors.images)
         )
-        assert set(CLOUDS) - set(described) == {"nothing", "large"}  # which is past the grid
-        assert set(described) - set(persistent) == {
-            "one point",
-            "two points",
-            "all equal",
-            "the origin",
-            "line along x",
-        }
+        assert CLOUDS.keys() - described == {"nothing", "large"}  # which is past the grid
+        assert described - persistent == {"one point", "two points", "all equal", "the origin", "line along x"}

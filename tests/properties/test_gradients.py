@@ -11,21 +11,13 @@ import numpy as np
 import pytest
 from slow_tier import slow
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor import view_normalization
 
-NETWORK = colornet.load_default()
-SMALL = {"n_slices": 3, "n_strips": 8, "image_size": 12}
-CLOSED, GUDHI = (thor2.DescriptorConfig(homology=name, **SMALL) for name in ("closed_form", "gudhi"))
-CONFIGS = {
-    "closed_form": CLOSED,
-    "gudhi": GUDHI,
-    "relaxed": dataclasses.replace(CLOSED, relaxation=thor2.Relaxation()),
-    "relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation()),
-}
+from .conftest import CLOSED, GUDHI, NETWORK, SMALL_CONFIGS
+
+CONFIGS = SMALL_CONFIGS | {"relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation())}
 COUNT, CAPACITY = 44, 48
-Loss = Callable[..., jax.Array]
 
 
 def in_cells(seed: int) -> np.ndarray:
@@ -55,25 +47,23 @@ def parameters_of(config: thor2.DescriptorConfig, dtype: Any = np.float64) -> th
     return jax.tree.map(lambda a: jnp.asarray(a, dtype), exact)
 
 
-def probed(descriptors: thor2.Descriptors) -> jax.Array:
-    """Return a sum of all outputs with random weights of both signs."""
-    probe = jnp.asarray(np.random.default_rng(5).normal(size=descriptors.tops2.shape[-1]), descriptors.tops2.dtype)
-    return (descriptors.tops2 * probe).sum()
+def checked_derivatives(
+    describe: Callable[..., thor2.Descriptors], clouds: thor2.PointClouds, config: thor2.DescriptorConfig
+) -> list[float]:
+    """Return the derivative of each input along a random direction, after a comparison with a central difference.
 
+    The derivatives are those of a sum of all outputs with random weights of both signs.
+    """
 
-def loss_of(describe: Loss, clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> Loss:
     def loss(points: jax.Array, colors: jax.Array, parameters: thor2.Parameters) -> jax.Array:
-        moved = dataclasses.replace(clouds, points=points, colors=colors)
-        return probed(describe(moved, NETWORK, config, parameters))
+        tops2 = describe(dataclasses.replace(clouds, points=points, colors=colors), NETWORK, config, parameters).tops2
+        probe = np.random.default_rng(5).normal(size=tops2.shape[-1])
+        return (tops2 * jnp.asarray(probe, tops2.dtype)).sum()
 
-    return loss
-
-
-def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) -> list[float]:
-    """Compare each leaf's derivative along a random direction with a central difference; return the derivatives."""
+    arguments, step = (clouds.points, clouds.colors, parameters_of(config)), 1e-6
     leaves, tree = jax.tree.flatten(arguments)
     value = jax.jit(lambda *leaves: loss(*jax.tree.unflatten(tree, leaves)))
-    gradients = jax.tree.leaves(jax.jit(jax.grad(loss, argnums=tuple(range(len(arguments)))))(*arguments))
+    gradients = jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(*arguments))
     rng, derivatives = np.random.default_rng(1), []
     for k, (leaf, gradient) in enumerate(zip(leaves, gradients, strict=True)):
         assert gradient.dtype == np.float64
@@ -96,9 +86,8 @@ def test_aligned_clouds_against_finite_differences(name: str) -> None:
         one = jax.tree.map(lambda a: a[:, None], clouds)
         return jax.tree.map(lambda a: a[:, 0], jax.vmap(lambda cloud: thor2.describe_aligned(cloud, *settings))(one))
 
-    loss = loss_of(describe_each if config.homology == "gudhi" else thor2.describe_aligned, aligned, config)
-    derivatives = assert_differences_agree(loss, aligned.points, aligned.colors, parameters_of(config))
-    points, colors, similarity, alpha, sigma_s, variance, weight = derivatives
+    describe = describe_each if config.homology == "gudhi" else thor2.describe_aligned
+    points, colors, similarity, alpha, sigma_s, variance, weight = checked_derivatives(describe, aligned, config)
     assert 0 not in (points, similarity, variance, weight) and alpha == sigma_s == 0  # the clouds are already aligned
     assert (colors != 0) == (config.relaxation is not None)
 
@@ -122,9 +111,7 @@ def test_describe_against_finite_differences(name: str, monkeypatch: pytest.Monk
         points, camera = view_normalization._align.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
         return thor2.describe_aligned(dataclasses.replace(clouds, points=points, camera=camera), *settings)
 
-    loss = loss_of(describe, clouds, config)
-    derivatives = assert_differences_agree(loss, clouds.points, clouds.colors, parameters_of(config))
-    points, colors, similarity, alpha, sigma_s, variance, weight = derivatives
+    points, colors, similarity, alpha, sigma_s, variance, weight = checked_derivatives(describe, clouds, config)
     assert 0 not in (points, similarity, sigma_s, variance, weight)
     for value in (colors, alpha):
         assert (value != 0) == (config.relaxation is not None)
@@ -135,8 +122,7 @@ def test_default_parameters_are_those_of_network_and_config() -> None:
     config = dataclasses.replace(CLOSED, alpha=0.6, sigma_s=2.0, image_variance=0.0005, persistence_weight=1.5)
     by_default = thor2.describe(clouds, NETWORK, config)
     explicit = thor2.describe(clouds, NETWORK, CLOSED, thor2.Parameters.of(NETWORK, config))
-    for name in ("images", "embeddings", "overflow"):
-        np.testing.assert_array_equal(getattr(explicit, name), getattr(by_default, name))
+    jax.tree.map(np.testing.assert_array_equal, explicit, by_default)
     assert np.abs(np.asarray(by_default.tops2 - thor2.describe(clouds, NETWORK, CLOSED).tops2)).max() > 0.01
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import instance_clouds
 
-NETWORK = colornet.load_default()
+from .conftest import NETWORK
+
 CONFIG = thor2.DescriptorConfig()
 
 
@@ -85,7 +85,7 @@ def test_laws_take_clouds_on_the_host_and_their_rim() -> None:
     def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
         """Return the descriptors of the points that are not in the rim."""
         mask = np.asarray(clouds.mask) & ~np.asarray(clouds.rim)
-        return thor2.describe_aligned(dataclasses.replace(clouds, mask=mask), colornet.load_default(), config)
+        return thor2.describe_aligned(dataclasses.replace(clouds, mask=mask), NETWORK, config)
 
     laws.assert_permutation_invariant(describe, clouds, 0, config)
     laws.assert_padding_invariant(describe, clouds, 1024, config)

@@ -6,17 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import expit
 from slow_tier import slow
 from small_clouds import aligned_cloud
 
-import colornet
 import thor2_jax as thor2
 from colornet.colors import GRID_WHITE
 from colornet.colors import hyab as exact_hyab
 from colornet.colors import to_lab as exact_lab
 from thor2_jax.descriptor.slicing import interval_log_weights, region_sets, soft_regions
 
-NETWORK = colornet.load_default()
+from .conftest import NETWORK
+
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SETS = region_sets(NETWORK)
 shares_of = jax.jit(lambda colors, temperature: soft_regions(colors, SETS, temperature))
@@ -37,17 +38,14 @@ def test_points_outside_the_hard_slices_are_left_out() -> None:
 
 
 def test_weights_of_intervals_are_differences_of_sigmoids() -> None:
-    at = np.linspace(0, 1.2, 500)
+    at = np.linspace(0, 1.2, 500)[:, None]
     lower, upper = (0.1 * (np.arange(7) + k) for k in (0, 1))
     for temperature in (0.003, 0.05, 1.0):
-
-        def below(edge: np.ndarray, temperature: float = temperature) -> np.ndarray:
-            return 1 / (1 + np.exp(-(at[:, None] - edge) / temperature))
-
-        expected = np.where(lower > 0, below(lower), 1) - below(upper)
-        weights = np.exp(interval_log_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
+        above_lower, above_upper = (expit((at - edges) / temperature) for edges in (lower, upper))
+        expected = np.where(lower > 0, above_lower, 1) - above_upper
+        weights = np.exp(interval_log_weights(jnp.asarray(at[:, 0], jnp.float32), 0.1, 7, temperature))
         np.testing.assert_allclose(weights, expected, atol=2e-5)
-        np.testing.assert_allclose(weights.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
+        np.testing.assert_allclose(weights.sum(axis=1), 1 - above_upper[:, -1], atol=2e-5)
 
 
 def test_cold_colours_are_in_the_hard_regions() -> None:
@@ -60,22 +58,20 @@ def test_cold_colours_are_in_the_hard_regions() -> None:
 
 
 def test_warm_colours_are_shared_by_the_softmax() -> None:
-    """Compare grid colours with a loop in float64 over their 27 neighbours."""
+    """Compare grid colours with a sum in float64 over their 27 neighbours."""
     temperature, reach = 4.0, 0.5 + 4 / 5
     ends = np.random.default_rng(0).choice([0, 5, 10, 245, 250, 255], (12, 3)).tolist()
     colors = [[120, 35, 200], [0, 255, 5], [0, 0, 0], *ends]
     shares = shares_of(np.array(colors, np.float32) / np.float32(255), temperature)
+    steps = np.array(list(np.ndindex(3, 3, 3))) - 1
+    fade = np.prod((1 - (steps / reach) ** 2) ** 2, axis=1)
     for rgb, weights in zip(colors, shares, strict=True):
-        total, expected = 0.0, np.zeros(NETWORK.n_regions)
-        for offset in np.ndindex(3, 3, 3):
-            steps = np.array(offset) - 1
-            other = np.array(rgb) + 5 * steps
-            if (other >= 0).all() and (other <= 255).all():
-                distance = exact_hyab(exact_lab(np.array(rgb), GRID_WHITE), exact_lab(other, GRID_WHITE))
-                share = np.exp(-float(distance) / temperature) * np.prod((1 - (steps / reach) ** 2) ** 2)
-                total += share
-                expected += share * NETWORK.membership(other.astype(np.uint8))
-        np.testing.assert_allclose(weights, expected / total, atol=1e-5)
+        others = np.array(rgb) + 5 * steps
+        exist = ((others >= 0) & (others <= 255)).all(axis=1)
+        distance = exact_hyab(exact_lab(np.array(rgb), GRID_WHITE), exact_lab(others, GRID_WHITE))
+        share = exist * fade * np.exp(-distance / temperature)
+        expected = share @ NETWORK.membership(others.clip(0, 255).astype(np.uint8)) / share.sum()
+        np.testing.assert_allclose(weights, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("temperature", [2.0, *slow(0.3, 30.0)])

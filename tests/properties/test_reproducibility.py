@@ -4,13 +4,11 @@ import pytest
 from hypothesis import given
 from processes import finish_programs, start_program
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
-from .conftest import batches
+from .conftest import NETWORK, batches
 
-NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
 
 

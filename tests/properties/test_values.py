@@ -14,9 +14,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
-from .conftest import batches
+from .conftest import NETWORK, batches
 
-NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
 ALIGNED = batches(laws.aligned_clouds(CONFIG))
 
@@ -122,7 +121,6 @@ def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) ->
 @pytest.mark.slow
 @given(aligned=batches(laws.aligned_clouds(CONFIG, max_points=256, margin=0.2)), factor=st.sampled_from([0.02, 0.01]))
 def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
-    def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
-        return thor2.describe_aligned(clouds, NETWORK, config)
-
-    laws.assert_relaxation_converges(describe_at, aligned, NETWORK, CONFIG, factor)
+    laws.assert_relaxation_converges(
+        lambda clouds, config: thor2.describe_aligned(clouds, NETWORK, config), aligned, NETWORK, CONFIG, factor
+    )

@@ -1,14 +1,13 @@
 """Looks: their order, geometry, colours and masks, against clouds that are changed and packed by NumPy; statistics."""
 
 import dataclasses
-from typing import Any
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import assert_refused
-from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -50,23 +49,15 @@ PACKED = thor2.PointClouds.pack([LONG, SQUARE], rim=RIMS)
 def half_turned(cloud: Cloud) -> np.ndarray:
     """Return the points [n, 3] of a cloud that is packed alone and aligned after a half turn about z."""
     normal = thor2.mirror(thor2.view_normalize(thor2.PointClouds.pack([cloud]), CONFIG), "xy")
-    return np.asarray(thor2.turn(normal, CONFIG).points)[0, : len(cloud[0])]
-
-
-def look(aligned: thor2.PointClouds, number: int, which: int, count: int) -> Cloud:
-    """Return the points [n, 3] and colours [n, 3] of one look at a cloud, without masked ones."""
-    row = number * count + which
-    mask = np.asarray(aligned.mask)[row]
-    return np.asarray(aligned.points)[row][mask], np.asarray(aligned.colors)[row][mask]
+    return thor2.turn(normal, CONFIG).unpack()[0][0]
 
 
 def test_the_second_of_two_looks_or_without_a_rim_is_a_half_turn() -> None:
     unknown, none = (thor2.PointClouds.pack([LONG, SQUARE], rim=rim) for rim in (None, [None, None]))
     assert unknown.rim is None and none.rim is not None
     for clouds, count in ((PACKED, 2), (unknown, 4), (none, 4)):
-        aligned = aligned_looks(clouds, CONFIG, count)
-        for number, cloud in enumerate((LONG, SQUARE)):
-            points, colors = look(aligned, number, 1, count)
+        seconds = aligned_looks(clouds, CONFIG, count).unpack()[1::count]
+        for (points, colors), cloud in zip(seconds, (LONG, SQUARE), strict=True):
             np.testing.assert_allclose(points, half_turned(cloud), atol=2e-6)
             np.testing.assert_array_equal(colors, np.float32(cloud[1]) / np.float32(255))
 
@@ -76,20 +67,17 @@ def test_four_looks_are_those_of_changed_clouds() -> None:
     np.testing.assert_allclose(aligned.camera[::4], thor2.align(PACKED, CONFIG).camera, atol=1e-6)
     for number, ((points, colors), rim) in enumerate(zip((LONG, SQUARE), RIMS, strict=True)):
         assert 0 < rim.sum() < len(rim) / 2
-        given, shades = np.asarray(thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).points), colors / 255
-        inner = points[~rim], colors[~rim]
+        given, shades = thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).unpack()[0][0], colors / 255
         expected = [
-            (given[0, : len(points)], shades),
-            (half_turned(inner), shades[~rim]),
+            (given, shades),
+            (half_turned((points[~rim], colors[~rim])), shades[~rim]),
             (half_turned((points, colors)), (shades * WARMER).clip(0, 1)),
-            (given[0, : len(points)], (shades / WARMER).clip(0, 1)),
+            (given, (shades / WARMER).clip(0, 1)),
         ]
-        for which, (places, tints) in enumerate(expected):
-            actual = look(aligned, number, which, 4)
+        looks_at_cloud = aligned.unpack()[4 * number : 4 * number + 4]
+        for actual, (places, tints) in zip(looks_at_cloud, expected, strict=True):
             np.testing.assert_allclose(actual[0], places, atol=5e-6)
             np.testing.assert_allclose(actual[1], tints, atol=1e-6)
-    warm, cool = (np.asarray(aligned.colors)[2 + k] for k in (0, 1))
-    assert warm.max() == cool.max() == 1 and (warm[:, 0] >= cool[:, 0]).all() and (warm[:, 2] <= cool[:, 2]).all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 3])
@@ -111,18 +99,12 @@ def test_other_counts_are_refused(count: int) -> None:
 
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])
 def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = describe_looks(PACKED, NETWORK, CONFIG, 4)
-    sizes = []
-
-    def record(chunk: thor2.PointClouds, config: thor2.DescriptorConfig, count: int) -> Any:
-        sizes.append(len(chunk.mask))
-        return aligned_looks(chunk, config, count)
-
+    whole, recorded = describe_looks(PACKED, NETWORK, CONFIG, 4), Mock(wraps=aligned_looks)
     monkeypatch.setattr(describe, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
-    monkeypatch.setattr(looks, "aligned_looks", record)
+    monkeypatch.setattr(looks, "aligned_looks", recorded)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     chunked = describe_looks(PACKED, NETWORK, CONFIG, 4)
-    assert len(sizes) == calls
+    assert recorded.call_count == calls
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked, whole)
 
 
@@ -140,10 +122,8 @@ def test_descriptors_and_statistics_are_those_of_each_look() -> None:
     aligned = aligned_looks(PACKED, CONFIG, 4)
     assert described.statistics.shape[:2] == described.shape == (2, 4)
     np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CONFIG).tops2, atol=1e-4)
-    for row in range(8):
-        points, colors = look(aligned, row // 4, row % 4, 4)
-        # The cloud of the look alone: points of the rim are not there, instead of masked.
-        alone = dataclasses.replace(thor2.PointClouds.pack([(points, colors)]), camera=aligned.camera[row : row + 1])
+    for row, cloud in enumerate(aligned.unpack()):
+        alone = thor2.PointClouds.pack([cloud])  # points of the rim are not there, instead of masked
         descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
         expected = thor2.describe_aligned(alone, NETWORK, CONFIG)
         np.testing.assert_allclose(descriptors.tops2, expected.tops2[0], atol=1e-4)
@@ -169,12 +149,11 @@ def test_fused_probabilities_are_geometric_means() -> None:
 
 
 def test_statistics_of_a_cloud() -> None:
-    ((points, colors),) = random_clouds(0, [300])
-    clouds = thor2.PointClouds.pack([(points, colors)])
-    aligned = thor2.align(clouds, CONFIG)
+    colors = LONG[1]
+    aligned = thor2.align(thor2.PointClouds.pack([LONG]), CONFIG)
     described = strips(aligned, NETWORK, CONFIG)
     values = np.asarray(cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), aligned, described))[0]
-    scalars = [1, 0.5, 0.25, 0.75, np.sqrt(300) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
+    scalars = [1, 0.5, 0.25, 0.75, np.sqrt(404) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
     region_points = np.asarray(described.color).sum(axis=(0, 1, 2))
     expected = [*scalars, *np.sqrt(region_points / region_points.sum())]
     assert len(scalars) == N_SCALARS
@@ -199,12 +178,9 @@ def test_balanced_histograms_are_those_of_colour_science() -> None:
 
 
 def test_side_lengths_are_those_before_the_turn() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.random((300, 3)) * (0.2, 0.1, 0.05)
-    clouds = thor2.PointClouds.pack([(points.astype(np.float32), np.zeros((300, 3), np.uint8))])
-    normal = np.asarray(thor2.view_normalize(clouds, CONFIG).points)[0]
-    sides = side_lengths(thor2.align(clouds, CONFIG), CONFIG.alpha)[0]
-    np.testing.assert_allclose(sides, np.sort(np.ptp(normal, axis=0))[::-1], atol=1e-4)
+    extents = np.ptp(thor2.view_normalize(PACKED, CONFIG).points, axis=1)  # padding lies in a corner of the box
+    sides = side_lengths(thor2.align(PACKED, CONFIG), CONFIG.alpha)
+    np.testing.assert_allclose(sides, np.sort(extents)[:, ::-1], atol=1e-4)
 
 
 def test_statistics_of_one_color_have_gradients() -> None:

@@ -45,21 +45,14 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
         np.testing.assert_array_equal(i, [0, number])
 
 
-def as_8_bit(colors: np.ndarray) -> np.ndarray:
-    """Round colours in [0, 1], float32, to the nearest of 256 levels, halves up."""
-    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
-
-
-def weights(colors: np.ndarray) -> np.ndarray:
-    sets = region_sets(NETWORK)
-    return np.asarray(sets.weights[jax.jit(color_sets)(colors, sets)])
-
-
 def test_every_level_of_a_channel_and_every_half_between_two() -> None:
     """Means of two 8-bit colours lie between two levels, where single precision decides the rounding."""
     halves = (np.arange(511) / 510).astype(np.float32)
     values = np.concatenate([halves, np.nextafter(halves, np.float32(0)), np.nextafter(halves, np.float32(1))])
+    sets = region_sets(NETWORK)
     for axis in range(3):
         colors = np.full((len(values), 3), 0.5, np.float32)
         colors[:, axis] = values
-        np.testing.assert_array_equal(weights(colors), NETWORK.membership(as_8_bit(colors)))
+        eight_bit = np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+        weights = sets.weights[jax.jit(color_sets)(colors, sets)]
+        np.testing.assert_array_equal(weights, NETWORK.membership(eight_bit))

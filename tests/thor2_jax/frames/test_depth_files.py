@@ -31,14 +31,11 @@ def assert_depth(path: Path, expected: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(("name", "values"), [("d.png", UNITS), ("d.tiff", UNITS), ("d.tif", METRES)])
-def test_images_written_by_opencv(tmp_path: Path, name: str, values: np.ndarray) -> None:
+def test_images_written_by_opencv_and_pillow(tmp_path: Path, name: str, values: np.ndarray) -> None:
     assert cv2.imwrite(str(tmp_path / name), values)
     assert_depth(tmp_path / name, values)
-
-
-def test_floats_in_tiff_written_by_pillow(tmp_path: Path) -> None:
-    Image.fromarray(METRES).save(tmp_path / "d.tiff")
-    assert_depth(tmp_path / "d.tiff", METRES)
+    Image.fromarray(values).save(tmp_path / name)
+    assert_depth(tmp_path / name, values)
 
 
 @pytest.mark.parametrize(

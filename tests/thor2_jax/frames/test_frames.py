@@ -3,13 +3,12 @@
 import dataclasses
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from image_files import deep_png, encode_image
+from image_files import deep_png, encode_image, write_frame_files
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from refusals import assert_refused
@@ -147,13 +146,10 @@ def test_largest_number_of_instances() -> None:
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
     """Write the frame of `arrays()` to files."""
-    fields = arrays()
-    paths = {name: tmp_path / f"{name}.png" for name in ("color", "depth", "labels")}
-    for name, path in paths.items():
-        Image.fromarray(fields[name]).save(path)
-    paths["intrinsics"] = tmp_path / "intrinsics.json"
-    paths["intrinsics"].write_text(json.dumps(dataclasses.asdict(CAMERA)))
-    return paths
+    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
+    write_frame_files(tmp_path, RGBDFrame(**arrays()))
+    (tmp_path / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(CAMERA)))
+    return {field: tmp_path / name for field, name in names.items()}
 
 
 def test_a_frame_of_files(files: dict[str, Path]) -> None:
@@ -204,9 +200,7 @@ def test_images_with_an_invalid_checksum_are_refused(tmp_path: Path) -> None:
         (read_labels, ("RGB", "RGBA", "LA", "1"), "^labels: .*integers"),
     ],
 )
-def test_images_of_other_modes_are_refused(
-    tmp_path: Path, read: Callable[[Path], Any], modes: tuple[str, ...], problem: str
-) -> None:
+def test_images_of_other_modes_are_refused(tmp_path: Path, read: Any, modes: tuple[str, ...], problem: str) -> None:
     for mode in modes:
         path = tmp_path / ("c.jpg" if mode == "CMYK" else "c.png")
         Image.new(mode, (7, 5)).save(path)

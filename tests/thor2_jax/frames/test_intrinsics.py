@@ -62,6 +62,7 @@ def as_text(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
+IMAGES = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
 BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
 SIZE = {"width": 640, "height": 480}
 REALSENSE = {**SIZE, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
@@ -188,12 +189,11 @@ def test_invalid_npy_files() -> None:
 
 
 def test_the_size_of_the_images_is_checked() -> None:
-    images = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
     for width, height in ((64, 48), (None, 48), (None, None)):
-        RGBDFrame(*images, Intrinsics(60, 60, 32, 24, width=width, height=height))
+        RGBDFrame(*IMAGES, Intrinsics(60, 60, 32, 24, width=width, height=height))
     for width, height in ((128, 96), (48, 64), (64, 47)):
         message = rf"^intrinsics is for images of {width} x {height} pixels; color has 64 x 48"
-        assert_refused(message, RGBDFrame, *images, Intrinsics(60, 60, 32, 24, width=width, height=height))
+        assert_refused(message, RGBDFrame, *IMAGES, Intrinsics(60, 60, 32, 24, width=width, height=height))
 
 
 # Geometry
@@ -236,6 +236,5 @@ def test_other_distortion_models_are_refused_by_name(values: Any, name: str) -> 
 
 @pytest.mark.parametrize("distortion", [(-9.0, 0, 0, 0), (0.0, 0, 80, 0), (0, 0, 0, 0, 0, -5.0, 0, 0)])
 def test_distortion_without_an_inverse_is_refused(distortion: tuple[float, ...]) -> None:
-    images = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
     camera = Intrinsics(40, 40, 32, 24, distortion=distortion)
-    assert_refused("^intrinsics has the distortion .*no inverse", RGBDFrame, *images, camera)
+    assert_refused("^intrinsics has the distortion .*no inverse", RGBDFrame, *IMAGES, camera)

@@ -36,8 +36,8 @@ def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front:
     depth, labels = scene(front=front)
     labels[:, 30:38] = 0
     labels[40 + touching :, 80:130] = 0
-    found, boundary = occlusions(depth, labels)[BACK]
-    assert found == occluded and boundary.any() == occluded
+    is_occluded, boundary = occlusions(depth, labels)[BACK]
+    assert is_occluded == occluded and boundary.any() == occluded
 
 
 @pytest.mark.parametrize(("missing", "occluded"), [(5, True), (6, False)])
@@ -45,8 +45,8 @@ def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front:
 def test_depth_may_be_missing_along_the_edge(whose: str, missing: int, occluded: bool) -> None:
     depth, labels = scene()
     depth[:, slice(80 - missing, 80) if whose == "own" else slice(80, 80 + missing)] = 0
-    found, boundary = occlusions(depth, labels)[BACK]
-    assert found == occluded
+    is_occluded, boundary = occlusions(depth, labels)[BACK]
+    assert is_occluded == occluded
     # Without its own depth, the edge is at least 13 mm from the cloud.
     assert boundary.any() == (occluded and whose == "other")
 
@@ -83,26 +83,21 @@ def test_instances_without_depth_or_of_one_pixel() -> None:
 
 def occlusion_by_loop(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, np.ndarray]:
     """Apply the rule to masks without gaps or missing depth, where only direct neighbours matter."""
-    height, width = frame.labels.shape
+    labels = np.pad(frame.label_image, 1, constant_values=-1)
+    depth = np.pad(frame.depth_m, 1)  # 0 outside the image, nearer than everything
     contour, edge = 0, []
-    for row, column in zip(*np.nonzero(frame.labels == cloud.label), strict=True):
-        own = frame.depth_m[row, column]
-        on_contour = on_edge = False
-        for r, c in ((row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)):
-            if not (0 <= r < height and 0 <= c < width):
-                on_contour = on_edge = True
-            elif frame.labels[r, c] != cloud.label:
-                on_contour = True
-                on_edge |= bool(frame.depth_m[r, c] < own - np.float32(0.01))
-        contour += on_contour
-        if on_edge:
-            edge.append(((column - CAMERA.cx) / CAMERA.fx * own, (row - CAMERA.cy) / CAMERA.fy * own, own))
+    for row, column in np.argwhere(labels == cloud.label):
+        own = depth[row, column]
+        beside = ((row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1))
+        others = [pixel for pixel in beside if labels[pixel] != cloud.label]
+        contour += len(others) > 0
+        if any(depth[pixel] < own - np.float32(0.01) for pixel in others):
+            edge.append([(column - 1 - CAMERA.cx) / CAMERA.fx * own, (row - 1 - CAMERA.cy) / CAMERA.fy * own, own])
     occluded = len(edge) > 0 and len(edge) >= 0.05 * contour
     marked = np.zeros(len(cloud.points), bool)
     if occluded and len(cloud.points):
-        distance = cdist(np.array(edge), cloud.points)
-        nearest = distance.argmin(axis=1)
-        marked[nearest[distance.min(axis=1) <= 0.012]] = True
+        distance = cdist(edge, cloud.points)
+        marked[distance.argmin(axis=1)[distance.min(axis=1) <= 0.012]] = True
     return occluded, marked
 
 
@@ -110,8 +105,7 @@ def occlusion_by_loop(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, 
 def test_against_a_loop_over_the_pixels(seed: int) -> None:
     """The instances fill the image, each at another depth and with a rough surface."""
     rng = np.random.default_rng(seed)
-    shape = (61, 83)
-    count = 9
+    shape, count = (61, 83), 9
     centres = rng.uniform(0, 1, (count, 2)) * shape
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     wobble = gaussian_filter(rng.normal(size=(count, *shape)), (0, 3, 3)) * 60
@@ -122,8 +116,8 @@ def test_against_a_loop_over_the_pixels(seed: int) -> None:
     answers = []
     for cloud in instance_clouds(frame):
         occluded, marked = occlusion_by_loop(frame, cloud)
-        found, boundary = find_occlusion(frame, cloud)
-        assert found == occluded
+        is_occluded, boundary = find_occlusion(frame, cloud)
+        assert is_occluded == occluded
         # A boundary pixel halfway between two points may mark either.
         assert (boundary != marked).sum() <= 0.02 * len(marked)
         answers.append(occluded)

@@ -1,4 +1,4 @@
-"""The voxel grid against a dictionary of cubes, and outlier removal against loops and grids labelled by SciPy."""
+"""The voxel grid against cubes by NumPy, and outlier removal against loops and components by SciPy."""
 
 import math
 import re
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import assert_refused
-from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
@@ -18,14 +18,11 @@ CAMERA = Intrinsics(611.3, 620.0, 10.0, 8.0)
 # The voxel grid
 
 
-def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+def means_by_cube(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the means of points and values in each cube, in lexicographic order and float64."""
     points, values = points.astype(np.float64), values.astype(np.float64)
-    low = points.min(axis=0) - size / 2
-    cubes: dict[tuple[int, ...], list[int]] = {}
-    for i, point in enumerate(points):
-        cubes.setdefault(tuple(math.floor((point[k] - low[k]) / size) for k in range(3)), []).append(i)
-    members = [cubes[key] for key in sorted(cubes)]
+    cubes = np.floor((points - (points.min(axis=0) - size / 2)) / size)
+    members = [(cubes == cube).all(axis=1) for cube in np.unique(cubes, axis=0)]
     return np.array([points[m].mean(axis=0) for m in members]), np.array([values[m].mean(axis=0) for m in members])
 
 
@@ -36,12 +33,10 @@ def test_means_of_cubes(count: int, size: float) -> None:
     points = rng.uniform(-0.1, 0.2, (count, 3))
     colors = rng.uniform(0, 1, (count, 3))
     before = points.copy(), colors.copy()
-    mean_points, mean_colors = voxel_downsample(points, colors, size)
-    assert size < 10 or len(mean_points) == 1
+    means = voxel_downsample(points, colors, size)
     np.testing.assert_array_equal((points, colors), before)
-    expected_points, expected_colors = by_dictionary(points, colors, size)
-    np.testing.assert_allclose(mean_points, expected_points, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(mean_colors, expected_colors, rtol=0, atol=1e-15)
+    for mean, expected in zip(means, means_by_cube(points, colors, size), strict=True):
+        np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-15)
 
 
 def test_types_are_kept_and_colors_rounded_halves_up() -> None:
@@ -81,22 +76,16 @@ def test_clouds_beyond_the_largest_bucket_get_larger_voxels(side: int, doublings
 # Flying pixels
 
 
-def frame_of(depth: np.ndarray, labels: np.ndarray) -> RGBDFrame:
-    return RGBDFrame(np.zeros((*labels.shape, 3), np.uint8), depth, labels, CAMERA)
-
-
 def flying_by_loop(depth: np.ndarray, labels: np.ndarray, label: int) -> np.ndarray:
     """Return the flying pixels of an instance, [H, W] bool, with a loop; depth in millimetres."""
-    height, width = labels.shape
+    labels, depth = np.pad(labels, 1), np.pad(depth.astype(float), 1)
     flying = np.zeros(labels.shape, bool)
-    for row in range(height):
-        for column in range(width):
-            for r, c in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
-                if 0 <= r < height and 0 <= c < width and labels[row, column] == labels[r, c] == label:
-                    here, there = float(depth[row, column]), float(depth[r, c])
-                    if there > 0 and here - there > 15 * here / CAMERA.fx:
-                        flying[row, column] = True
-    return flying
+    for row, column in np.argwhere(labels == label):
+        here = depth[row, column]
+        for beside in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if labels[beside] == label and depth[beside] > 0 and here - depth[beside] > 15 * here / CAMERA.fx:
+                flying[row, column] = True
+    return flying[1:-1, 1:-1]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (17, 23)])
@@ -107,11 +96,10 @@ def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> No
     depth = (900 + rng.integers(0, spread, shape)).astype(np.uint16)
     depth[rng.random(shape) < 0.1] = 0
     labels = rng.choice([0, 2, 5], shape, p=[0.1, 0.7, 0.2]).astype(np.uint8)
-    frame = frame_of(depth, labels)
+    frame = RGBDFrame(np.zeros((*shape, 3), np.uint8), depth, labels, CAMERA)
     for label, pixels in frame.instance_pixels.items():
-        flying = flying_pixels(frame, pixels)
-        assert flying.shape == pixels.shape and flying.dtype == bool
-        np.testing.assert_array_equal(flying, flying_by_loop(depth, labels, label).ravel()[pixels])
+        expected = flying_by_loop(depth, labels, label).ravel()[pixels]
+        np.testing.assert_array_equal(flying_pixels(frame, pixels), expected, strict=True)
 
 
 # Isolated points and connected components
@@ -124,20 +112,10 @@ def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
     among = np.array([len(row) == 30 and float(np.mean(row)) <= 0.016 for row in nearest])
     relaxed = among.sum() < len(points) / 2
     index = np.arange(len(points)) if relaxed else np.flatnonzero(among)
-    cells = np.floor(points[index] / 0.01).astype(int)
-    cells -= cells.min(axis=0)
-    occupied = np.zeros(cells.max(axis=0) + 1, bool)
-    occupied[tuple(cells.T)] = True
-    piece = ndimage.label(occupied, structure=np.ones((3, 3, 3)))[0][tuple(cells.T)]
-    largest = max(int((piece == k).sum()) for k in set(piece.tolist()))
-    return index[[int((piece == k).sum()) * 10 >= largest for k in piece]], bool(relaxed)
-
-
-def assert_equals_loops(points: np.ndarray) -> None:
-    kept, relaxed = remove_outliers(points)
-    expected, expected_relaxed = kept_by_loops(points)
-    np.testing.assert_array_equal(kept, expected)
-    assert relaxed is expected_relaxed
+    cells = np.floor(points[index] / 0.01)
+    _, piece = connected_components(cdist(cells, cells, "chebyshev") <= 1)
+    size = np.bincount(piece)[piece]
+    return index[10 * size >= size.max()], bool(relaxed)
 
 
 @pytest.mark.parametrize("count", [1, 2, 30, 31, 32, 101, 400])
@@ -148,7 +126,7 @@ def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
     rng = np.random.default_rng(count)
     points = (rng.normal(size=(count, 3)) * side * rng.uniform(0.1, 1, (count, 1))).astype(kind)
     before = points.copy()
-    assert_equals_loops(points)
+    np.testing.assert_equal(remove_outliers(points), kept_by_loops(points))
     np.testing.assert_array_equal(points, before)
 
 
@@ -160,7 +138,7 @@ def test_clouds_on_the_voxel_grid_against_loops(share: float, depth: int) -> Non
     cubes = np.argwhere(rng.random((20, 20, depth)) < share)
     cubes = cubes[rng.permutation(len(cubes))[:1200]]
     points = (cubes + rng.random(cubes.shape)) * 0.003 - [0.03, 0.01, -0.8]
-    assert_equals_loops(points)
+    np.testing.assert_equal(remove_outliers(points), kept_by_loops(points))
 
 
 def grid(rows: int, columns: int, spacing: float = 0.003) -> np.ndarray:

@@ -1,14 +1,14 @@
 """Overlays of answers against outlines computed by SciPy and the rectangles of the drawn text."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
+from refusals import assert_refused
 from scipy import ndimage
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames import overlay
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, draw_overlay
 from thor2_jax.model.recognition import Recognition
 
@@ -52,9 +52,7 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[int, int, int, in
         last.append(xy)
         rectangle(self, xy, **options)
 
-    def with_text(
-        self: ImageDraw.ImageDraw, xy: tuple[float, float], words: str, *rest: object, **options: float
-    ) -> None:
+    def with_text(self: ImageDraw.ImageDraw, xy: tuple[float, float], words: str, *rest: Any, **options: Any) -> None:
         left, top, right, bottom = self.multiline_textbbox(xy, words, rest[1], spacing=options["spacing"])
         box = last[-1]
         assert box[0] < left and box[1] < top and right <= box[2] and bottom <= box[3], "the text leaves its box"
@@ -73,8 +71,8 @@ def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int
     return free
 
 
-def test_outlines_lie_on_the_inner_edge_of_the_masks(tmp_path: Path, boxes: list) -> None:
-    labels = discs([(120, 150), (300, 400)], 60)
+def test_outlines_lie_on_the_inner_edge_of_touching_masks(tmp_path: Path, boxes: list) -> None:
+    labels = discs([(250, 310), (300, 400)], 60)
     labels[300:320, 390:410] = 0  # holes have an outline too
     answers = [named(1), Recognition(label=2, reason="too few points")]
     picture = drawn(photo(), labels, answers, tmp_path / "a.png")
@@ -89,41 +87,21 @@ def test_outlines_lie_on_the_inner_edge_of_the_masks(tmp_path: Path, boxes: list
         assert (picture[inside] == GREY).all()
 
 
-def test_touching_neighbours_keep_their_own_outlines(tmp_path: Path, boxes: list) -> None:
-    labels = np.zeros((480, 640), np.uint8)
-    labels[200:300, 200:300], labels[200:300, 300:400] = 1, 2
-    picture = drawn(photo(), labels, [named(1), named(2)], tmp_path / "a.png")
-    rows = np.flatnonzero(outside(boxes, labels.shape)[200:300, 298:302].all(axis=1)) + 200
-    assert len(rows) > 20
-    assert (picture[rows, 298:300] == COLORS[0]).all() and (picture[rows, 300:302] == COLORS[1]).all()
-
-
 def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> None:
-    labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (250, 340), (260, 330)], 40)
-    answers = [
-        named(1, "mug"),
-        named(2, "bowl", occluded=True),
-        Recognition(label=3, reason="too few points"),
-        Recognition(label=4, occluded=True, reason="too few points"),
-        Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
-        named(6, "pitcher"),
-        Recognition(label=7, name="spoon"),
-    ]
-    drawn(photo(), labels, answers, tmp_path / "a.png")
-    assert [text for _, text in boxes] == [
-        "mug 0.76\nTOPS2",
-        "bowl 0.76\nTOPS2, occluded",
-        "unrecognized",
-        "unrecognized\noccluded",
-        "plate 1.00\nTOPS",
-        "pitcher 0.76\nTOPS2",
-        "spoon",
-    ]
-    count = np.zeros(labels.shape, int)
-    for (left, top, right, bottom), _ in boxes:
-        assert 0 <= left < right < 640 and 0 <= top < bottom < 480
-        count[top : bottom + 1, left : right + 1] += 1
-    assert count.max() == 1
+    labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (244, 320), (248, 320)], 40)
+    answers = {
+        "mug 0.76\nTOPS2": named(1, "mug"),
+        "bowl 0.76\nTOPS2, occluded": named(2, "bowl", occluded=True),
+        "unrecognized": Recognition(label=3, reason="too few points"),
+        "unrecognized\noccluded": Recognition(label=4, occluded=True, reason="too few points"),
+        "plate 1.00\nTOPS": Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
+        "pitcher 0.76\nTOPS2": named(6, "pitcher"),
+        "spoon": Recognition(label=7, name="spoon"),
+    }
+    drawn(photo(), labels, list(answers.values()), tmp_path / "a.png")
+    assert [text for _, text in boxes] == list(answers)
+    areas = [(right + 1 - left) * (bottom + 1 - top) for (left, top, right, bottom), _ in boxes]
+    assert sum(areas) == (~outside(boxes, labels.shape)).sum()  # smaller if labels overlap or leave the picture
 
 
 def test_text_is_legible_on_its_box(tmp_path: Path, boxes: list) -> None:
@@ -183,22 +161,20 @@ def test_tiny_pictures_have_outlines_without_labels(tmp_path: Path, boxes: list,
 
 @pytest.mark.parametrize("label", [0, 4, -1, 300])
 def test_an_answer_without_an_instance(tmp_path: Path, label: int) -> None:
-    with pytest.raises(InputError, match=f"answers: label {label} "):
-        draw_overlay(photo(), discs([(100, 100)], 20), [named(1), named(label)], tmp_path / "a.png")
+    arguments = photo(), discs([(100, 100)], 20), [named(1), named(label)], tmp_path / "a.png"
+    assert_refused(f"answers: label {label} ", draw_overlay, *arguments)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"labels has shape \(5, 4\)"):
-        draw_overlay(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4), int), [], tmp_path / "a.png")
+    images = photo(4, 5), np.zeros((5, 4), int)
+    assert_refused(r"labels has shape \(5, 4\)", draw_overlay, *images, [], tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(
-    "name, drawn", [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")]
+    ("name", "text"),
+    [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")],
 )
-def test_missing_characters_are_escaped(name: str, drawn: str, tmp_path: Path) -> None:
-    labels = np.zeros((480, 640), np.uint8)
-    labels[80:120, 20:60] = 1
-    draw_overlay(photo(), labels, [Recognition(label=1, name=name)], tmp_path / "overlay.png")
-    lettering = overlay._fit(ImageDraw.Draw(Image.new("RGB", (9, 9))), name, 20, (400, 200))
-    assert lettering is not None and lettering.text == drawn
+def test_missing_characters_are_escaped(name: str, text: str, tmp_path: Path, boxes: list) -> None:
+    drawn(photo(), discs([(100, 40)], 20), [Recognition(label=1, name=name)], tmp_path / "a.png")
+    assert boxes[0][1] == text

@@ -76,12 +76,7 @@ def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("size", [1000, 50_000])
 def test_a_database_on_a_full_disk_is_named(tmp_path: Path, size: int) -> None:
     frame, path = segmented(table_frame()), tmp_path / "out"
-
-    def write() -> None:
-        with DetectionBag(path) as bag:
-            for stamp in range(20):
-                bag.write(frame, detections_of(frame, ANSWERS), stamp=stamp)
-
-    with small_disk(size), pytest.raises(OSError, match="disk") as caught:
-        write()
+    with small_disk(size), pytest.raises(OSError, match="disk") as caught, DetectionBag(path) as bag:
+        for stamp in range(20):
+            bag.write(frame, detections_of(frame, ANSWERS), stamp=stamp)
     assert caught.value.filename == str(path) and list(tmp_path.iterdir()) == []

@@ -36,17 +36,13 @@ def test_pairs_equal_those_of_all_pairs(seed: int) -> None:
     rng = np.random.default_rng(seed)
     images, stamps = [], {}
     for is_color, period in ((True, 33), (False, int(rng.integers(15, 120)))):
-        steps = rng.uniform(0.5, 1.5, 60) * period * MS
-        stamps[is_color] = [int(stamp) for stamp in np.cumsum(steps)]
+        stamps[is_color] = np.cumsum(rng.uniform(0.5, 1.5, 60) * period * MS).astype(int).tolist()
         late = int(rng.integers(0, 300)) * MS
         images += [StampedImage(is_color, stamp, stamp + late, None) for stamp in stamps[is_color]]
     images.sort(key=lambda image: image.arrival)
     tolerance = 15 * MS
-    expected = []
-    for color in stamps[True]:
-        nearest = min(stamps[False], key=lambda depth: abs(depth - color))
-        if abs(nearest - color) <= tolerance:
-            expected.append((color, nearest))
+    nearest = [(color, min(stamps[False], key=lambda depth: abs(depth - color))) for color in stamps[True]]
+    expected = [(color, depth) for color, depth in nearest if abs(depth - color) <= tolerance]
     pairs, counts = pairs_of(images, tolerance)
     assert pairs == expected
     assert (counts.color, counts.depth, counts.pairs) == (60, 60, len(expected))
@@ -55,11 +51,9 @@ def test_pairs_equal_those_of_all_pairs(seed: int) -> None:
 def test_streams_with_other_clocks_are_not_paired() -> None:
     hour = 3600 * 10**9
     for shift in (hour, -hour):
-        images = [
-            StampedImage(is_color, k * 33 * MS + (0 if is_color else shift), k * 33 * MS, None)
-            for k in range(200)
-            for is_color in (True, False)
-        ]
+        images = []
+        for arrival in range(0, 200 * 33 * MS, 33 * MS):
+            images += [StampedImage(True, arrival, arrival, None), StampedImage(False, arrival + shift, arrival, None)]
         pairs, counts = pairs_of(images, 30 * MS)
         assert pairs == [] and counts.color == counts.depth == 200
         assert counts.smallest_gap is not None and abs(counts.smallest_gap - hour) < 2 * LONGEST_WAIT + 7 * 10**9

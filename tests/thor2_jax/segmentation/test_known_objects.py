@@ -42,7 +42,10 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
 
 
 def test_only_pieces_of_one_known_object_are_merged() -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
+    quantiles = np.quantile(np.nonzero(TRUTH)[1], [0.45, 0.9])
+    three = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), quantiles), 0)
+    for pieces in (TRUTH, three):
+        np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
     np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
 
 
@@ -50,18 +53,10 @@ def test_a_piece_is_divided_although_all_of_it_resembles_one_object() -> None:
     apart = knows(TRUTH == 1, TRUTH == 2)
 
     def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        whole = int((TRUTH > 0).sum())
-        sizes = [int((frame.label_image == 1).sum()) for frame in frames]
-        return [("0", 0.985) if n == whole else each for n, each in zip(sizes, apart(frames), strict=True)]
+        are_whole = [(frame.label_image == 1).sum() == ONE_PIECE.sum() for frame in frames]
+        return [("0", 0.985) if whole else each for whole, each in zip(are_whole, apart(frames), strict=True)]
 
     assert (best_overlaps(segment_known(FRAME, ONE_PIECE, recognize), TRUTH) > 0.9).all()
-
-
-def test_more_than_two_pieces_of_one_object_are_merged() -> None:
-    column = np.nonzero(TRUTH)[1]
-    pieces = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), np.quantile(column, [0.45, 0.9])), 0)
-    assert pieces.max() == 3
-    np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
@@ -71,18 +66,15 @@ def test_frames_without_pieces_or_without_depth_remain() -> None:
     np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown), ONE_PIECE)
 
 
-@pytest.mark.parametrize(
-    "recognize",
-    [
-        pytest.param(knows(TRUTH > 0), id="one known object"),
-        pytest.param(knows(TRUTH == 1), id="a known object beside an unknown one"),
-        pytest.param(lambda frames: [(None, 0.99)] * len(frames), id="unknown objects"),
-        pytest.param(lambda frames: [("a", 0.5)] * len(frames), id="without confidence"),
-        pytest.param(lambda frames: [("a", 0.99)] * len(frames), id="the same object everywhere"),
-    ],
-)
-def test_a_piece_without_two_known_objects_remains(recognize: Recognize) -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
+@pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1], ids=["all of it", "one half"])
+def test_a_piece_with_one_known_object_remains(known: NDArray[np.bool_]) -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, knows(known)), ONE_PIECE)
+
+
+@pytest.mark.parametrize("answer", [(None, 0.99), ("a", 0.5), ("a", 0.99)], ids=["unknown", "unsure", "one object"])
+def test_a_piece_with_one_answer_everywhere_remains(answer: Answer) -> None:
+    labels = segment_known(FRAME, ONE_PIECE, lambda frames: [answer] * len(frames))
+    np.testing.assert_array_equal(labels, ONE_PIECE)
 
 
 def test_candidates_are_shown_where_they_are() -> None:

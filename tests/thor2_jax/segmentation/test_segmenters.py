@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from typing import Any
 
 import numpy as np
@@ -31,12 +31,7 @@ def halves(frame: RGBDFrame) -> np.ndarray[Any, Any]:
 def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
     """Return a function that offers an entry point of the group for the duration of a test."""
     points: list[EntryPoint] = []
-
-    def entry_points(group: str, name: str | None = None) -> list[EntryPoint]:
-        assert group == ENTRY_POINTS
-        return [point for point in points if name in (None, point.name)]
-
-    monkeypatch.setattr(segmenters, "entry_points", entry_points)
+    monkeypatch.setattr(segmenters, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted))
     monkeypatch.setitem(sys.modules, "wrapper", sys.modules[__name__])
     return lambda name, value: points.append(EntryPoint(name, value, ENTRY_POINTS))
 

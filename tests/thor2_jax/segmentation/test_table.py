@@ -51,13 +51,12 @@ SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
 def test_each_box_of_a_scene_is_a_thing(name: str) -> None:
     boxes, pose, least = SCENES[name]
     frame = render(boxes, *pose)
-    color, depth = frame.color.copy(), frame.depth.copy()
+    before = frame.color.copy(), frame.depth.copy()
     labels = segment_table(dataclasses.replace(frame, labels=None))
     assert labels.dtype == np.int32 and sorted(np.unique(labels)) == list(range(len(boxes) + 1))
     assert (best_overlaps(labels, frame.label_image) > least).all()
     np.testing.assert_array_equal(segment_table(frame), labels)  # its own labels are not read
-    np.testing.assert_array_equal(frame.color, color)
-    np.testing.assert_array_equal(frame.depth, depth)
+    np.testing.assert_equal((frame.color, frame.depth), before)
 
 
 WHITE, DARK_RED = (225, 225, 220), (170, 60, 50)
@@ -88,9 +87,7 @@ def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
 @pytest.mark.parametrize("size", [(481, 641), *slow((480, 640), (720, 1280))])
 def test_larger_images_have_labels_of_their_size(size: tuple[int, int]) -> None:
     frame = render(APART, size=size)
-    labels = segment_table(frame)
-    assert labels.shape == size
-    assert (best_overlaps(labels, frame.label_image) > 0.85).all()
+    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.85).all()
 
 
 def test_frames_without_things() -> None:
