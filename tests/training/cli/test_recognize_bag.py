@@ -29,8 +29,9 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     [pytest.param("a.bag", "out.mcap", marks=pytest.mark.slow), ("folder", "out"), ("a.mcap", "out.mcap")],
 )
 def test_detections_are_read_back(recognize: Recognize, tmp_path: Path, name: str, out: str) -> None:
-    path = write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
-    lines = recognize("--bag", path, "--out-bag", tmp_path / out)
+    """The objects of the folder are tracked."""
+    is_tracked, path = name == "folder", write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
+    lines = recognize("--bag", path, "--out-bag", tmp_path / out, *["--track"] * is_tracked)
     assert [line["frame"] for line in lines] == [f"1700000000.{k * PERIOD:09d}" for k in range(3)]
     messages = messages_of(tmp_path / out)
     assert set(messages) == {"/thor2/detections", "/thor2/overlay/compressed"}
@@ -49,6 +50,8 @@ def test_detections_are_read_back(recognize: Recognize, tmp_path: Path, name: st
         expected = [[60 + 3 * k, 80, 50, 70], [180 + 3 * k, 80, 70, 70]]
         np.testing.assert_allclose([one["box"] for one in line["instances"]], expected, atol=2)
         assert line["instances"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
+        tracks = [(one.get("track"), one.get("frames")) for one in line["instances"]]
+        assert tracks == ([(1, k + 1), (2, k + 1)] if is_tracked else [(None, None)] * 2)
     _, overlay = messages["/thor2/overlay/compressed"][0]
     assert Image.open(io.BytesIO(overlay.data.tobytes())).size == (320, 240)
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
@@ -61,15 +64,6 @@ def test_every_second_frame_and_pictures(recognize: Recognize, segment: tuple[st
     assert [line["frame"] for line in lines] == ["1700000000.000000000", "1700000000.066666666"]
     assert all(one["name"] is None for line in lines for one in line["instances"])
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
-
-
-def test_tracks_are_the_ids_of_detections(recognize: Recognize, tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "a.mcap", FRAMES)
-    lines = recognize("--bag", path, "--track", "--out-bag", tmp_path / "out")
-    assert [[one["track"] for one in line["instances"]] for line in lines] == [[1, 2]] * 3
-    assert [one["frames"] for one in lines[2]["instances"]] == [3, 3]
-    for _, array in messages_of(tmp_path / "out")["/thor2/detections"]:
-        assert [detection.id for detection in array.detections] == ["1", "2"]
 
 
 def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: Command) -> None:

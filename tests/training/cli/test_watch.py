@@ -37,7 +37,7 @@ def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], cap
     assert messages[-1]["number"] == 2
 
 
-def test_frames_with_labels_do_not_need_opencv(
+def test_only_frames_without_labels_need_opencv(
     model: Path, tmp_path: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
     frame = FRAMES[0]
@@ -48,14 +48,8 @@ def test_frames_with_labels_do_not_need_opencv(
     assert run_thor2(*command) == 0
     assert messages[-1]["number"] == 1
     assert "needs OpenCV" in refused(*command, "--segment", "table")
-
-
-def test_a_frame_without_labels_needs_opencv(
-    model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, refused: Command
-) -> None:
-    monkeypatch.delitem(sys.modules, "thor2_jax.segmentation.table", raising=False)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    assert "needs OpenCV" in refused("watch", "--model", model, "--folder", folder, "--port", 0)
+    (tmp_path / "frames" / "0" / "mask.png").unlink()
+    assert "needs OpenCV" in refused(*command)
 
 
 def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
