@@ -140,13 +140,17 @@ def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monk
     assert run.record == whole[1].record
     assert logged_rows(out) == logged_rows(whole[0])
     assert names(out) == FINISHED
-    assert_refused("out: .* already contains", train, out, ("tops", "ce"))
 
 
 @pytest.mark.usefixtures("unfitted")
-def test_interrupted_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupts before the first file is moved to its name, and after some of them are."""
+def test_failures_before_and_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full at several steps; interrupts before the first file is moved to its name, and after some are."""
     out, rename = tmp_path / "run", Path.rename
+    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+            patch.setattr(module, name, full_disk)
+            train(out)
+        assert not (out / "run.json").exists()
     for moved in (None, "tops.safetensors", "network.npz", "run.json"):
 
         def stopping(self: Path, target: Path) -> Path:
@@ -172,15 +176,14 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train(out, progress=stop_when("fit tops", 4))
     before = files_of(out)
     begun = Protocol(("tops",), OPTIONS, CONFIG)
-    cases: list[tuple[str, int, dict[str, Any]]] = [
+    for message, seed, changes in (
         ("batch_size 8, not 6", 0, {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", 0, {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
         (r"classifiers\[0\] \"tops\", not \"ce\"", 0, {"classifiers": ("tops", "ce")}),
         ("folds 1, not 3", 0, {"folds": 3}),
         (f'dataset "{source().digest}", not ', 1, {}),
         (r"descriptor_config\.\w+ ", 0, {"config": thor2.DescriptorConfig()}),
-    ]
-    for message, seed, changes in cases:
+    ):
         settings = dataclasses.replace(begun, **changes)
         assert_refused(f"out: {out} was written with {message}", train_run, source(seed), out, settings)
     assert files_of(out) == before
@@ -204,18 +207,6 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     train(out)
     assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
-
-
-@pytest.mark.usefixtures("unfitted")
-def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "run"
-    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
-        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
-            patch.setattr(module, name, full_disk)
-            train(out)
-        assert not (out / "run.json").exists()
-    train(out)
-    assert names(out) == FINISHED
 
 
 def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
