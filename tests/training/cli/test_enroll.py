@@ -127,26 +127,23 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "folder", "names"),
-    [
-        (None, "025_mug", {"025_mug"}),
-        ("red mug", "025_mug", {"red mug"}),
-        ("can", "", {"can"}),
-        (None, "", {"025_mug", "can", "caf\u00e9"}),
-    ],
-)
-def test_a_folder_of_meshes(name: str | None, folder: str, names: set[str], model: Path, tmp_path: Path) -> None:
+def test_a_folder_of_meshes(tmp_path: Path) -> None:
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
         write_box(tmp_path / "meshes" / file, BOX, color)
-    mesh = tmp_path / "meshes" / folder
-    assert run_thor2("enroll", *filter(None, [name]), "--mesh", mesh, "--model", model) == 0
-    objects = Recognizer.load(model).gallery.objects
-    assert set(objects) == {"brick", "book"} | names
-    for each in names:  # has the views of its own mesh
-        view = next(iter(objects[each].clouds.views()))
-        assert view.colors.mean(axis=0).argmax() == {"can": 1, "caf\u00e9": 2}.get(each, 0)
+    for name, folder, names in (
+        ([], "025_mug", {"025_mug"}),
+        (["red mug"], "025_mug", {"red mug"}),
+        (["can"], "", {"can"}),
+        ([], "", {"025_mug", "can", "caf\u00e9"}),
+    ):
+        run = tmp_path / f"{name} in {folder}"
+        assert run_thor2("enroll", *name, "--mesh", tmp_path / "meshes" / folder, "--model", run) == 0
+        objects = Recognizer.load(run).gallery.objects
+        assert set(objects) == names
+        for each in names:  # has the views of its own mesh
+            view = next(iter(objects[each].clouds.views()))
+            assert view.colors.mean(axis=0).argmax() == {"can": 1, "caf\u00e9": 2}.get(each, 0)
 
 
 def test_arguments_are_checked_before_anything_is_loaded(
@@ -161,7 +158,6 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
-        (("mug\u200b", "--frames", frames), "visible"),
         (("--mesh", tmp_path / "one.ply"), "name is missing"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
         (("mug", "--mesh", tmp_path / "damaged.ply"), "damaged.ply"),
@@ -222,18 +218,17 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
     tiny, mask = write_frame(tmp_path / "tiny", {1: "leaf"}), np.zeros((240, 320), np.uint8)
     mask[10:13, 10:13] = 1
     Image.fromarray(mask).save(tiny / "mask.png")
-    for given, words, is_bad_for_any_run in (
-        (("--frames", frames), "'brick'", False),
-        (("new", "--mesh", large), "mm.ply", True),
-        (("--frames", tiny), "points", True),
-        (("new", *one_frame(tiny, 1)), "points", True),
-        (("new", "--frames", frames), "'new'", True),
-        (("new", *frame_options(frames / "000")), "--instance", True),
-        (("new", *one_frame(frames / "000", 4)), "instance is 4", True),
+    assert "'brick'" in refused("enroll", "--frames", frames, "--model", model)
+    for given, words in (
+        (("new", "--mesh", large), "mm.ply"),
+        (("--frames", tiny), "points"),
+        (("new", *one_frame(tiny, 1)), "points"),
+        (("new", "--frames", frames), "'new'"),
+        (("new", *frame_options(frames / "000")), "--instance"),
+        (("new", *one_frame(frames / "000", 4)), "instance is 4"),
     ):
-        assert words in refused("enroll", *given, "--model", model)
-        if is_bad_for_any_run:
-            assert words in refused("enroll", *given, "--model", tmp_path / "other")
+        for run in (model, tmp_path / "other"):
+            assert words in refused("enroll", *given, "--model", run)
     assert files_of(model) == before and not (tmp_path / "other").exists()
 
 

@@ -92,17 +92,25 @@ def test_advice_on_a_wrong_name() -> None:
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
 
 
-def test_the_next_command_has_an_instance_that_was_explained(
+def test_options_of_recognition_hold_and_the_next_command_is_shown(
     model: Path, frame: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def explain(_: Recognizer, __: Any, label: int) -> SimpleNamespace:
+    """The next command has an instance that was explained."""
+    seen = []
+
+    def explain(recognizer: Recognizer, _: Any, label: int) -> SimpleNamespace:
+        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
         if label == 4:
             raise InputError("too few points")
         return SimpleNamespace(title="mug")
 
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
-    assert " --instance 1 " in printed("explain", "--model", model, frame, "--out", tmp_path / "out")
+    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
+    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
+    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
+    assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
+    assert seen == [(0.9, "classifiers")] * 2
 
 
 def test_frames_without_instances_are_named(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,18 +128,3 @@ def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, 
     out.mkdir()  # The error has not created it.
     (out / "mine.txt").write_text("x")
     assert "mine.txt" in refused(*command)
-
-
-def test_options_of_recognition_hold(model: Path, frame: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def explain(recognizer: Recognizer, *_: Any) -> None:
-        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
-        raise InputError("seen")
-
-    monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
-    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
-    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
-    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
-    assert run_thor2("explain", *given, frame, "--out", tmp_path / "out") == 2
-    assert seen == [(0.9, "classifiers")] * 2

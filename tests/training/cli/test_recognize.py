@@ -114,7 +114,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
         ("frames --out frames", "expected a new or empty directory"),
         ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
-        ("frames --unknown-below 1.5", "unknown_below is 1.5"),
         ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
         ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
@@ -129,16 +128,13 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         assert not Path("out").exists()
 
 
-BOP_ROWS = "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n"
-
-
 def test_no_file_of_the_user_is_replaced(model: Path, tmp_path: Path, refused: Command) -> None:
     write_frame_files(tmp_path / "f", small_frame())
     for name, content, option in (
         ("f/recognition.json", '{"a": "user\'s"}', "--out"),
         ("f/overlay.png", "a user's", "--out"),
         ("instances.json", '[{"image_id": 1, "category_id": 2}]', "--coco"),
-        ("poses.csv", BOP_ROWS, "--bop"),
+        ("poses.csv", "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n", "--bop"),
     ):
         (tmp_path / name).write_text(content)
         before, given = files_of(tmp_path), tmp_path if option == "--out" else tmp_path / name
