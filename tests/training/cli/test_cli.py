@@ -10,7 +10,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from commands import Command, frame_options, run_thor2
+from commands import Command, Texts, frame_options, run_thor2
 from rendered_objects import write_meshes, write_scene
 from written_files import files_of
 
@@ -85,13 +85,12 @@ def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Com
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
 
-def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, texts: Texts) -> None:
     labels = Path(shutil.copytree(images, tmp_path / "one")) / "labels.json"
     names = json.loads(labels.read_text())["labels"]
     for more in ({}, {"200": "mug_white"}):
         labels.write_text(json.dumps({"labels": names | more}))
-        assert run_thor2("evaluate", "frames", tmp_path, "--model", model, "--quiet") == 0
-        out, err = capfd.readouterr()
+        out, err = texts("evaluate", "frames", tmp_path, "--model", model, "--quiet")
         assert err == "" and ("without pixels" in out) == ("200 of frame one" in out) == bool(more)
 
 
@@ -129,22 +128,14 @@ def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path:
 
 @pytest.mark.usefixtures("small_descriptors")
 def test_a_default_training_recognizes_and_is_evaluated(
-    weights: str,
-    meshes: Path,
-    views: Path,
-    images: Path,
-    tmp_path: Path,
-    printed: Command,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    weights: str, meshes: Path, views: Path, images: Path, tmp_path: Path, texts: Texts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --classifiers, a run has an embedding alone; the command that is printed recognizes with it."""
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "my run"
     shutil.copytree(views, out / "views")  # of an interrupted training
     command = ("train", "--meshes", meshes, "--out", out, *STEPS, "--epochs", 1, "--embedding", 10)
-    assert run_thor2(*command) == 0
-    text, err = capfd.readouterr()
+    text, err = texts(*command)
     assert "embedding has a held-out accuracy of 0." in text.replace("1.000", "0.")
     stages = [line.split(":")[0] for line in err.splitlines() if line.startswith("stage ")]
     assert list(dict.fromkeys(stages)) == [f"stage {number} of 5" for number in (1, 2, 3, 4, 5)]
@@ -154,13 +145,13 @@ def test_a_default_training_recognizes_and_is_evaluated(
     program, *arguments = shlex.split(line.split(" with: ")[1])
     monkeypatch.chdir(images)
     assert program == "thor2" and str(out) in line
-    answers = printed(*arguments, "--unknown-below", 0)
+    answers, _ = texts(*arguments, "--unknown-below", 0)
     assert any(name in answers for name in NAMES)
     evaluation = ("evaluate", "frames", images.parent, "--model", out, "--out", tmp_path / "report")
-    assert "embedding" in printed(*evaluation)
+    assert "embedding" in texts(*evaluation)[0]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert list(report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]) == ["embedding"]
-    text = printed(*command)
+    text, _ = texts(*command)
     assert "nothing was trained" in text and line.split(" with: ")[1] in text
 
 
@@ -229,17 +220,14 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
 
 
 @pytest.mark.usefixtures("unfitted")
-def test_train_by_sequences(
-    meshes: Path, views: Path, tmp_path: Path, refused: Command, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:
     """Each run has the objects of its sequence, whose name is shown; a repeated command trains only missing runs."""
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
     arguments = ("train", "--dataset", views, "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
-    assert run_thor2(*arguments) == 0
-    assert "table/a: stage 1 of 2: describe: " in capfd.readouterr().err
+    assert "table/a: stage 1 of 2: describe: " in texts(*arguments)[1]
     first = (out / "table/a/run.json").read_bytes()
     assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
     table.write_text(json.dumps({"table/a": [soup, mug], "b": [cereal, cereal, soup]}))

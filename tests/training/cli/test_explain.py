@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import Command, run_thor2
+from commands import Command, Texts, run_thor2
 from failures import full_disk
 from image_files import write_frame
 from written_files import ParsedPage
@@ -113,10 +113,10 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     assert seen == [(0.9, "classifiers")] * 2
 
 
-def test_frames_without_instances_are_named(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_instances_are_named(model: Path, tmp_path: Path, texts: Texts) -> None:
     empty = write_frame(tmp_path / "nothing", {})
-    assert run_thor2("explain", "--model", model, empty, "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err.startswith("skipped: nothing: ")
+    _, err = texts("explain", "--model", model, empty, "--out", tmp_path / "out", status=2)
+    assert err.startswith("skipped: nothing: ")
 
 
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Command, Recognize, frame_options, json_lines, run_thor2
+from commands import Command, Recognize, Texts, frame_options, json_lines, run_thor2
 from image_files import small_frame, write_frame_files
 from PIL import Image
 from recording_files import table_frame
@@ -37,7 +37,7 @@ def test_output_for_one_frame(model: Path, recognize: Recognize, tmp_path: Path,
     assert "no instances" in background and "confidence" not in background
 
 
-def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, texts: Texts) -> None:
     for number in range(1, 7):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
@@ -48,8 +48,7 @@ def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, capfd: py
     outputs = ("--out", tmp_path / "out", "--coco", coco_file)
     command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
     for _ in range(2):  # it may be repeated
-        assert run_thor2(*command) == 2
-        out, err = capfd.readouterr()
+        out, err = texts(*command, status=2)
         answers = {line["frame"]: line for line in json_lines(out)}
         assert list(answers) == [f"00000{number}" for number in range(1, 7)]
         for number, word in ((2, "depth"), (3, "intrinsics.json"), (5, "color.png"), (6, "--segment")):
@@ -60,7 +59,7 @@ def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, capfd: py
     assert [entry["image_id"] for entry in json.loads(coco_file.read_text())] == [1, 1, 4, 4]
 
 
-def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -> None:
     one = write_frame_files(tmp_path / "one", small_frame())
     two = write_frame_files(tmp_path / "more" / "deep" / "two", small_frame(1))
     shutil.move(two / "mask.png", two / "labels.png")
@@ -68,8 +67,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
     tables = ("--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv", "--names", tmp_path / "names.json")
     outputs = (*tables, "--out", tmp_path / "out")
     command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
-    assert run_thor2(*command) == 0
-    out, err = capfd.readouterr()
+    out, err = texts(*command)
     assert "instances have a name" not in err
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
     with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
@@ -82,8 +80,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
     expected = [{"mug": 14, "bowl": 21, "plate": 5}[name] for name in names]
     assert [entry["category_id"] for entry in coco] == [int(row["obj_id"]) for row in rows] == expected
     (tmp_path / "names.json").write_text(json.dumps({"14": "another"}))
-    assert run_thor2(*command) == 0
-    assert f"{len(names)} instances have a name" in capfd.readouterr().err
+    assert f"{len(names)} instances have a name" in texts(*command)[1]
 
 
 def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +179,7 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
 
 
 def test_a_bad_frame_does_not_end_a_sequence(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts
 ) -> None:
     """One is damaged, one lacks labels, and one is removed after it has been read for the tracks."""
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(5)]
@@ -198,8 +195,7 @@ def test_a_bad_frame_does_not_end_a_sequence(
         return frame
 
     monkeypatch.setattr(FrameFiles, "read", read_and_remove)
-    assert run_thor2("recognize", "--model", model, tmp_path / "video", "--track", "--json") == 2
-    out, err = capfd.readouterr()
+    out, err = texts("recognize", "--model", model, tmp_path / "video", "--track", "--json", status=2)
     answers = json_lines(out)
     assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 4)] == [[3, 3]] * 2
     for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file")):

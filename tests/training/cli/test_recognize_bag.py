@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, Recognize, json_lines, run_thor2
+from commands import Command, Recognize, Texts, json_lines, run_thor2
 from image_files import write_frame_files
 from PIL import Image
 from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_images, write_recording
@@ -77,7 +77,7 @@ def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: C
         assert (tmp_path / name).read_bytes().startswith(b"RRF2")
 
 
-def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         for k, pixels in enumerate((FRAMES[0].color, FRAMES[0].color[:100], FRAMES[0].color)):
@@ -85,18 +85,16 @@ def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, capfd: pyte
             write("/depth", image(FRAMES[0].depth, "16UC1", START + k * PERIOD), START + k * PERIOD)
     (tmp_path / "K.txt").write_text("290 0 160 0 290 120 0 0 1")
     command = ("recognize", "--model", model, "--bag", path, "--intrinsics", tmp_path / "K.txt")
-    assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 2
-    out, err = capfd.readouterr()
+    out, err = texts(*command, "--out-bag", tmp_path / "out.mcap", status=2)
     assert ["error" in line for line in json_lines(out)] == [False, True, False]
     assert err.splitlines()[-1].startswith("error: 1 of 3 frames") and "failed: 1700000000.033333333" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == 2
 
 
-def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
     path.write_bytes(path.read_bytes()[: -(10**6)])
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
-    out, err = capfd.readouterr()
+    out, err = texts("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", status=2)
     n_frames = len(json_lines(out))
     assert 0 < n_frames < 8 and "mcap recover" in err and err.count("\n") == 1
     assert f"{n_frames} frames were recognized before and are in {tmp_path / 'out.mcap'}" in err
@@ -117,12 +115,12 @@ def test_frames_with_one_stamp_and_before_1970(recognize: Recognize, tmp_path: P
     assert (messages[0][1].header.stamp.sec, messages[0][1].header.stamp.nanosec) == (-1, 10**9 - 1)
 
 
-def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         write_images(write, FRAMES[0], frame_id="a\n\x1b[2J")
-    assert run_thor2("recognize", "--model", model, "--bag", path) == 0
-    (note,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("note: ")]
+    _, err = texts("recognize", "--model", model, "--bag", path)
+    (note,) = [line for line in err.splitlines() if line.startswith("note: ")]
     assert r"color in a\n\x1b[2J" in note
 
 
