@@ -1,6 +1,5 @@
 """`thor2 recognize` with several frames, other formats and other outputs; the run's weights are random."""
 
-import csv
 import dataclasses
 import json
 import os
@@ -75,10 +74,9 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
     names = [one["name"] for path in results for one in json.loads(path.read_text())]
     coco = json.loads((tmp_path / "coco.json").read_text())
-    with (tmp_path / "bop.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
+    lines = (tmp_path / "bop.csv").read_text().splitlines()[1:]
     expected = [{"mug": 14, "bowl": 21, "plate": 5}[name] for name in names]
-    assert [entry["category_id"] for entry in coco] == [int(row["obj_id"]) for row in rows] == expected
+    assert [entry["category_id"] for entry in coco] == [int(line.split(",")[2]) for line in lines] == expected
     (tmp_path / "names.json").write_text(json.dumps({"14": "another"}))
     assert f"{len(names)} instances have a name" in texts(*command)[1]
 
