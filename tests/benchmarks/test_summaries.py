@@ -65,9 +65,7 @@ def test_pieces_are_compared_with_instances() -> None:
     assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)
 
 
-def test_bad_arguments_write_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     for benchmark, arguments, message in (
         (cameras, "", "give --model, --frames and --out"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, frame_options, run_thor2
+from commands import Command, Texts, frame_options, run_thor2
 from failures import full_disk
 from image_files import write_frame
 from PIL import Image
@@ -241,14 +241,12 @@ def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path,
     assert files_of(tmp_path / "other") == files_of(model)
 
 
-def test_a_full_disk_leaves_no_run_behind(
-    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_leaves_no_run(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts) -> None:
     for step in ("_write_durably", "write_text"):
         for before in ([], [tmp_path / step / "run"]):  # the directory is new, or there and empty
             (tmp_path / step / "run" if before else tmp_path / step).mkdir()
             with monkeypatch.context() as patch:
                 patch.setattr(store, step, full_disk)
-                assert run_thor2("enroll", "--frames", frames, "--model", tmp_path / step / "run") != 0
-            assert "No space left" in capsys.readouterr().err
+                _, err = texts("enroll", "--frames", frames, "--model", tmp_path / step / "run", status=2)
+            assert "No space left" in err
             assert list((tmp_path / step).rglob("*")) == before

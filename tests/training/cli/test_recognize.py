@@ -176,9 +176,7 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
     assert "track" in printed("recognize", "--model", model, *command)
 
 
-def test_a_bad_frame_does_not_end_a_sequence(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts
-) -> None:
+def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts) -> None:
     """One is damaged, one lacks labels, and one is removed after it has been read for the tracks."""
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(5)]
     (frames[1] / "depth.png").write_bytes(b"damaged")
