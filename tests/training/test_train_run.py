@@ -244,19 +244,19 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     same_weights(runs[0], first)
     samples, _ = sample_views(source(), runs[0].network, CONFIG)
     fold_of = fold_of_views(samples.label, samples.view, source().classes, 3, OPTIONS.seed)
+    logged = []
     for fold, one in enumerate(load_runs([out])):
         rows, context = np.flatnonzero(fold_of == fold), FitContext("tops", runs[fold].network, CONFIG)
         probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)
         assert one.temperatures == {"tops": pytest.approx(fit_temperature(probabilities, samples.label[rows]))}
-        assert one.recognizer.run.record["temperatures"] == one.temperatures
-    rows = []
-    for fold, record in enumerate(run.record for run in runs):
+        record = runs[fold].record
+        assert record["temperatures"] == one.temperatures
         curve = record["curves"]["tops"]
-        rows += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
+        logged += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
         best = max(row["held_out_accuracy"] for row in curve)
         assert record["fold"] == fold and record["held_out_accuracy"] == {"tops": best}
         assert curve[record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
-    assert logged_rows(out) == rows
+    assert logged_rows(out) == logged
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
     assert_refused("out: .* already contains", run)

@@ -53,7 +53,6 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("recognize --model '' f", "--model is empty"),
         ("recognize --model m f --out=", "--out is empty"),
         ("recognize --model m ''", "the argument after m is empty"),
-        ("explain '' --model m --out o", "the argument after explain is empty"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
         ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
     ):
