@@ -31,7 +31,10 @@ def frame(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn_pictures")
-def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, printed: Command) -> None:
+def test_a_page_for_every_instance(
+    model: Path, frame: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is left after an error."""
     out = tmp_path / "out"
     *pages, last = printed("explain", "--model", model, frame, "--out", out).splitlines()
     assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(pages) == 2
@@ -47,12 +50,6 @@ def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, pri
         pictures = sorted(path.stem for path in directory.glob("*.png"))
         assert len(pictures) == len(page.pictures) and {"photo", "cloud", "check", "network"} <= set(pictures)
         assert not list(directory.glob(".*"))
-
-
-@pytest.mark.slow
-def test_nothing_is_left_after_an_error(
-    model: Path, frame: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(explanation_page, "write_page", full_disk)
     error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
     assert "No space left" in error and not (tmp_path / "deep").exists()
