@@ -95,7 +95,14 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     Path("empty").mkdir()
     os.mkfifo("pipe")
     files = " ".join(map(str, frame_options(write_frame_files(Path("frames/one"), small_frame()))))
+    two = write_frame_files(Path("frames/two"), small_frame())
+    for name in ("color.png", "depth.png", "mask.png"):
+        Image.open(two / name).crop((0, 0, 100, 90)).save(two / name)
     Path("frames/names.json").write_text("{}")
+    Path("damaged.json").write_text("[")
+    unit, double = np.eye(4).tolist(), (2 * np.eye(4)).tolist()
+    for name, poses in {"few": [unit], "other": {"one": unit}, "scaled": [unit, double]}.items():
+        Path(f"{name}.json").write_text(json.dumps(poses))
     no_files = ("empty", "frames/one/color.png/results", "pipe")
     for arguments, expected in (
         ("", "give either"),
@@ -110,6 +117,12 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
         ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
+        ("frames --out out --track --poses damaged.json", "damaged.json is invalid"),
+        ("frames --out out --track --poses few.json", "1 poses for 2 frames"),
+        ("frames --out out --track --poses other.json", "no pose of frame two"),
+        ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),
+        ("frames --out out --poses few.json", "--track"),
+        ("frames --out out --track", "two: frame has 100 x 90 pixels"),
         ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
         ("FILES --segment table --out out", "error: labels is "),
         ("FILES --out out --color absent.png", "absent.png"),
@@ -197,23 +210,3 @@ def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: py
     for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file")):
         assert reason in answers[number]["error"] and "instances" not in answers[number]
     assert "3 of 5 frames" in err
-
-
-def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:
-    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(2)]
-    poses, out = tmp_path / "poses.json", tmp_path / "out"
-    command = ("recognize", "--model", model, tmp_path / "video", "--out", out)
-    unit = np.eye(4).tolist()
-    for content, message in (
-        ("[", "poses.json is invalid"),
-        (json.dumps([unit]), "1 poses for 2 frames"),
-        (json.dumps({"0": unit}), "no pose of frame 1"),
-        (json.dumps([unit, (2 * np.eye(4)).tolist()]), "frame 1 is not a rigid motion"),
-    ):
-        poses.write_text(content)
-        assert message in refused(*command, "--track", "--poses", poses)
-    assert "--track" in refused(*command, "--poses", poses)
-    for name in ("color.png", "depth.png", "mask.png"):
-        Image.open(frames[1] / name).crop((0, 0, 100, 90)).save(frames[1] / name)
-    assert "1: frame has 100 x 90 pixels" in refused(*command, "--track")
-    assert not out.exists()
