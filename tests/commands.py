@@ -10,6 +10,8 @@ from unittest import mock
 Command = Callable[..., str]
 """Type of the fixtures `printed` and `refused`, which run the command line."""
 
+Texts = Callable[..., tuple[str, str]]
+"""Type of the fixture `texts`, which runs the command line and returns its standard output and error."""
 
 Recognize = Callable[..., list[dict[str, Any]]]
 """Type of the fixture `recognize`, which recognizes frames on the command line."""

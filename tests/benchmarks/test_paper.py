@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from processes import UNOPTIMIZED
 from rendered_objects import write_meshes, write_scene
-from safetensors.numpy import save_file
 
 from benchmarks import paper
 from benchmarks.paper_measurement import CLAIMS, paired_difference
@@ -79,10 +78,6 @@ def test_weights_are_checked_before_the_comparison_begins(tmp_path: Path) -> Non
     names = ["meshes", "frames", "weights", "out"]
     options = [*(f"--{name}={tmp_path / name}" for name in names), "--baselines=rcfusion,thor"]
     with pytest.raises(SystemExit, match=r"^error: weights: .*resnet18\.safetensors does not exist"):
-        paper.main(options)
-    (tmp_path / "weights").mkdir()
-    save_file({"conv1.weight": np.zeros((64, 3, 3, 3), np.float32)}, tmp_path / "weights" / "resnet18.safetensors")
-    with pytest.raises(SystemExit, match=r"^error: weights: .*resnet18\.safetensors has no tensor bn1\.bias"):
         paper.main(options)
     assert not (tmp_path / "out").exists()
 

@@ -65,9 +65,9 @@ def test_pieces_are_compared_with_instances() -> None:
     assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)
 
 
-@pytest.mark.parametrize(
-    ("benchmark", "arguments", "message"),
-    [
+def test_bad_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    for benchmark, arguments, message in (
         (cameras, "", "give --model, --frames and --out"),
         (cameras, "--model x", "give --model, --frames and --out"),
         (cameras, "--model x --frames y --out z", "y"),
@@ -78,23 +78,13 @@ def test_pieces_are_compared_with_instances() -> None:
         (paper, "--meshes . --out out --frames absent --folds 0", "folds is 0"),
         (paper, "--meshes . --out out --frames absent", "absent"),
         (paper, "--meshes . --out out --frames . --baselines tree", "baselines is tree"),
-    ],
-)
-def test_bad_arguments_write_nothing(
-    benchmark: Any,
-    arguments: str,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments.split()])
-    with pytest.raises(SystemExit) as caught:
-        benchmark.main()
-    error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
-    assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1]
-    assert list(tmp_path.iterdir()) == []
+    ):
+        monkeypatch.setattr(sys, "argv", ["benchmark", *arguments.split()])
+        with pytest.raises(SystemExit) as caught:
+            benchmark.main()
+        error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
+        assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1]
+        assert list(tmp_path.iterdir()) == []
 
 
 SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"

@@ -79,7 +79,7 @@ class Node:
 
     def __init__(self, name: str) -> None:
         self.parameters, self.callbacks, self.published, self.warnings = {}, {}, [], []
-        self.declare_parameter = self.parameters.__setitem__
+        self.declare_parameter, self.destroy_node = self.parameters.__setitem__, self.callbacks.clear
 
     def get_parameter(self, name: str) -> Any:
         return types.SimpleNamespace(value=self.parameters[name])
@@ -92,9 +92,6 @@ class Node:
 
     def get_logger(self) -> Any:
         return types.SimpleNamespace(warning=lambda text, throttle_duration_sec: self.warnings.append(text))
-
-    def destroy_node(self) -> None:
-        self.callbacks.clear()
 
 
 def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,13 +140,17 @@ def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monk
     assert run.record == whole[1].record
     assert logged_rows(out) == logged_rows(whole[0])
     assert names(out) == FINISHED
-    assert_refused("out: .* already contains", train, out, ("tops", "ce"))
 
 
 @pytest.mark.usefixtures("unfitted")
-def test_interrupted_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupts before the first file is moved to its name, and after some of them are."""
+def test_failures_before_and_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full at several steps; interrupts before the first file is moved to its name, and after some are."""
     out, rename = tmp_path / "run", Path.rename
+    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+            patch.setattr(module, name, full_disk)
+            train(out)
+        assert not (out / "run.json").exists()
     for moved in (None, "tops.safetensors", "network.npz", "run.json"):
 
         def stopping(self: Path, target: Path) -> Path:
@@ -172,15 +176,14 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train(out, progress=stop_when("fit tops", 4))
     before = files_of(out)
     begun = Protocol(("tops",), OPTIONS, CONFIG)
-    cases: list[tuple[str, int, dict[str, Any]]] = [
+    for message, seed, changes in (
         ("batch_size 8, not 6", 0, {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", 0, {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
         (r"classifiers\[0\] \"tops\", not \"ce\"", 0, {"classifiers": ("tops", "ce")}),
         ("folds 1, not 3", 0, {"folds": 3}),
         (f'dataset "{source().digest}", not ', 1, {}),
         (r"descriptor_config\.\w+ ", 0, {"config": thor2.DescriptorConfig()}),
-    ]
-    for message, seed, changes in cases:
+    ):
         settings = dataclasses.replace(begun, **changes)
         assert_refused(f"out: {out} was written with {message}", train_run, source(seed), out, settings)
     assert files_of(out) == before
@@ -204,18 +207,6 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     train(out)
     assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
-
-
-@pytest.mark.usefixtures("unfitted")
-def test_a_full_disk_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "run"
-    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
-        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
-            patch.setattr(module, name, full_disk)
-            train(out)
-        assert not (out / "run.json").exists()
-    train(out)
-    assert names(out) == FINISHED
 
 
 def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
@@ -253,19 +244,19 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     same_weights(runs[0], first)
     samples, _ = sample_views(source(), runs[0].network, CONFIG)
     fold_of = fold_of_views(samples.label, samples.view, source().classes, 3, OPTIONS.seed)
+    logged = []
     for fold, one in enumerate(load_runs([out])):
         rows, context = np.flatnonzero(fold_of == fold), FitContext("tops", runs[fold].network, CONFIG)
         probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)
         assert one.temperatures == {"tops": pytest.approx(fit_temperature(probabilities, samples.label[rows]))}
-        assert one.recognizer.run.record["temperatures"] == one.temperatures
-    rows = []
-    for fold, record in enumerate(run.record for run in runs):
+        record = runs[fold].record
+        assert record["temperatures"] == one.temperatures
         curve = record["curves"]["tops"]
-        rows += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
+        logged += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
         best = max(row["held_out_accuracy"] for row in curve)
         assert record["fold"] == fold and record["held_out_accuracy"] == {"tops": best}
         assert curve[record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
-    assert logged_rows(out) == rows
+    assert logged_rows(out) == logged
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
     assert_refused("out: .* already contains", run)
@@ -300,11 +291,10 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
     assert_refused("already contains", train, out, progress=quicker)
     assert load_run(out).record == done[0].record
 
-    other, begun = tmp_path / "other", []
+    other = tmp_path / "other"
 
     def dies(stage: str, count: int, total: int, note: str) -> None:
-        if stage == "describe" and not begun:
-            begun.append(1)
+        if stage == "describe" and not other.exists():
             with pytest.raises(Interrupted):
                 train(other, progress=stop_when("fit tops", 3))
 

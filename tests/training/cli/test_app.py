@@ -30,13 +30,13 @@ ROOT = Path(__file__).parents[3]
 
 
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command, environment = [sys.executable, "-c", *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
+    command, environment = [sys.executable, *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
 
 
 def test_closed_streams_are_no_error() -> None:
     command = "import os, sys; os.close(1); os.close(2); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
-    assert run_python(command, "-m", "training.cli", "doctor", "--help").returncode == 0
+    assert run_python("-c", command, "-m", "training.cli", "doctor", "--help").returncode == 0
 
 
 def test_a_usage_error_is_one_line(refused: Command) -> None:
@@ -53,9 +53,7 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("recognize --model '' f", "--model is empty"),
         ("recognize --model m f --out=", "--out is empty"),
         ("recognize --model m ''", "the argument after m is empty"),
-        ("explain '' --model m --out o", "the argument after explain is empty"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
-        ("render --meshes m --out o --sensor --copies 0", "copies is 0; expected"),
         ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
     ):
         assert expected in refused(*shlex.split(command))
@@ -89,11 +87,8 @@ def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
     assert str(tmp_path / "a") in refused("forget", "mug", "--model", tmp_path / "a")
 
 
-def test_version(printed: Command) -> None:
+def test_version_and_help(printed: Command) -> None:
     assert printed("--version") == f"thor2 {thor2.__version__}\n"
-
-
-def test_short_help(printed: Command) -> None:
     for arguments in ((), ("-h",), ("evaluate",), ("train", "-h")):
         assert "Usage:" in printed(*arguments)
     assert "--install-completion" in printed("--help")
@@ -109,7 +104,7 @@ def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
         "sys.exitfunc = None\ntry: training.cli.main()\n"
         "except SystemExit as end: assert not end.code and 'jax' not in sys.modules"
     )
-    done = run_python(code, "objects", "--model", str(tmp_path))
+    done = run_python("-c", code, "objects", "--model", str(tmp_path))
     assert done.returncode == 0 and "1 object: mug" in done.stdout, done.stderr
 
 
@@ -148,7 +143,7 @@ class Interrupt:
 sys.meta_path.insert(0, Interrupt())
 import training.cli
 """
-    done = run_python(code)
+    done = run_python("-c", code)
     assert (done.returncode, done.stderr) == (130, "")
 
 
@@ -229,22 +224,18 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
     ]
 
 
-@pytest.mark.parametrize(
-    ("stage", "done", "total", "note"),
-    [
-        ("render [red]", 3, 10, "of [/x]"),
-        ("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2),
-    ],
-)
-def test_a_terminal_gets_bars_and_a_narrow_one_cuts_the_note(
-    stage: str, done: int, total: int, note: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_narrow_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The note is cut, not the bar, the stage and the numbers."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
-    with show_progress() as show:
-        show(stage, done, total, note)
-    err: Any = capsys.readouterr().err
-    assert "━" in err and stage in err and f"{done}/{total}" in err and note[:7] in err
+    for stage, done, total, note in (
+        ("render [red]", 3, 10, "of [/x]"),
+        ("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2),
+    ):
+        with show_progress() as show:
+            show(stage, done, total, note)
+        err = capsys.readouterr().err
+        assert "━" in err and stage in err and f"{done}/{total}" in err and note[:7] in err
 
 
 def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,39 +267,30 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("THOR2_CACHE", "off")
-    enable_compilation_cache()
-    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "" and not environment.exists()
-    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-        enable_compilation_cache()
-        assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone
-    enable_compilation_cache()
-    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
-
-
-def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A directory that cannot be created is ignored, and a file is refused."""
-    monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
-    enable_compilation_cache()
-    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == ""
+    for value in ("off", "/proc/no-such-directory"):
+        monkeypatch.setenv("THOR2_CACHE", value)
+        enable_compilation_cache()
+        assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "" and not environment.exists()
     (tmp_path / "file").touch()
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
     assert_refused("THOR2_CACHE", enable_compilation_cache)
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
+    enable_compilation_cache()
+    assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
 
 
 @pytest.mark.slow
 def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick"})
     save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
-    variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    command = [sys.executable, "-m", "training.cli", "recognize", "--model", str(tmp_path / "run"), str(frame)]
 
     def recognize() -> tuple[set[str], str]:
         """Return the names of the cached programs, and what was printed."""
-        done = subprocess.run(command, capture_output=True, text=True, env=variables)
+        done = run_python("-m", "training.cli", "recognize", "--model", str(tmp_path / "run"), str(frame))
         assert done.returncode == 0 and done.stderr == ""
         return {path.name for path in environment.glob("*/*-cache")}, done.stdout
 

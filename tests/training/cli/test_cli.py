@@ -10,7 +10,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from commands import Command, frame_options, run_thor2
+from commands import Command, Texts, frame_options, run_thor2
 from rendered_objects import write_meshes, write_scene
 from written_files import files_of
 
@@ -26,7 +26,6 @@ from training.train_job import TrainJob
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
-UNFITTED = pytest.mark.usefixtures("unfitted")
 NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
 STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
 FEW_STEPS = ("--epochs", 1, "--batch-size", 64, "--classifiers", "tops,tops2", "--embedding", 0)
@@ -80,22 +79,18 @@ def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Com
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
     assert report["instances"]["scored"] == whole["instances"] == len(truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(expected), "std": 0.0, "runs": 2}
-    before = (tmp_path / "report" / "answers.jsonl").read_bytes()
     assert "nothing was recomputed" in printed(*command)
-    assert (tmp_path / "report" / "answers.jsonl").read_bytes() == before
-    alone = ("evaluate", "frames", images.parent, "--model", model, "--out")
-    assert "already contains" in refused(*alone, tmp_path / "answer")
+    assert "already contains" in refused(*command[:-1], tmp_path / "answer")
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)
 
 
-def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, texts: Texts) -> None:
     labels = Path(shutil.copytree(images, tmp_path / "one")) / "labels.json"
     names = json.loads(labels.read_text())["labels"]
     for more in ({}, {"200": "mug_white"}):
         labels.write_text(json.dumps({"labels": names | more}))
-        assert run_thor2("evaluate", "frames", tmp_path, "--model", model, "--quiet") == 0
-        out, err = capfd.readouterr()
+        out, err = texts("evaluate", "frames", tmp_path, "--model", model, "--quiet")
         assert err == "" and ("without pixels" in out) == ("200 of frame one" in out) == bool(more)
 
 
@@ -133,22 +128,14 @@ def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path:
 
 @pytest.mark.usefixtures("small_descriptors")
 def test_a_default_training_recognizes_and_is_evaluated(
-    weights: str,
-    meshes: Path,
-    views: Path,
-    images: Path,
-    tmp_path: Path,
-    printed: Command,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    weights: str, meshes: Path, views: Path, images: Path, tmp_path: Path, texts: Texts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --classifiers, a run has an embedding alone; the command that is printed recognizes with it."""
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "my run"
     shutil.copytree(views, out / "views")  # of an interrupted training
     command = ("train", "--meshes", meshes, "--out", out, *STEPS, "--epochs", 1, "--embedding", 10)
-    assert run_thor2(*command) == 0
-    text, err = capfd.readouterr()
+    text, err = texts(*command)
     assert "embedding has a held-out accuracy of 0." in text.replace("1.000", "0.")
     stages = [line.split(":")[0] for line in err.splitlines() if line.startswith("stage ")]
     assert list(dict.fromkeys(stages)) == [f"stage {number} of 5" for number in (1, 2, 3, 4, 5)]
@@ -158,13 +145,13 @@ def test_a_default_training_recognizes_and_is_evaluated(
     program, *arguments = shlex.split(line.split(" with: ")[1])
     monkeypatch.chdir(images)
     assert program == "thor2" and str(out) in line
-    answers = printed(*arguments, "--unknown-below", 0)
+    answers, _ = texts(*arguments, "--unknown-below", 0)
     assert any(name in answers for name in NAMES)
     evaluation = ("evaluate", "frames", images.parent, "--model", out, "--out", tmp_path / "report")
-    assert "embedding" in printed(*evaluation)
+    assert "embedding" in texts(*evaluation)[0]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert list(report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]) == ["embedding"]
-    text = printed(*command)
+    text, _ = texts(*command)
     assert "nothing was trained" in text and line.split(" with: ")[1] in text
 
 
@@ -213,7 +200,6 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     shutil.copytree(views, tmp_path / "run" / "views")
     out = printed(*arguments)
     assert "fold 0: tops" in out and "fold 1: tops" in out
-    assert sorted(p.name for p in (tmp_path / "run" / "fold-1").iterdir()) == ["network.npz", "run.json", "weights"]
     # Views in a finished run directory may be a dataset of the user, and are kept.
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
@@ -233,18 +219,15 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
 
 
-@UNFITTED
-def test_train_by_sequences(
-    meshes: Path, views: Path, tmp_path: Path, refused: Command, capfd: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("unfitted")
+def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:
     """Each run has the objects of its sequence, whose name is shown; a repeated command trains only missing runs."""
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
     arguments = ("train", "--dataset", views, "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
-    assert run_thor2(*arguments) == 0
-    assert "table/a: stage 1 of 2: describe: " in capfd.readouterr().err
+    assert "table/a: stage 1 of 2: describe: " in texts(*arguments)[1]
     first = (out / "table/a/run.json").read_bytes()
     assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
     table.write_text(json.dumps({"table/a": [soup, mug], "b": [cereal, cereal, soup]}))
@@ -256,24 +239,23 @@ def test_train_by_sequences(
     for change in (("--epochs", 2), ("--batch-size", 8), ("--seed", 1), ("--folds", 2), ("--classifiers", "ce,tops")):
         assert "b was written with" in refused(*arguments, *change)
     assert sorted(out.rglob("*")) == before
-    cases = {
-        json.dumps({"b": [cereal, mug]}): "b was written with dataset",
-        "{}": "has no sequence",
-        '{"c": ["dragon"]}': "no class dragon",
-        '{"c": "mug"}': "c is 'mug'",
-        '{"c": []}': "c is []",
-        '{"../c": ["mug_white"]}': "'../c'",
-        '{"/c": ["mug_white"]}': "'/c'",
-        "[]": "list",
-    }
-    for content, message in cases.items():
+    for content, message in (
+        (json.dumps({"b": [cereal, mug]}), "b was written with dataset"),
+        ("{}", "has no sequence"),
+        ('{"c": ["dragon"]}', "no class dragon"),
+        ('{"c": "mug"}', "c is 'mug'"),
+        ('{"c": []}', "c is []"),
+        ('{"../c": ["mug_white"]}', "'../c'"),
+        ('{"/c": ["mug_white"]}', "'/c'"),
+        ("[]", "list"),
+    ):
         table.write_text(content)
         assert message in refused(*arguments), content
     assert "--dataset" in refused("train", "--meshes", meshes, "--out", tmp_path / "other", *options)
     assert sorted(p.name for p in out.iterdir()) == ["b", "table"]
 
 
-@UNFITTED
+@pytest.mark.usefixtures("unfitted")
 def test_rendered_views_stay(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import Command, run_thor2
+from commands import Command, Texts, run_thor2
 from failures import full_disk
 from image_files import write_frame
 from written_files import ParsedPage
@@ -31,7 +31,10 @@ def frame(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn_pictures")
-def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, printed: Command) -> None:
+def test_a_page_for_every_instance(
+    model: Path, frame: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is left after an error."""
     out = tmp_path / "out"
     *pages, last = printed("explain", "--model", model, frame, "--out", out).splitlines()
     assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(pages) == 2
@@ -47,12 +50,6 @@ def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, pri
         pictures = sorted(path.stem for path in directory.glob("*.png"))
         assert len(pictures) == len(page.pictures) and {"photo", "cloud", "check", "network"} <= set(pictures)
         assert not list(directory.glob(".*"))
-
-
-@pytest.mark.slow
-def test_nothing_is_left_after_an_error(
-    model: Path, frame: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(explanation_page, "write_page", full_disk)
     error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
     assert "No space left" in error and not (tmp_path / "deep").exists()
@@ -92,23 +89,31 @@ def test_advice_on_a_wrong_name() -> None:
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
 
 
-def test_the_next_command_has_an_instance_that_was_explained(
+def test_options_of_recognition_hold_and_the_next_command_is_shown(
     model: Path, frame: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def explain(_: Recognizer, __: Any, label: int) -> SimpleNamespace:
+    """The next command has an instance that was explained."""
+    seen = []
+
+    def explain(recognizer: Recognizer, _: Any, label: int) -> SimpleNamespace:
+        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
         if label == 4:
             raise InputError("too few points")
         return SimpleNamespace(title="mug")
 
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
-    assert " --instance 1 " in printed("explain", "--model", model, frame, "--out", tmp_path / "out")
+    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
+    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
+    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
+    assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
+    assert seen == [(0.9, "classifiers")] * 2
 
 
-def test_frames_without_instances_are_named(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_instances_are_named(model: Path, tmp_path: Path, texts: Texts) -> None:
     empty = write_frame(tmp_path / "nothing", {})
-    assert run_thor2("explain", "--model", model, empty, "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err.startswith("skipped: nothing: ")
+    _, err = texts("explain", "--model", model, empty, "--out", tmp_path / "out", status=2)
+    assert err.startswith("skipped: nothing: ")
 
 
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
@@ -121,18 +126,3 @@ def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, 
     out.mkdir()  # The error has not created it.
     (out / "mine.txt").write_text("x")
     assert "mine.txt" in refused(*command)
-
-
-def test_options_of_recognition_hold(model: Path, frame: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def explain(recognizer: Recognizer, *_: Any) -> None:
-        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
-        raise InputError("seen")
-
-    monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
-    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
-    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
-    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
-    assert run_thor2("explain", *given, frame, "--out", tmp_path / "out") == 2
-    assert seen == [(0.9, "classifiers")] * 2

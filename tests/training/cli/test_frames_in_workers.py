@@ -4,9 +4,7 @@ import dataclasses
 import json
 import pickle
 import shutil
-import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 from commands import run_thor2
 from image_files import small_frame, write_frame_files
+from processes import wait_until
 from recording_files import table_frame
 from rendered_objects import write_meshes
 
@@ -22,6 +21,7 @@ from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
 from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import RecognizerArguments, recognize_frames
 from training.readers.frames import FrameFolder, find_frames, segmented_source
+from training.storage.workers import IN_PROCESS
 
 N_FRAMES = 9
 
@@ -61,14 +61,9 @@ def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, 
     expected = answer_frames(load_evaluated(*arguments), FrameFolder(folder))
     (damaged / "006" / "depth.png").write_bytes(b"damaged")
     frames, answers = FrameFolder(damaged), []
-
-    def pool(answer: Callable[[FrameFolder], Any], parts: Iterable[FrameFolder]) -> Iterator[Any]:
-        for part in parts:
-            assert len(part.sources) == 1  # workers get no other frames
-            yield answer(part)
-
+    assert len(frames.only(6)) == 1  # workers get no other frames
     with pytest.raises(InputError, match="depth"):
-        for _, answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
+        for _, answer in answer_frames_in_pool(arguments, frames, IN_PROCESS, range(len(frames))):
             answers.append(answer)
     assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(6)]
     for one, (_, other) in zip(answers, expected, strict=False):
@@ -118,18 +113,14 @@ def test_two_ray_nodes_enroll_and_recognize_and_one_is_killed(
         node = cluster.add_node(num_cpus=1)
         on_nodes = "--workers", 2, "--engine", "ray", "--address", cluster.address
         assert enrolled(tmp_path / "on-nodes", *on_nodes) == enrolled(tmp_path / "here", "--workers", 1)
-        lost = threading.Event()
 
         def lose_node() -> None:
-            while not (tmp_path / "answers" / "000").exists():
-                time.sleep(0.02)
+            wait_until(lambda: (tmp_path / "answers" / "000").exists())
             cluster.remove_node(node, allow_graceful=False)
-            lost.set()
 
-        thread = threading.Thread(target=lose_node)
-        thread.start()
-        answers = results(model, folder, tmp_path, *on_nodes)
-        thread.join()
-        assert lost.is_set() and answers == expected
+        with ThreadPoolExecutor(1) as thread:
+            lost = thread.submit(lose_node)
+            assert results(model, folder, tmp_path, *on_nodes) == expected
+        lost.result()
     finally:
         cluster.shutdown()

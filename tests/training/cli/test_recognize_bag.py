@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, Recognize, json_lines, run_thor2
+from commands import Command, Recognize, Texts, json_lines, run_thor2
 from image_files import write_frame_files
 from PIL import Image
 from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_images, write_recording
@@ -29,8 +29,9 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     [pytest.param("a.bag", "out.mcap", marks=pytest.mark.slow), ("folder", "out"), ("a.mcap", "out.mcap")],
 )
 def test_detections_are_read_back(recognize: Recognize, tmp_path: Path, name: str, out: str) -> None:
-    path = write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
-    lines = recognize("--bag", path, "--out-bag", tmp_path / out)
+    """The objects of the folder are tracked."""
+    is_tracked, path = name == "folder", write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
+    lines = recognize("--bag", path, "--out-bag", tmp_path / out, *["--track"] * is_tracked)
     assert [line["frame"] for line in lines] == [f"1700000000.{k * PERIOD:09d}" for k in range(3)]
     messages = messages_of(tmp_path / out)
     assert set(messages) == {"/thor2/detections", "/thor2/overlay/compressed"}
@@ -49,6 +50,8 @@ def test_detections_are_read_back(recognize: Recognize, tmp_path: Path, name: st
         expected = [[60 + 3 * k, 80, 50, 70], [180 + 3 * k, 80, 70, 70]]
         np.testing.assert_allclose([one["box"] for one in line["instances"]], expected, atol=2)
         assert line["instances"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
+        tracks = [(one.get("track"), one.get("frames")) for one in line["instances"]]
+        assert tracks == ([(1, k + 1), (2, k + 1)] if is_tracked else [(None, None)] * 2)
     _, overlay = messages["/thor2/overlay/compressed"][0]
     assert Image.open(io.BytesIO(overlay.data.tobytes())).size == (320, 240)
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
@@ -63,15 +66,6 @@ def test_every_second_frame_and_pictures(recognize: Recognize, segment: tuple[st
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
 
 
-def test_tracks_are_the_ids_of_detections(recognize: Recognize, tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "a.mcap", FRAMES)
-    lines = recognize("--bag", path, "--track", "--out-bag", tmp_path / "out")
-    assert [[one["track"] for one in line["instances"]] for line in lines] == [[1, 2]] * 3
-    assert [one["frames"] for one in lines[2]["instances"]] == [3, 3]
-    for _, array in messages_of(tmp_path / "out")["/thor2/detections"]:
-        assert [detection.id for detection in array.detections] == ["1", "2"]
-
-
 def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: Command) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
     path = write_recording(tmp_path / "a.mcap", FRAMES)
@@ -83,7 +77,7 @@ def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: C
         assert (tmp_path / name).read_bytes().startswith(b"RRF2")
 
 
-def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         for k, pixels in enumerate((FRAMES[0].color, FRAMES[0].color[:100], FRAMES[0].color)):
@@ -91,18 +85,16 @@ def test_a_failing_frame_stops_no_other(model: Path, tmp_path: Path, capfd: pyte
             write("/depth", image(FRAMES[0].depth, "16UC1", START + k * PERIOD), START + k * PERIOD)
     (tmp_path / "K.txt").write_text("290 0 160 0 290 120 0 0 1")
     command = ("recognize", "--model", model, "--bag", path, "--intrinsics", tmp_path / "K.txt")
-    assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 2
-    out, err = capfd.readouterr()
+    out, err = texts(*command, "--out-bag", tmp_path / "out.mcap", status=2)
     assert ["error" in line for line in json_lines(out)] == [False, True, False]
     assert err.splitlines()[-1].startswith("error: 1 of 3 frames") and "failed: 1700000000.033333333" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == 2
 
 
-def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
     path.write_bytes(path.read_bytes()[: -(10**6)])
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
-    out, err = capfd.readouterr()
+    out, err = texts("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", status=2)
     n_frames = len(json_lines(out))
     assert 0 < n_frames < 8 and "mcap recover" in err and err.count("\n") == 1
     assert f"{n_frames} frames were recognized before and are in {tmp_path / 'out.mcap'}" in err
@@ -123,12 +115,12 @@ def test_frames_with_one_stamp_and_before_1970(recognize: Recognize, tmp_path: P
     assert (messages[0][1].header.stamp.sec, messages[0][1].header.stamp.nanosec) == (-1, 10**9 - 1)
 
 
-def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, texts: Texts) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         write_images(write, FRAMES[0], frame_id="a\n\x1b[2J")
-    assert run_thor2("recognize", "--model", model, "--bag", path) == 0
-    (note,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("note: ")]
+    _, err = texts("recognize", "--model", model, "--bag", path)
+    (note,) = [line for line in err.splitlines() if line.startswith("note: ")]
     assert r"color in a\n\x1b[2J" in note
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Command, run_thor2
+from commands import Command, Texts, run_thor2
 from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
@@ -26,9 +26,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "frames"
 
 
-def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0
-    err = capfd.readouterr().err
+def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], texts: Texts) -> None:
+    _, err = texts("watch", "--model", model, "--folder", folder, "--port", 0)
     assert "watch at http://127.0.0.1:" in err and "2 of 3 were recognized" in err
     assert f"thor2 recognize {folder} --segment table --model {model} --out answers" in err
     assert [one["state"] for one in messages] == ["waiting", "live", "live", "live", "ended"]
@@ -37,7 +36,7 @@ def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], cap
     assert messages[-1]["number"] == 2
 
 
-def test_frames_with_labels_do_not_need_opencv(
+def test_only_frames_without_labels_need_opencv(
     model: Path, tmp_path: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
     frame = FRAMES[0]
@@ -48,14 +47,8 @@ def test_frames_with_labels_do_not_need_opencv(
     assert run_thor2(*command) == 0
     assert messages[-1]["number"] == 1
     assert "needs OpenCV" in refused(*command, "--segment", "table")
-
-
-def test_a_frame_without_labels_needs_opencv(
-    model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, refused: Command
-) -> None:
-    monkeypatch.delitem(sys.modules, "thor2_jax.segmentation.table", raising=False)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    assert "needs OpenCV" in refused("watch", "--model", model, "--folder", folder, "--port", 0)
+    (tmp_path / "frames" / "0" / "mask.png").unlink()
+    assert "needs OpenCV" in refused(*command)
 
 
 def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,11 +60,10 @@ def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monke
 
 
 def test_a_damaged_recording_ends_with_its_line(
-    model: Path, tmp_path: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str], refused: Command
+    model: Path, tmp_path: Path, messages: list[dict[str, Any]], texts: Texts, refused: Command
 ) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES, gap=5 * 10**9)
-    assert run_thor2("watch", "--model", model, "--bag", path, "--port", 0) == 2
-    error = capfd.readouterr().err.splitlines()[-1]
+    error = texts("watch", "--model", model, "--bag", path, "--port", 0, status=2)[1].splitlines()[-1]
     assert error.startswith("error: bag: ") and "expected at most" in error
     assert messages[-1]["state"] == "failed" and "expected at most" in messages[-1]["message"]
     path.write_bytes(path.read_bytes()[:1000])
