@@ -1,5 +1,6 @@
 """TOPS and TOPS2 of clouds: equal by steps, in chunks of large batches and as a stream; compilations; bad input."""
 
+import dataclasses
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,8 +24,16 @@ CLOSED = thor2.DescriptorConfig(homology="closed_form")
 def test_describe_equals_its_steps_and_its_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     clouds = thor2.PointClouds.pack(random_clouds(0, [900] * 3))
     whole = thor2.describe(clouds, NETWORK, CLOSED)
+
+    def mass(points: jax.Array) -> jax.Array:
+        return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, CLOSED).images.sum()
+
+    gradient = np.asarray(jax.grad(mass)(clouds.points))
+    assert (np.abs(gradient).max(axis=(1, 2)) > 0.1).all()
     monkeypatch.setattr(describe, "MAX_CHUNK_CLOUDS", 2)
+    monkeypatch.setattr(describe, "CHUNKS_PER_STEP", 1)
     np.testing.assert_allclose(thor2.describe(clouds, NETWORK, CLOSED).tops2, whole.tops2, atol=1e-6)
+    np.testing.assert_allclose(jax.grad(mass)(clouds.points), gradient, atol=1e-4)
     aligned = thor2.align(clouds, CLOSED)
     np.testing.assert_array_equal(thor2.describe_aligned(aligned, NETWORK, CLOSED).tops2, whole.tops2)
     strips = thor2.strips(aligned, NETWORK, CLOSED)

@@ -3,6 +3,7 @@
 import functools
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -149,6 +150,8 @@ def test_obj_without_its_material_or_texture(tmp_path: Path) -> None:
     (material,) = tmp_path.glob("*.mtl")
     picture.unlink()
     check_refused(tmp_path / "quad.obj", f"'{picture.name}' is missing")
+    os.mkfifo(picture)  # reading it would never end
+    check_refused(tmp_path / "quad.obj", "is missing or unreadable")
     material.unlink()
     check_refused(tmp_path / "quad.obj", f"'{material.name}' is missing")
 
