@@ -1,4 +1,4 @@
-"""Messages for packages that are missing, and reasons of exceptions."""
+"""Messages that are too long or for missing packages, and reasons of exceptions."""
 
 import pytest
 
@@ -17,3 +17,8 @@ def test_the_reason_of_an_error_of_the_system_names_its_file() -> None:
     assert reason_of(OSError(28, "No space left")) == "No space left"
     assert reason_of(OSError(5, "two\nlines", "a\nb")) == "a b: two lines"
     assert reason_of(OSError("two\nlines")) == "two lines" and reason_of(ValueError()) == "ValueError"
+
+
+def test_the_middle_of_a_long_message_is_left_out() -> None:
+    assert str(InputError("a" * 500 + "b" * 500)) == "a" * 500 + "b" * 500
+    assert str(InputError("a" * 600 + "b" * 600)) == f"{'a' * 500} ... {'b' * 500}"

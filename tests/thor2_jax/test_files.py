@@ -67,6 +67,8 @@ def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
             check_output_directory(tmp_path, "marker", ("partial",))
     assert_refused(f"out: {tmp_path} already contains marker", check_output_directory, tmp_path, "other", ("partial",))
     check_output_directory(tmp_path, "marker")
+    (tmp_path / "a").touch()
+    assert_refused("contains .lock, a, marker; expected", check_output_directory, tmp_path)
 
 
 def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

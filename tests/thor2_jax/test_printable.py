@@ -1,7 +1,15 @@
-"""Names of objects in sentences."""
+"""Names of objects: which are refused, and lists of them in sentences."""
 
-from thor2_jax.printable import first_names
+from refusals import assert_refused
+
+from thor2_jax.printable import check_name, first_names
 
 
 def test_dots_stand_for_further_names_only() -> None:
     assert [first_names("abc"[:count], 2) for count in range(4)] == ["", "a", "a, b", "a, b, ..."]
+
+
+def test_names_that_are_paths_or_no_names_are_reserved() -> None:
+    for name in ("..", "a/./b", "Unknown", "unrecognized"):
+        assert_refused("which is reserved", check_name, name)
+    assert [check_name(name) for name in (" a..b ", "a/b", "unknown 2")] == ["a..b", "a/b", "unknown 2"]
