@@ -42,7 +42,7 @@ def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int
 
 
 def png_of_zeros(width: int, height: int, bits: int = 8) -> bytes:
-    """Return an RGB image as a PNG; a large image is cut off, as Pillow could not write it."""
+    """Return an RGB image of zeros as a PNG; its pixels end after 64 MiB, so that a larger image is damaged."""
     header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     rows = zlib.compress(bytes(min((width * 3 * bits // 8 + 1) * height, 2**26)), 1)
     return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))

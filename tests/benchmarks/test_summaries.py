@@ -65,7 +65,9 @@ def test_pieces_are_compared_with_instances() -> None:
     assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)
 
 
-def test_bad_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_arguments_write_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     for benchmark, arguments, message in (
         (cameras, "", "give --model, --frames and --out"),
@@ -83,7 +85,7 @@ def test_bad_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
         with pytest.raises(SystemExit) as caught:
             benchmark.main()
         error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
-        assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1]
+        assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1], arguments
         assert list(tmp_path.iterdir()) == []
 
 

@@ -165,3 +165,13 @@ def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
     assert finish(*command, out) == finish(*command, tmp_path / "whole")
+
+
+def test_enroll(meshes: Path, tmp_path: Path) -> None:
+    command = "enroll", "brick", "--mesh", meshes / "brick.ply", "--model", tmp_path / "run"
+    for place in ("before ../.thor2-*/run/gallery/index.json", "before ."):
+        kill(place, *command)
+        (left,) = tmp_path.iterdir()  # what the process before has left is removed
+        assert left.name.startswith(".thor2-")
+    assert run_thor2(*command) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

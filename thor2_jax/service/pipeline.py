@@ -127,7 +127,7 @@ class Service:
         if self.state == "starting":
             self.state = "ready"
             self.metrics.ready_workers.set(1)
-        log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
+            log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
         if self.settings.warm_why:
             self._warm_why([programs for n in POINT_BUCKETS for programs in self.engine.explanation_programs(n)])
 

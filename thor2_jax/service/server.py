@@ -46,7 +46,7 @@ MAX_HEAD = 2**20
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:
     """Serve until SIGTERM or SIGINT, then finish the accepted requests and return.
 
-    With one worker, SIGTERM ends this process instead, with exit code 0.
+    A thread may still be compiling explanations then; a normal exit of the process waits for it.
 
     Args:
         settings: settings of each worker.
@@ -79,10 +79,13 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         if workers == 1:
             config.load()
             log.info("listening at %s", url)
-            # uvicorn raises the signal again after the shutdown. A normal exit would wait for the compiling thread.
-            signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
-            with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(config).run([listener])
+            # uvicorn raises the signal again after the shutdown; SIGTERM then is like SIGINT.
+            previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+            try:
+                with contextlib.suppress(KeyboardInterrupt):
+                    uvicorn.Server(config).run([listener])
+            finally:
+                signal.signal(signal.SIGTERM, previous)
         else:
             with ended_by_signals():
                 InferenceEngine(settings)  # Report an unreadable run once, not once per worker.

@@ -51,24 +51,24 @@ class OutputOptions:
 class _AnswerFiles:
     """The files for the answers, of which unusable ones are refused before any frame is recognized."""
 
-    def __init__(self, given: OutputOptions, frames: Sequence[str], in_folders: bool) -> None:
+    def __init__(self, given: OutputOptions, frames: Sequence[str], in_directories: bool) -> None:
         """Check the paths.
 
         Args:
             given: the paths.
             frames: name of each frame; empty for a recording, whose frames are not known yet.
-            in_folders: whether each frame has a folder of its name in `given.out`.
+            in_directories: whether each frame has a directory of its name in `given.out`.
         """
         from thor2_jax.files import check_output_directory, check_output_file
         from thor2_jax.model import result_files
         from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
         from training.readers.bop import read_object_names
 
-        self._given, self._frames, self._in_folders = given, frames, in_folders
+        self._given, self._frames, self._in_directories = given, frames, in_directories
         if given.out is not None:
-            resumable = {name.split("/")[0] for name in frames} if in_folders else result_files.RESULT_FILES
+            resumable = {name.split("/")[0] for name in frames} if in_directories else result_files.RESULT_FILES
             check_output_directory(given.out, resumable=resumable)
-            for name in frames if in_folders else [""]:
+            for name in frames if in_directories else [""]:
                 result_files.check_no_foreign_results(given.out / name)
         if given.coco is not None and given.bop is not None and given.coco.absolute() == given.bop.absolute():
             raise InputError(f"coco and bop are {given.coco}; expected two files")
@@ -96,7 +96,7 @@ class _AnswerFiles:
         if self._given.coco or self._given.bop:
             self._tables.add(answer.name, frame, answer.detections, answer.seconds)
         if out is not None:
-            write_recognitions(out / answer.name if self._in_folders else out, frame, answer.recognitions)
+            write_recognitions(out / answer.name if self._in_directories else out, frame, answer.recognitions)
         if self._bag is not None and place is not None:
             self._bag.write(frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
         if self._rerun is not None:
@@ -166,7 +166,7 @@ def recognize(
         from thor2_jax.tracking.viewpoints import read_poses  # imports SciPy
 
         frame_poses = read_poses(poses, [source.name for source in sources])
-    files = _AnswerFiles(outputs, [source.name for source in sources], in_folders=bool(frames or recording))
+    files = _AnswerFiles(outputs, [source.name for source in sources], in_directories=bool(frames or recording))
     as_json, failed, empty, unknown, damage = as_json or recording is not None, [], [], False, None
     with contextlib.ExitStack() as stack:
         if bag is not None:

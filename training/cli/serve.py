@@ -74,3 +74,4 @@ def serve(
             warm_why=warm_why,
         )
     serve_forever(settings, host, port, workers)
+    os._exit(0)  # a normal exit would wait until explanations are compiled

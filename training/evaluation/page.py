@@ -204,9 +204,10 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
         text += f"The column {EMBEDDED} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         named_by = main_fusion(title for title in report["fusions"] if title != ALL_CLASSIFIERS)
+        names = f"the names from {named_by} with" if named_by != EMBEDDED else "these names with"
         text += (
-            f"The column {ALL_CLASSIFIERS} shows the names from {named_by} with the confidence from the embedding; "
-            "answers below the threshold keep their names in this table. "
+            f"The column {ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
+            "threshold keep their names in this table. "
         )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):
         text += (

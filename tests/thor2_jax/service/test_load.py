@@ -45,8 +45,11 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
 
 
 @pytest.mark.parametrize("workers", [1, *slow(2)])
-def test_sigterm_answers_accepted_requests(workers: int, start_server: Callable[..., Any], files: Files) -> None:
-    """It does not wait for explanations to be compiled, which takes up to a minute."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, *slow(signal.SIGINT)])
+def test_signals_answer_accepted_requests(
+    number: signal.Signals, workers: int, start_server: Callable[..., Any], files: Files
+) -> None:
+    """With one worker, explanations are being compiled, which never ends, and the service does not wait for it."""
     options = ("--workers", str(workers), "--processes", "1", "--warm-why")
     server, answered = start_server(*options), list[int]()
     wait_until(lambda: server.log.read_text().count("ready: ") == workers, server.log.read_text)
@@ -59,7 +62,7 @@ def test_sigterm_answers_accepted_requests(workers: int, start_server: Callable[
     with ThreadPoolExecutor(8) as clients:
         clients.map(call, range(8))
         wait_until(lambda: answered.count(200) >= 10, server.log.read_text)
-        server.process.terminate()
+        server.process.send_signal(number)
         assert server.process.wait(HANG) == 0
     log = server.log.read_text()
     counts = re.findall(r"stopped: (\d+) requests accepted, (\d+) finished", log)

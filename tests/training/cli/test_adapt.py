@@ -98,7 +98,9 @@ def test_uncertainty_that_does_not_decrease_is_noted(
         assert (f"{model} may serve as well" in out) == is_noted
 
 
-def test_bad_input(model: Path, video: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_writes_nothing(
+    model: Path, video: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing is written for few or unlabelled frames, or for a run with a device, which cannot be copied."""
     few, unlabelled = tmp_path / "few", tmp_path / "unlabelled"
     write_frame(few, OBJECTS)

@@ -79,7 +79,9 @@ def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Com
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
     assert report["instances"]["scored"] == whole["instances"] == len(truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(expected), "std": 0.0, "runs": 2}
+    kept = (tmp_path / "report" / "answers.jsonl").read_bytes()
     assert "nothing was recomputed" in printed(*command)
+    assert (tmp_path / "report" / "answers.jsonl").read_bytes() == kept
     assert "already contains" in refused(*command[:-1], tmp_path / "answer")
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
     assert str(tmp_path / "absent") in refused("evaluate", "uwis", tmp_path / "absent", "--model", model)

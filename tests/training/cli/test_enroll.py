@@ -133,13 +133,12 @@ def test_a_folder_of_meshes(tmp_path: Path) -> None:
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
         write_box(tmp_path / "meshes" / file, BOX, color)
-    for name, folder, names in (
-        ([], "025_mug", {"025_mug"}),
-        (["red mug"], "025_mug", {"red mug"}),
-        (["can"], "", {"can"}),
-        ([], "", {"025_mug", "can", "caf\u00e9"}),
+    for run, name, folder, names in (
+        (tmp_path / "one", [], "025_mug", {"025_mug"}),
+        (tmp_path / "one", ["red mug"], "025_mug", {"025_mug", "red mug"}),
+        (tmp_path / "two", ["can"], "", {"can"}),
+        (tmp_path / "all", [], "", {"025_mug", "can", "caf\u00e9"}),
     ):
-        run = tmp_path / f"{name} in {folder}"
         assert run_thor2("enroll", *name, "--mesh", tmp_path / "meshes" / folder, "--model", run) == 0
         objects = Recognizer.load(run).gallery.objects
         assert set(objects) == names

@@ -96,18 +96,20 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     seen = []
 
     def explain(recognizer: Recognizer, _: Any, label: int) -> SimpleNamespace:
-        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
+        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by, recognizer.objects.directory))
         if label == 4:
             raise InputError("too few points")
         return SimpleNamespace(title="mug")
 
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
-    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
-    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
+    gallery = tmp_path / "gallery"
+    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers", gallery))
+    options_of_model = ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
+    assert given == [*options_of_model, "--gallery", str(gallery)]
     assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
     assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
-    assert seen == [(0.9, "classifiers")] * 2
+    assert seen == [(0.9, "classifiers", gallery)] * 2
 
 
 def test_frames_without_instances_are_named(model: Path, tmp_path: Path, texts: Texts) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pickle
 import shutil
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
 from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
 from training.frame_recognition import RecognizerArguments, recognize_frames
 from training.readers.frames import FrameFolder, find_frames, segmented_source
-from training.storage.workers import IN_PROCESS
 
 N_FRAMES = 9
 
@@ -61,9 +61,14 @@ def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, 
     expected = answer_frames(load_evaluated(*arguments), FrameFolder(folder))
     (damaged / "006" / "depth.png").write_bytes(b"damaged")
     frames, answers = FrameFolder(damaged), []
-    assert len(frames.only(6)) == 1  # workers get no other frames
+
+    def pool(answer: Callable[[FrameFolder], Any], parts: Iterable[FrameFolder]) -> Iterator[Any]:
+        for part in parts:
+            assert len(part) == 1  # workers get no other frames
+            yield answer(part)
+
     with pytest.raises(InputError, match="depth"):
-        for _, answer in answer_frames_in_pool(arguments, frames, IN_PROCESS, range(len(frames))):
+        for _, answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
             answers.append(answer)
     assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(6)]
     for one, (_, other) in zip(answers, expected, strict=False):

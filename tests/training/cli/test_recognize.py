@@ -70,6 +70,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
     out, err = texts(*command)
     assert "instances have a name" not in err
+    assert f"written to {tmp_path / 'out'}, {tables[1]}, {tables[3]}; see why" in out
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
     with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
         assert overlay.size == (120, 90)

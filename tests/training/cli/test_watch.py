@@ -70,7 +70,8 @@ def test_a_damaged_recording_ends_with_its_line(
     assert "mcap recover" in refused("watch", "--model", model, "--bag", path, "--port", 0)
 
 
-def test_invalid_arguments(model: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = write_frame_files(tmp_path / "frame", FRAMES[0])
     for arguments, expected in (
         ("", "no source is given"),
         ("--bag a.bag --realsense", "--bag and --realsense is given"),
@@ -78,6 +79,8 @@ def test_invalid_arguments(model: Path, refused: Command, monkeypatch: pytest.Mo
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
         ("--folder a --segment sam", "segmenter is 'sam'"),
+        (f"--folder {frame} --answer-by gallery", "answer_by is gallery"),
+        (f"--folder {frame} --unknown-below 2", "unknown_below is 2"),
     ):
         assert expected in refused("watch", "--model", model, *arguments.split())
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)

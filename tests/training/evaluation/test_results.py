@@ -60,11 +60,11 @@ def test_main_fusion_is_that_of_what_answers() -> None:
         assert fusions(features)[main_fusion(fusions(features))] == chosen
 
 
-@pytest.mark.parametrize(("feature", "named_by"), [("tops", "TOPS"), ("ce", "embedding")])
-def test_the_page_says_which_column_gives_the_names(feature: str, named_by: str) -> None:
+@pytest.mark.parametrize(("feature", "names"), [("tops", "the names from TOPS"), ("ce", "these names")])
+def test_the_page_says_which_column_gives_the_names(feature: str, names: str) -> None:
     titles = list(fusions([feature, "embedding", "classifiers"]))
     text = _accuracy_text({"fusions": titles, "rule": "log-mean", "scratch": [], "runs": ["run"]})
-    assert f"column classifiers shows the names from {named_by} " in text and "THOR2" not in text
+    assert f"column classifiers shows {names} with" in text and "THOR2" not in text
 
 
 def test_fusion_rules_match_hand_calculation() -> None:

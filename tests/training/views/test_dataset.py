@@ -38,8 +38,6 @@ from training.views.normalized_views import NormalizedViews, normalize_views, pa
 NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
 JOB = RenderJob(OBJECTS, 180, 90)
-
-
 """6 views an object: of 4 and 2 with the shards of these tests."""
 CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 
