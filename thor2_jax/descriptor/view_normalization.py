@@ -136,10 +136,9 @@ def _eigenvectors(moments: jax.Array) -> jax.Array:
 
 def _moments(points: jax.Array) -> jax.Array:
     """Return `points @ points.T` [3, 3] of centred points [3, N]; N is a multiple of 16."""
-    # Row by row, because XLA would store the products of whole coordinates first.
-    folded = points.reshape(3, ROWS, -1)
-    first, second = (rows_of(folded[np.array(k)]) for k in ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]))
-    products = [a * b for a, b in zip(first, second, strict=True)]
+    # Row by row, because XLA would store whole coordinates, chosen for each product, and their products first.
+    first, second = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+    products = [row[first] * row[second] for row in rows_of(points.reshape(3, ROWS, -1))]
     return functools.reduce(jnp.add, products).sum(axis=-1)[np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
 
 
