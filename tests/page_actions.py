@@ -1,12 +1,35 @@
 """Actions on the web page of the service that several test files use."""
 
+import io
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import processes
-from playwright.sync_api import Page, Route
+from PIL import Image
+from playwright.sync_api import Locator, Page, Route
 
 FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
+
+RECORD_TEXTS = """() => {
+  const { drawImage, roundRect, fillText } = CanvasRenderingContext2D.prototype;
+  const recorded = (draw, note) => function (...args) {
+    if (this.canvas.id === "overlay") note(args);
+    return draw.apply(this, args);
+  };
+  let box;
+  window.texts = new Set();
+  Object.assign(CanvasRenderingContext2D.prototype, {
+    drawImage: recorded(drawImage, () => { window.tags = []; }),
+    roundRect: recorded(roundRect, ([x, y, width, height]) => { box = [x, y, x + width, y + height]; }),
+    fillText: function (text, ...args) {
+      if (this.canvas.id === "overlay") window.tags.push([text, ...box]);
+      if (this.canvas.className === "image") window.texts.add(`${text}`);
+      return fillText.call(this, text, ...args);
+    },
+  });
+}"""
+"""Script that records the tags on the overlay (text and box), `tags`, and the texts in images, `texts`."""
 
 
 def changed_answers(change: Callable[[Any], None], path: str = "/v1/explain") -> Callable[[Route], None]:
@@ -48,6 +71,12 @@ def wait_for_answer(page: Page) -> None:
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
     """Wait for something that the handler of a request does."""
     processes.wait_until(condition, pause=lambda seconds: page.wait_for_timeout(1000 * seconds))
+
+
+def pixels(canvas: Locator) -> np.ndarray:
+    """Return the pixels of a canvas, [H, W, 3]."""
+    canvas.scroll_into_view_if_needed()
+    return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
 
 
 def assert_fits(page: Page, width: int) -> None:
