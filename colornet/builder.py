@@ -32,7 +32,6 @@ MIN_SAMPLES = 6
 """Smallest number of colours in the neighbourhood of a core point of DBSCAN."""
 
 _N_CUBES = (3, 8)  # chroma, hue
-_OVERLAP = (0.10, 0.25)
 
 _MIN_SHARED = 0.95
 """Fraction of the smaller node's colours above which two nodes can be redundant."""
@@ -91,7 +90,7 @@ def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDAr
         pairs of nodes that share a colour; and pairs of nodes [c, 2] int64 that are neighbours across the cut.
     """
     values = lens(lab)
-    cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=list(_OVERLAP))
+    cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=[0.10, 0.25])
     graph = kmapper.KeplerMapper(verbose=0).map(values, lab, clusterer=HyabDBSCAN(), cover=cover)
     names = list(graph["nodes"])
     members = [np.sort(np.asarray(graph["nodes"][name], np.int64)) for name in names]
