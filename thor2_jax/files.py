@@ -6,6 +6,7 @@ import functools
 import hashlib
 import json
 import math
+import os
 import re
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -77,9 +78,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
     """
     directory = Path(directory)
     with _refusal_named(f"out: {directory} is not a directory"):
-        names = (
-            sorted(path.name for path in directory.iterdir()) if directory.exists() or directory.is_symlink() else []
-        )
+        names = sorted(path.name for path in directory.iterdir()) if os.path.lexists(directory) else []
         if marker or resumable:
             names = [name for name in names if name not in resumable and not name.startswith(".")]
         if names and not (marker and (directory / marker).is_file()):
@@ -90,7 +89,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         check_writable(directory)
 
 
-def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], bool] = lambda path: True) -> None:
+def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], bool]) -> None:
     """Raise unless a command may write a file at the end of its work; missing directories will be created.
 
     Args:

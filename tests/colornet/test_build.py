@@ -1,18 +1,18 @@
 """The packaged network: the result of a build from scratch, with the counts of the paper."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import finish_programs, start_program
 
 import colornet
 
 NETWORK = colornet.load_default()
 BUILD = """
-import re, sys
+import re, sys, warnings
+warnings.simplefilter("error")
 from pathlib import Path
 import colornet
 colornet.build().save(sys.argv[1])
@@ -23,8 +23,7 @@ print(re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1
 
 @pytest.mark.slow
 def test_packaged_network_is_built_in_little_memory(tmp_path: Path) -> None:
-    command = [sys.executable, "-W", "error", "-c", BUILD, str(tmp_path / "network.npz")]
-    peak = subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout
+    (peak,) = finish_programs(start_program(BUILD, tmp_path / "network.npz"))
     assert int(peak) < 3 * 2**20
     rebuilt = colornet.load(tmp_path / "network.npz")
     for field in dataclasses.fields(NETWORK):

@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 from sklearn.cluster import DBSCAN
 
 from colornet.builder import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
-from colornet.colors import GRID_WHITE, LUMA, MEAN_WHITE, grid_colors, to_lab
+from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, to_lab
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
@@ -19,10 +19,6 @@ def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArr
     ratio = linear @ matrix.T / np.array([x / y, 1.0, (1 - x - y) / y])
     f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
-
-
-def test_luma_is_that_of_rec_601() -> None:
-    assert LUMA.tolist() == np.array([0.299, 0.587, 0.114], np.float32).tolist()
 
 
 def reference_hyab(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:

@@ -27,7 +27,6 @@ def test_round_trip(tmp_path: Path) -> None:
     again = colornet.load(str(path))
     for name, value in CONTENTS.items():
         np.testing.assert_array_equal(getattr(again, name), value, strict=True)
-    assert again.fingerprint == NETWORK.fingerprint
     colornet.save(again, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
     assert sorted(os.listdir(tmp_path)) == ["again.npz", "network.npz"]

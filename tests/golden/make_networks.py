@@ -29,7 +29,6 @@ DENSENETS: dict[str, tuple[str, dict[str, Any], int]] = {
     "densenet_161": ("densenet161", {}, 64),
     "densenet_small": ("densenet121", {"growth_rate": 12, "block_config": (2, 4, 4, 2)}, 96),
 }
-RESNETS = {"resnet18": 64}
 
 
 def filled(model: torch.nn.Module) -> torch.nn.Module:
@@ -47,19 +46,14 @@ def images(name: str, count: int, size: int) -> torch.Tensor:
     return torch.from_numpy(random_images(name, count, size)).double().permute(0, 3, 1, 2)
 
 
-def rows_last(features: torch.Tensor) -> np.ndarray:
-    """Return features [B, C, H, W] as [B, H, W, C]."""
-    return features.permute(0, 2, 3, 1).numpy()
-
-
-def resnet_outputs(name: str, size: int) -> np.ndarray:
+def resnet_outputs() -> np.ndarray:
     """Return the sampled features of the four stages of timm's ResNet-18."""
     model: Any = filled(timm.create_model("resnet18"))
-    x = model.maxpool(model.act1(model.bn1(model.conv1(images(name, 2, size)))))
+    x = model.maxpool(model.act1(model.bn1(model.conv1(images("resnet18", 2, 64)))))
     outputs = []
     for stage in (model.layer1, model.layer2, model.layer3, model.layer4):
         x = stage(x)
-        outputs.append(sampled(rows_last(x)))
+        outputs.append(sampled(x.permute(0, 2, 3, 1).numpy()))
     return np.concatenate(outputs)
 
 
@@ -78,8 +72,7 @@ def resampled_outputs() -> np.ndarray:
 
 def outputs() -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the sampled output of each case."""
-    for name, size in RESNETS.items():
-        yield name, resnet_outputs(name, size)
+    yield "resnet18", resnet_outputs()
     for name, (model, arguments, size) in DENSENETS.items():
         network: Any = filled(timm.create_model(model, **arguments))
         features = network.forward_features(images(name, 2, size))

@@ -36,19 +36,15 @@ GREYS = np.linspace(0, 1, 256).astype(np.float32)
 """Every grey from black to white, on grid colours and between them."""
 
 
-def packed() -> thor2.PointClouds:
-    colors = [np.repeat(np.resize(GREYS, len(points))[:, None], 3, axis=1) for points in CLOUDS.values()]
-    return thor2.PointClouds.pack(list(zip(CLOUDS.values(), colors, strict=True)), 112)
-
-
 QUICK = [("cold", True), ("closed_form", False)]
 SLOW = sorted(set(itertools.product(CONFIGS, (True, False))) - set(QUICK))
 
 
 @pytest.mark.parametrize(("name", "aligned"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)])
 def test_values_and_gradients_are_finite(name: str, aligned: bool) -> None:
-    config, clouds = CONFIGS[name], packed()
-    describe = thor2.describe_aligned if aligned else thor2.describe
+    colors = [np.repeat(np.resize(GREYS, len(points))[:, None], 3, axis=1) for points in CLOUDS.values()]
+    clouds = thor2.PointClouds.pack(list(zip(CLOUDS.values(), colors, strict=True)), 112)
+    config, describe = CONFIGS[name], thor2.describe_aligned if aligned else thor2.describe
 
     def outputs(cloud: thor2.PointClouds, points: Any, colors: Any, parameters: Any) -> Any:
         one = dataclasses.replace(cloud, points=points, colors=colors)

@@ -42,11 +42,6 @@ def clouds_of(make: Callable[[int], np.ndarray], count: int = 2, dtype: Any = np
     return dataclasses.replace(packed, points=jnp.asarray(points, dtype), colors=jnp.asarray(colors, dtype))
 
 
-def parameters_of(config: thor2.DescriptorConfig, dtype: Any = np.float64) -> thor2.Parameters:
-    exact = thor2.Parameters.of(NETWORK, dataclasses.replace(config, persistence_weight=1.3))
-    return jax.tree.map(lambda a: jnp.asarray(a, dtype), exact)
-
-
 def checked_derivatives(
     describe: Callable[..., thor2.Descriptors], clouds: thor2.PointClouds, config: thor2.DescriptorConfig
 ) -> list[float]:
@@ -60,7 +55,8 @@ def checked_derivatives(
         probe = np.random.default_rng(5).normal(size=tops2.shape[-1])
         return (tops2 * jnp.asarray(probe, tops2.dtype)).sum()
 
-    arguments, step = (clouds.points, clouds.colors, parameters_of(config)), 1e-6
+    parameters = thor2.Parameters.of(NETWORK, dataclasses.replace(config, persistence_weight=1.3))
+    arguments, step = (clouds.points, clouds.colors, jax.tree.map(jnp.float64, parameters)), 1e-6
     leaves, tree = jax.tree.flatten(arguments)
     value = jax.jit(lambda *leaves: loss(*jax.tree.unflatten(tree, leaves)))
     gradients = jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(*arguments))

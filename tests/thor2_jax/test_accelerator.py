@@ -49,10 +49,6 @@ def clouds() -> thor2.PointClouds:
     return thor2.PointClouds.pack(pairs, 2048)
 
 
-def on(device: jax.Device, clouds: thor2.PointClouds) -> thor2.PointClouds:
-    return jax.device_put(clouds, device)
-
-
 def assert_near_except_at_borders(
     actual: jax.Array, expected: jax.Array, median: float = 1e-5, limit: float = 1e-3
 ) -> None:
@@ -71,8 +67,8 @@ def assert_near_except_at_borders(
 @pytest.mark.parametrize("homology", ["closed_form", "gudhi"])
 def test_descriptors_are_those_of_a_cpu(homology: str, accelerator: jax.Device, clouds: thor2.PointClouds) -> None:
     config = thor2.DescriptorConfig(homology=homology)
-    descriptors = thor2.describe(on(accelerator, clouds), NETWORK, config)
-    expected = thor2.describe(on(jax.devices("cpu")[0], clouds), NETWORK, config)
+    descriptors = thor2.describe(jax.device_put(clouds, accelerator), NETWORK, config)
+    expected = thor2.describe(jax.device_put(clouds, jax.devices("cpu")[0]), NETWORK, config)
     assert descriptors.images.devices() == {accelerator}
     assert_near_except_at_borders(descriptors.images, expected.images)
     assert_near_except_at_borders(descriptors.embeddings, expected.embeddings)
@@ -87,8 +83,8 @@ def test_gradients_are_those_of_a_cpu(homology: str, accelerator: jax.Device, cl
         return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
 
     gradient, expected = (
-        jax.jit(jax.grad(mass))(placed.points, placed)
-        for placed in (on(accelerator, clouds), on(jax.devices("cpu")[0], clouds))
+        jax.jit(jax.grad(mass))(*jax.device_put((clouds.points, clouds), device))
+        for device in (accelerator, jax.devices("cpu")[0])
     )
     assert_near_except_at_borders(gradient, expected, median=1e-3, limit=1e-2)
 

@@ -15,7 +15,6 @@ def test_import_rejects_versions_that_are_wrong_or_untested(package: str, versio
         f"m.version = lambda name: '{version}' if name == '{package}' else real(name); import thor2_jax"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode != 0
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f"ImportError: {package} {version} ")
     assert "issues/39103" in last and "constraints.txt" in last

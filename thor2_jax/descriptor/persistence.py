@@ -102,10 +102,7 @@ def persistence_power(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:
 
 
 def persistence_images(
-    diagrams: Diagrams,
-    config: DescriptorConfig,
-    variance: ArrayLike | None = None,
-    persistence_weight: ArrayLike | None = None,
+    diagrams: Diagrams, config: DescriptorConfig, variance: ArrayLike, exponent: ArrayLike
 ) -> jax.Array:
     """Return the sum over pairs of persistence**n times a Gaussian, integrated over each pixel; the paper's n is 1.
 
@@ -114,9 +111,9 @@ def persistence_images(
 
     Args:
         diagrams: fields [..., J].
-        config: settings of the descriptor. Static.
-        variance: [], variance of the Gaussian; by default `config.image_variance`.
-        persistence_weight: [], exponent n; by default `config.persistence_weight`.
+        config: settings of the descriptor, without those of the next two. Static.
+        variance: [], variance of the Gaussian.
+        exponent: [], exponent n.
 
     Returns:
         [..., P, P] float32, axes birth and persistence, both over [-sigma_2, (P - 1) sigma_2]. The image of an empty
@@ -128,10 +125,7 @@ def persistence_images(
     padding = -len(births) % 8
     persistence = jnp.pad(persistence, [(0, 0)] * (persistence.ndim - 1) + [(0, padding)])
     births = jnp.pad(births, (0, padding))
-    variance = config.image_variance if variance is None else variance
-    weight = persistence_power(
-        persistence, config.persistence_weight if persistence_weight is None else persistence_weight
-    )
+    weight = persistence_power(persistence, exponent)
     edges = (jnp.arange(config.image_size + 1, dtype=births.dtype) - 1) * config.sigma_2
     by_persistence = cumulative_at_edges(persistence, variance, edges) * weight[..., None, :]
     by_birth = jnp.diff(cumulative_at_edges(births, variance, edges), axis=-2)

@@ -60,10 +60,8 @@ class RegionSets:
 @functools.lru_cache(maxsize=8)
 def region_sets(network: ColorNetwork) -> RegionSets:
     """Return the region sets of a network as device arrays."""
-    bits, of_color = np.unique(network.region_bits, return_inverse=True)
-    member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
-    weights = member / member.sum(axis=1, keepdims=True)
-    fields = of_color.astype(np.min_scalar_type(len(bits))), weights.astype(np.float32)
+    _, first, of_color = np.unique(network.region_bits, return_index=True, return_inverse=True)
+    fields = of_color.astype(np.min_scalar_type(len(first))), network.membership(grid_colors()[first])
     # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
     with jax.ensure_compile_time_eval():
         return RegionSets(*jax.device_put(fields))  # from NumPy arrays, since JAX would compile each conversion

@@ -73,13 +73,8 @@ def image_numbers(names: Sequence[str]) -> list[tuple[int, int]]:
     The numbers are the last two parts of the name (`000048/000001`: scene 48, image 1; `000001`: scene 1) if these are
     numbers that differ between the frames; otherwise all frames are in scene 1 and are counted from 1.
     """
-    numbers = []
-    for name in names:
-        scene, _, image = name.rpartition("/")
-        scene = scene.rpartition("/")[2]
-        if not image.isdecimal() or (scene and not scene.isdecimal()):
-            break
-        numbers.append((int(scene or 1), int(image)))
+    matches = (re.fullmatch(r"(?:(?:.*/)?(\d+)/)?(\d+)", name, re.DOTALL) for name in names)
+    numbers = [(int(match[1] or 1), int(match[2])) for match in matches if match]
     if len(set(numbers)) < len(names):
         return [(1, position) for position in range(1, len(names) + 1)]
     return numbers
@@ -105,11 +100,8 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
 
 def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
     """Return the compressed run-length encoding of a mask [H, W], as COCO defines it."""
-    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
-    borders = np.flatnonzero(flat[1:] != flat[:-1])
-    counts = np.diff(np.concatenate([[0], borders, [mask.size]])).tolist()
-    if counts[-1] == 0:
-        counts.pop()
+    borders = np.flatnonzero(np.diff(mask.ravel(order="F"), prepend=False))
+    counts = np.diff(borders, prepend=0, append=mask.size).tolist()
     text = bytearray()
     for position, count in enumerate(counts):
         value = count - counts[position - 2] if position > 2 else count

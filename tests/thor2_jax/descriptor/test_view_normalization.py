@@ -16,7 +16,6 @@ from thor2_jax.descriptor.view_normalization import _minimum_area_angle
 from thor2_jax.types import matmul
 
 CONFIG = thor2.DescriptorConfig()
-COLOR = np.float32(0.5)
 
 # These tests share three shapes, [1, 512], [1, 1024] and [4, 512], since compilation dominates their time.
 
@@ -30,7 +29,7 @@ def object_cloud(seed: int, n: int = 400) -> np.ndarray:
 
 
 def pack(*clouds: np.ndarray, **options: object) -> thor2.PointClouds:
-    return thor2.PointClouds.pack([(points, np.full(points.shape, COLOR)) for points in clouds], **options)
+    return thor2.PointClouds.pack([(points, np.full(points.shape, 0.5)) for points in clouds], **options)
 
 
 def normalized(points: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
-from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run, weights_file
 from thor2_jax.recognizer import Recognizer
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
@@ -85,10 +85,6 @@ def edited(**changes: Any) -> Callable[[Path], None]:
     return edit
 
 
-def weights(path: Path, name: str) -> Path:
-    return path / "weights" / f"{name}.safetensors"
-
-
 def test_an_equal_run_in_an_empty_directory_has_equal_bytes(saved: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     save_run(make_run(), tmp_path / "run")
@@ -97,9 +93,9 @@ def test_an_equal_run_in_an_empty_directory_has_equal_bytes(saved: Path, tmp_pat
 
 
 def flip_a_bit(path: Path) -> None:
-    content = bytearray(weights(path, "ce").read_bytes())
+    content = bytearray(weights_file(path, "ce").read_bytes())
     content[len(content) // 2] ^= 1
-    weights(path, "ce").write_bytes(content)
+    weights_file(path, "ce").write_bytes(content)
 
 
 def other_network(path: Path) -> None:
@@ -127,7 +123,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
     "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
-    "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors is missing"),
+    "no weights": (lambda path: weights_file(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 
 
