@@ -29,18 +29,12 @@ from thor2_jax.files import open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
-from thor2_jax.recordings.topics import (
-    CAMERA_TYPE,
-    DEFAULT_MAX_GAP,
-    IMAGE_TYPES,
-    PairCounts,
-    StampedImage,
-    Topics,
-    choose_topics,
-    nearest_pairs,
-)
+from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 __all__ = ["Bag"]
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
