@@ -2,6 +2,7 @@
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,11 @@ from image_files import write_frame_files
 from PIL import Image
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from training.readers.bop import BOP
+from training.readers.frames import FrameFolder
+from training.readers.labelled import LabelledFrames
+from training.readers.ocid import OCID
+from training.readers.uwis import UWISOccluded
 
 SHAPE = (6, 9)
 K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
@@ -103,9 +109,7 @@ def pack_pcd(points: np.ndarray, color: np.ndarray, labels: np.ndarray, data: st
     return header + b"".join(rows)
 
 
-def write_ocid(
-    root: Path, sequence: str = "table/bottom/curved/seq36", stem: str = STEM, data: str = "binary", **options: Any
-) -> Path:
+def write_ocid(root: Path, sequence: str = "table/bottom/curved/seq36", stem: str = STEM, **options: Any) -> Path:
     folder = root / sequence
     color, depth, labels = ocid_scene(first=2 if sequence.startswith("floor") else 3, **options)
     for kind, image in (("rgb", color), ("depth", depth), ("label", labels)):
@@ -115,8 +119,13 @@ def write_ocid(
             picture.putpalette(np.arange(768, dtype=np.uint8) * 7)  # the dataset has indexed PNGs
         picture.save(folder / kind / f"{stem}.png")
     (folder / "pcd").mkdir(exist_ok=True)
-    (folder / "pcd" / f"{stem}.pcd").write_bytes(pack_pcd(points_of(depth), color, labels, data))
+    (folder / "pcd" / f"{stem}.pcd").write_bytes(pack_pcd(points_of(depth), color, labels))
     return folder
+
+
+def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") -> dict[str, Any]:
+    """Return an entry of a table of OCID-VLG."""
+    return {"image_filename": file, "answer": answer, "target": target, "question": "Pick it."}
 
 
 def write_uwis(root: Path, video: str, stem: str, poses: str, seed: int = 0) -> Path:
@@ -132,3 +141,31 @@ def write_folder(folder: Path, labels: Any, seed: int = 0) -> Path:
     write_frame_files(folder, RGBDFrame(*images(seed), Intrinsics(600.0, 601.0, 4.0, 3.0)))
     (folder / "labels.json").write_text(json.dumps(labels))
     return folder
+
+
+READERS: dict[str, Callable[[Path], LabelledFrames]] = {
+    "bop": lambda root: BOP(root, root / "names.yaml"),
+    "ocid": lambda root: OCID(root, root / "names.json"),
+    "uwis": UWISOccluded,
+    "folder": FrameFolder,
+}
+"""Kind of a dataset -> function that reads what `write_dataset` wrote."""
+
+
+def write_dataset(kind: str, root: Path) -> None:
+    """Write a dataset of two frames."""
+    if kind == "bop":
+        for scene in ("000048", "000049"):
+            write_bop(root / scene, visible=[1.0, 1.0])
+        (root / "names.yaml").write_text("8: mug\n14: bowl\n")
+    elif kind == "ocid":
+        write_ocid(root, "table/bottom/mixed/seq35", "a")
+        write_ocid(root, "table/top/mixed/seq36", "b")
+        names = ["mug", "bowl", "banana"]
+        (root / "names.json").write_text(json.dumps({"seq35": names, "seq36": names}))
+    elif kind == "uwis":
+        for video in ("41", "42"):
+            write_uwis(root, video, "000000", "mug:\n  label: 1\n  pose: [1, 0, 0]\nbowl:\n  label: 4\n")
+    else:
+        for name in "ab":
+            write_folder(root / name, {"labels": {"1": "mug"}, "light": 1})

@@ -11,7 +11,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from dataset_files import band, write_bop, write_folder, write_ocid, write_uwis
+from dataset_files import READERS, write_dataset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_runs import untrained_run
@@ -20,10 +20,6 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
-from training.readers.bop import BOP
-from training.readers.frames import FrameFolder
-from training.readers.ocid import OCID
-from training.readers.uwis import UWISOccluded
 from training.storage.jobs import MANIFEST
 from training.views.dataset import Manifest, Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews
@@ -31,43 +27,20 @@ from training.views.normalized_views import NormalizedViews
 from .conftest import other_content
 
 
-def bop(path: Path) -> tuple[Any, list[str]]:
-    write_bop(path, objects={3: band(2, 6)}, visible=[0.75])
-    (path / "names.yaml").write_text("3: mug\n4: bowl\n")
-    tables = ["scene_camera.json", "scene_gt.json", "scene_gt_info.json", "names.yaml"]
-    return (lambda: list(BOP(path, path / "names.yaml"))), tables
-
-
-def ocid(path: Path) -> tuple[Any, list[str]]:
-    write_ocid(path, "table/top/mixed/seq01", "a", objects=2)
-    (path / "names.yaml").write_text("seq01: [mug, bowl]\n")
-    return (lambda: list(OCID(path, path / "names.yaml"))), ["names.yaml", "table/top/mixed/seq01/pcd/a.pcd"]
-
-
-def uwis(path: Path) -> tuple[Any, list[str]]:
-    write_uwis(path, "41", "000001", "mug:\n  label: 2\n  pose: [[1.0, 0, 0], [0, 1, 0]]\nbowl:\n  label: 4\n")
-    return (lambda: list(UWISOccluded(path))), ["41/images/000001_poses.yaml"]
-
-
-def folders(path: Path) -> tuple[Any, list[str]]:
-    write_folder(path / "one", {"labels": {"2": "mug"}, "light": 1})
-    return (lambda: list(FrameFolder(path))), ["one/labels.json", "one/intrinsics.json"]
-
-
-@pytest.fixture(scope="module", params=[bop, ocid, uwis, folders], ids=lambda make: make.__name__)
-def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list[str]]:
-    """Return the directory of a dataset of one frame, its reader, and the names of its tables and clouds."""
-    path = tmp_path_factory.mktemp("dataset")
-    read, names = request.param(path)
-    assert len(read()) == 1
-    return path, read, names
+@pytest.fixture(scope="module", params=READERS)
+def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, list[Path]]:
+    """Return the reader of a dataset of two frames, and the tables and the cloud of the first one."""
+    kind, path = request.param, tmp_path_factory.mktemp("dataset")
+    write_dataset(kind, path)
+    files = [*READERS[kind](path).files(0), *path.glob("names.*")]
+    return (lambda: list(READERS[kind](path))), [f for f in files if f.suffix in (".json", ".yaml", ".pcd")]
 
 
 @given(data=st.data())
-def test_datasets(data: st.DataObject, dataset: tuple[Path, Any, list[str]], attempt: Any) -> None:
+def test_datasets(data: st.DataObject, dataset: tuple[Any, list[Path]], attempt: Any) -> None:
     """One table or cloud of a small dataset is damaged, and the whole dataset is read."""
-    path, read, names = dataset
-    file = path / data.draw(st.sampled_from(names))
+    read, tables = dataset
+    file = data.draw(st.sampled_from(tables))
     with other_content(file, data.draw(damaged(file.read_bytes()))):
         frames = attempt(read)
     assert frames is None or all(type(v) is str for item in frames for v in item.truth.values())

@@ -160,9 +160,6 @@ def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tup
 
 
 def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    n_points = points.shape[1]
-    if n_points <= NEIGHBORS:
-        return np.zeros(n_points, bool)
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):

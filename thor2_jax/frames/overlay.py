@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,16 +27,7 @@ from thor2_jax.printable import escape_characters
 if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
 
-__all__ = [
-    "COLORS",
-    "UNRECOGNIZED",
-    "Annotation",
-    "Paint",
-    "annotate",
-    "answer_paints",
-    "draw_instances",
-    "draw_overlay",
-]
+__all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "annotate", "answer_paints", "draw_instances", "draw_overlay"]
 
 Paint = tuple[int, int, int]
 """An sRGB colour, 0 to 255."""
@@ -168,11 +160,8 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
 
 def answer_paints(answers: Sequence[Recognition]) -> list[Paint]:
     """Return the colour of each answer: `COLORS` in turn, or `UNRECOGNIZED`."""
-    recognized = np.cumsum([answer.name is not None for answer in answers])
-    return [
-        UNRECOGNIZED if answer.name is None else COLORS[(int(count) - 1) % len(COLORS)]
-        for answer, count in zip(answers, recognized, strict=True)
-    ]
+    colors = itertools.cycle(COLORS)
+    return [UNRECOGNIZED if answer.name is None else next(colors) for answer in answers]
 
 
 def _text(answer: Recognition) -> str:

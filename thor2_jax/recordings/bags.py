@@ -29,18 +29,12 @@ from thor2_jax.files import open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
-from thor2_jax.recordings.topics import (
-    CAMERA_TYPE,
-    DEFAULT_MAX_GAP,
-    IMAGE_TYPES,
-    PairCounts,
-    StampedImage,
-    Topics,
-    choose_topics,
-    nearest_pairs,
-)
+from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 __all__ = ["Bag"]
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
@@ -103,7 +97,6 @@ class Bag:
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
         self.is_truncated = False
         self.notes: list[str] = []
-        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> "Bag":
         """Open the recording, choose its topics and read the camera.
@@ -133,24 +126,24 @@ class Bag:
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":
-                reader: Any = Reader1(self.path)
+                self._reader: Any = Reader1(self.path)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
-                reader = Reader2(self.path)
+                self._reader = Reader2(self.path)
                 if self.is_truncated:
-                    reader.storage.path = SimpleNamespace(open=lambda mode: _CompleteRecords(io.FileIO(self.path)))
+                    self._reader.storage.path = SimpleNamespace(open=lambda _: _CompleteRecords(io.FileIO(self.path)))
                 self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
-            reader.open()
-        with contextlib.ExitStack() as stack:
-            stack.callback(reader.close)
-            self._reader = reader
+            self._reader.open()
+        try:
             self._choose()
-            self._stack = stack.pop_all()
+        except BaseException:
+            self._reader.close()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the recording."""
-        self._stack.close()
+        self._reader.close()
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their time stamps.

@@ -67,7 +67,6 @@ class RealSenseCamera:
         if self._pipeline is not None:
             with contextlib.suppress(RuntimeError):  # The camera may be unplugged.
                 self._pipeline.stop()
-            self._pipeline = None
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the newest frame repeatedly.

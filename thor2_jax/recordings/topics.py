@@ -8,19 +8,7 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError
 from thor2_jax.printable import first_names
 
-__all__ = [
-    "CAMERA_TYPE",
-    "DEFAULT_MAX_GAP",
-    "IMAGE_TYPES",
-    "PairCounts",
-    "StampedImage",
-    "Topics",
-    "choose_topics",
-    "nearest_pairs",
-]
-
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
+__all__ = ["DEFAULT_MAX_GAP", "PairCounts", "StampedImage", "Topics", "choose_topics", "nearest_pairs"]
 
 _EXPECTED = {
     "color": "8-bit colour images",

@@ -207,8 +207,8 @@ def assert_stable(
     Births do not change and each extreme moves by at most eps, so that the 1-Wasserstein distance W1 of the diagrams is
     at most 2 eps for each pair. By the theorem for Gaussians of Adams et al. (JMLR 2017), the difference of the images,
     summed over pixels, is at most (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1 for the weight f = p, with |f'| = 1 and
-    |f| the largest persistence. Both steps are checked, and for each pair also the tighter constant for fixed births,
-    which is smaller by a factor of sqrt(5).
+    |f| the largest persistence. Both steps are checked, the second with the tighter constant for fixed births and the
+    persistence of each pair, which is smaller by a factor of at least sqrt(5).
 
     Args:
         describe: function of aligned clouds.
@@ -236,7 +236,6 @@ def assert_stable(
     assert (difference <= tight + slack).all(), f"an image moves by {difference.max():.3g}"
     constant = math.sqrt(5) * image_lipschitz(largest.max(axis=-1, initial=0), config)
     bound = constant * moves.sum(axis=-1)
-    assert (difference <= bound + slack).all()
     return float((difference / np.where(bound > 100 * slack, bound, np.inf)).max(initial=0))
 
 

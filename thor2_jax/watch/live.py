@@ -42,11 +42,7 @@ LONGEST_PAUSE = 2.0
 _JPEG_QUALITY = 80
 
 
-def paced(
-    frames: Iterable[RecordedFrame],
-    clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], object] = time.sleep,
-) -> Iterator[RecordedFrame]:
+def paced(frames: Iterable[RecordedFrame]) -> Iterator[RecordedFrame]:
     """Yield the frames of a recording at the speed at which they were taken; late frames are skipped.
 
     If a frame is more than `LONGEST_PAUSE` late or early, because programs are compiled or the recording has a gap, the
@@ -54,12 +50,12 @@ def paced(
     """
     offset: float | None = None  # from the time stamps to the clock
     for frame in frames:
-        stamp, now = frame.stamp / 1e9, clock()
+        stamp, now = frame.stamp / 1e9, time.monotonic()
         if offset is None or abs(stamp + offset - now) > LONGEST_PAUSE:
             offset = now - stamp
         ahead = stamp + offset - now
         if ahead >= 0:
-            sleep(ahead)
+            time.sleep(ahead)
             yield frame
 
 

@@ -182,10 +182,7 @@ class FrameFolder(LabelledFrames):
             InputError: the path is not a directory or contains no frame, or no frame has a labels.json.
         """
         sources = find_frames([Path(frames)]) if isinstance(frames, str | Path) else frames
-        labelled: list[FrameSource] = []
-        others: list[FrameSource] = []
-        for source in sources:
-            (labelled if source.files and source.files.names.is_file() else others).append(source)
+        labelled = [each for each in sources if each.files and each.files.names.is_file()]
         self.named = bool(labelled)
         if named and not self.named:
             raise InputError(
@@ -194,7 +191,8 @@ class FrameFolder(LabelledFrames):
             )
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
-        left_out = [source.name for source in others] if labelled else []
+        kept = set(self.sources)
+        left_out = [source.name for source in sources if source not in kept]
         listed = first_names(left_out, MAX_LISTED)
         self.note = f"{len(left_out)} frames without labels.json: {listed}" if left_out else ""
 

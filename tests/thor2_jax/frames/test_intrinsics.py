@@ -15,13 +15,7 @@ from failures import Pickled
 from image_files import encode_npy
 from refusals import assert_refused
 
-from thor2_jax.frames.frames import (
-    Intrinsics,
-    RGBDFrame,
-    backproject,
-    frame_intrinsics,
-    pixel_rays,
-)
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, frame_intrinsics, pixel_rays
 from thor2_jax.frames.intrinsics import parse_intrinsics, read_intrinsics
 
 MATRIX = np.array([[615.5, 0.0, 318.25], [0.0, 616.75, 241.5], [0.0, 0.0, 1.0]])
@@ -95,10 +89,7 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "BOP scene": (as_json({"7": BOP_ENTRY}), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP camera.json": (as_json(WITH_SIZE | {"depth_scale": 0.1}), Intrinsics(**WITH_SIZE, depth_scale=10_000)),
     "RealSense": (as_json({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}), SIZED),
-    "RealSense with a scale": (
-        as_json(REALSENSE | {"depth_scale": 0.00025}),
-        Intrinsics(**WITH_SIZE, depth_scale=4e3),
-    ),
+    "RealSense with a scale": (as_json(REALSENSE | {"depth_scale": 0.00025}), Intrinsics(**WITH_SIZE, depth_scale=4e3)),
     "Open3D": (as_json(OPEN3D), SIZED),
     "Open3D camera": (as_json({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}), SIZED),
 }
@@ -146,7 +137,6 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ("[" * 70_000, "is not valid JSON"),
         ("\xff", "is neither JSON, YAML"),
         ("[500, 500, 3, 2]", "intrinsics is a list of shape (4,)"),
-        ('{"fx": 1' + "0" * 400 + ', "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is 1000"),
         ("K: [1, 0, 3, 0, 2, 2, 0, 0]", "expected fx, 0, cx"),
         ('{"K": "one"}', "expected fx, 0, cx"),
         ("615 0 318 0 616 241 0 0", "shape (8,)"),

@@ -215,10 +215,8 @@ def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
 
 
 def test_no_recording(tmp_path: Path) -> None:
-    (tmp_path / "file.bag").write_bytes(b"#ROSBAG V2.0\n")
-    assert_refused("damaged or of another format", Bag(tmp_path / "file.bag").__enter__)
     (tmp_path / "x.bag").mkdir()
-    message = "metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
+    message = "damaged or of another format.*metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
     assert_refused(message, Bag(tmp_path / "x.bag").__enter__)
 
 

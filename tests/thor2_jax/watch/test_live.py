@@ -6,6 +6,7 @@ import functools
 import io
 import json
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -61,7 +62,7 @@ STAMPS = [100 + k / 10 for k in range(10)]
     ],
 )
 def test_recordings_play_at_their_speed(
-    stamps: list[float], work: list[float], expected: list[tuple[float, float]]
+    stamps: list[float], work: list[float], expected: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The clock stands still, but for sleeping and for the work after each frame."""
     clock, shown, works = [0.0], [], iter(work)
@@ -69,7 +70,8 @@ def test_recordings_play_at_their_speed(
     def sleep(seconds: float) -> None:
         clock[0] += seconds
 
-    for frame in paced(map(recorded, stamps), lambda: clock[0], sleep):
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: clock[0], sleep=sleep))
+    for frame in paced(map(recorded, stamps)):
         shown.append(pytest.approx((frame.stamp / SECOND, clock[0])))
         sleep(next(works, 0.0))
     assert shown == expected

@@ -2,21 +2,14 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from dataset_files import K, write_bop, write_folder, write_ocid, write_uwis
+from dataset_files import READERS, K, vlg_item, write_dataset
 from PIL import Image
 from refusals import assert_refused
-
-from training.readers.bop import BOP
-from training.readers.frames import FrameFolder
-from training.readers.labelled import LabelledFrames
-from training.readers.ocid import OCID
-from training.readers.uwis import UWISOccluded
 
 FILES = {
     "bop": ("000049", "rgb/000001.png depth/000001.png mask_visib/000001_000000.png scene_camera.json scene_gt.json"),
@@ -28,33 +21,6 @@ FILES = {
 EACH_FILE = [(kind, f"{folder}/{file}") for kind, (folder, files) in FILES.items() for file in files.split()]
 OPTIONAL = ("rgb", "camera", "labels.json")
 """Parts of the names of files without which there is no frame."""
-
-
-def write_dataset(kind: str, root: Path) -> None:
-    """Write a dataset of two frames."""
-    if kind == "bop":
-        for scene in ("000048", "000049"):
-            write_bop(root / scene, visible=[1.0, 1.0])
-        (root / "names.yaml").write_text("8: mug\n14: bowl\n")
-    elif kind == "ocid":
-        write_ocid(root, "table/bottom/mixed/seq35", "a")
-        write_ocid(root, "table/top/mixed/seq36", "b")
-        names = ["mug", "bowl", "banana"]
-        (root / "names.json").write_text(json.dumps({"seq35": names, "seq36": names}))
-    elif kind == "uwis":
-        for video in ("41", "42"):
-            write_uwis(root, video, "000000", "mug:\n  label: 1\n  pose: [1, 0, 0]\n")
-    else:
-        for name in "ab":
-            write_folder(root / name, {"labels": {"1": "mug"}})
-
-
-READERS: dict[str, Callable[[Path], LabelledFrames]] = {
-    "bop": lambda root: BOP(root, root / "names.yaml"),
-    "ocid": lambda root: OCID(root, root / "names.json"),
-    "uwis": UWISOccluded,
-    "folder": FrameFolder,
-}
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut off"])
@@ -103,10 +69,6 @@ def camera(**changes: Any) -> dict[str, Any]:
 
 
 POSES = "42/images/000000_poses.yaml"
-
-
-def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") -> dict[str, Any]:
-    return {"image_filename": file, "answer": answer, "target": target}
 
 
 @pytest.mark.parametrize(
