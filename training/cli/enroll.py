@@ -96,7 +96,7 @@ def enroll(
     enrolled = f"enrolled in {gallery or model}, which recognizes {known.gallery.summary}"
     # `thor2 recognize` uses the gallery in the run directory.
     then = ("serve the objects", "serve") if gallery else ("recognize a frame", "recognize", "FRAME")
-    finish(enrolled, *then, *options.model_arguments(model, gallery))
+    finish(enrolled, *then, model=model, gallery=gallery)
 
 
 @contextlib.contextmanager

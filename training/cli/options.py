@@ -12,7 +12,7 @@ from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, Topics
-from training.cli.app import print_note
+from training.cli.app import option_arguments, print_note
 
 __all__ = [
     "AnswerByOption",
@@ -33,10 +33,8 @@ __all__ = [
     "check_alone",
     "check_belongs",
     "find_segmenter",
-    "given_options",
     "given_values",
     "grouped_options",
-    "model_arguments",
     "recording_option",
     "split_names",
 ]
@@ -93,26 +91,10 @@ recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
 """Option for recordings; the help lists these in a panel of their own."""
 
 
-def model_arguments(model: Path, gallery: Path | None) -> list[object]:
-    """Return the arguments with which the next command uses the same run directory and gallery."""
-    return ["--model", model, *(["--gallery", gallery] if gallery else [])]
-
-
 def given_values(record: Any) -> dict[str, Any]:
     """Return the fields of a dataclass that differ from their defaults: the options that were given."""
     values = ((field, getattr(record, field.name)) for field in dataclasses.fields(record))
     return {field.name: value for field, value in values if value != field.default}
-
-
-def given_options(record: Any, without: str = "") -> list[str]:
-    """Return the command-line options that pass the values of a record to another command.
-
-    Args:
-        record: a dataclass, such as `FrameOptions` or `RecognizerArguments`.
-        without: name of a field that is not an option.
-    """
-    given = [(f"--{name.replace('_', '-')}", value) for name, value in given_values(record).items() if name != without]
-    return [str(part) for pair in given for part in pair]
 
 
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
@@ -159,8 +141,9 @@ class FrameOptions:
     @property
     def arguments(self) -> list[str]:
         """The arguments that pass the same frames to another command."""
-        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in self.frames or ()]
-        return [*frames, *given_options(self, without="frames")]
+        given = given_values(self)
+        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
+        return [*frames, *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
