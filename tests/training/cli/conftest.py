@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import Command, Recognize, Texts, json_lines, run_thor2
+from commands import Command, Recognize, json_lines
 from small_runs import SMALL_CONFIG, untrained_run
 from small_runs import small_embedding as embedding_of_tests
 
@@ -28,18 +28,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run")
     save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), COVERING, seed=1), directory)
     return directory
-
-
-@pytest.fixture
-def texts(capfd: pytest.CaptureFixture[str]) -> Texts:
-    """Return a function that runs a command, which must have a status, and returns its standard output and error."""
-
-    def run(*arguments: object, status: int = 0) -> tuple[str, str]:
-        capfd.readouterr()
-        assert run_thor2(*arguments) == status
-        return capfd.readouterr()
-
-    return run
 
 
 @pytest.fixture
