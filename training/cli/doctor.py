@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def doctor(
     given: options.FrameOptions,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Run directory trained on the objects, to check the channel order.")
+        Path | None, typer.Option(help="Run directory trained on the objects, to check the channel order.")
     ] = None,
     meshes: Annotated[
         Path | None,

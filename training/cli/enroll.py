@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.grouped_options
 def enroll(
     *,
-    model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
+    model: Annotated[Path, typer.Option(help="Run directory; created if it does not exist.")],
     name: Annotated[str | None, typer.Argument(help="Name of the object. Default: enroll every object.")] = None,
     given: options.FrameOptions,
     mesh: Annotated[

@@ -30,12 +30,10 @@ MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", hel
 class EvaluationOptions(options.WorkerOptions):
     """The models to evaluate, and the directory of the report."""
 
-    model: Annotated[
-        list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
-    ]
+    model: Annotated[list[Path], typer.Option(help="Run directory, or the directory of a training with several folds.")]
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
+        typer.Option(help="Directory for report.html and report.json; an interrupted evaluation resumes."),
     ] = None
     quiet: options.QuietOption = False
 

@@ -48,37 +48,32 @@ if TYPE_CHECKING:
 UnknownOption = Annotated[
     float | None,
     typer.Option(
-        "--unknown-below",
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own threshold for "
         "trained classes; for enrolled objects, a threshold that depends on their number of views.",
     ),
 ]
 AnswerByOption = Annotated[
-    str | None, typer.Option("--answer-by", help="classifiers, gallery or both. Default: all that the run has.")
+    str | None, typer.Option(help="classifiers, gallery or both. Default: all that the run has.")
 ]
-ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+ModelOption = Annotated[Path, typer.Option(help="Run directory of a trained model.")]
 SegmentOption = Annotated[
     str | None,
     typer.Option(
-        "--segment",
         help="Segmenter to use instead of labels: table, model (for piles; only in recognize and explain), or another "
         "one.",
     ),
 ]
 GalleryOption = Annotated[
-    Path | None, typer.Option("--gallery", help="Directory of the gallery. Default: gallery in the run directory.")
+    Path | None, typer.Option(help="Directory of the gallery. Default: gallery in the run directory.")
 ]
 MeshScaleOption = Annotated[
-    float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
+    float, typer.Option(help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]
-NamesOption = Annotated[
-    Path | None, typer.Option("--names", help="JSON or YAML table: object name -> mesh. Default: all meshes.")
-]
-HostOption = Annotated[str, typer.Option("--host", help="Address to listen on; 0.0.0.0 for other machines.")]
+NamesOption = Annotated[Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")]
+HostOption = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")]
 AllowHostOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--allow-host",
         metavar="NAME",
         help="Additional name or address of this machine in requests, such as robot.local; repeatable. localhost and "
         "the address of the connection are always allowed.",
@@ -257,7 +252,7 @@ MAX_WORKERS = 1024
 """Largest number of processes of a command; each process needs memory and open files."""
 
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
 ]
 
 

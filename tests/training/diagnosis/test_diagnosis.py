@@ -282,11 +282,11 @@ def test_folders_of_frames(tmp_path: Path, texts: Texts, printed: Command) -> No
     reports = json_lines(texts(*command, status=1)[0])
     assert [[finding["code"] for finding in report["findings"]] for report in reports] == [[], ["intrinsics-focal"]]
     assert printed("doctor", tmp_path / "frames" / "tools").startswith("tools:\n")
-    color = frame_files(tmp_path / "frames" / "breakfast").color
-    color.unlink()
+    frame_files(tmp_path / "frames" / "breakfast").color.unlink()
     out, err = texts(*command, status=2)
     assert [report["frame"] for report in json_lines(out)] == ["tools"]
     assert "failed: breakfast: " in err and "error: 1 of 2 frames" in err
+    color = frame_files(tmp_path / "frames" / "breakfast").color
     color.mkdir()
     assert f"failed: breakfast: {color}: Is a directory\n" in texts(*command, status=2)[1]
 
