@@ -182,7 +182,6 @@ def train_run(
         if first:
             if not resumed:
                 check_out(out)  # another process may have begun in the meantime
-                (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
         wait_for_all("begun")

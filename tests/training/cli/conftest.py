@@ -12,9 +12,7 @@ from small_runs import small_embedding as embedding_of_tests
 from thor2_jax.gallery import embedding, enrollment
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
-from thor2_jax.networks import EmbeddingSizes
-from training import protocol, train_run
-from training.embedding import fit
+from training import protocol
 from training.protocol import DEFAULT, PAPER
 from training.views import mesh_views
 
@@ -37,12 +35,10 @@ def recognize(model: Path, printed: Command) -> Recognize:
 
 
 @pytest.fixture(scope="module")
-def small_descriptors() -> Iterator[None]:
+def small_descriptors(small_networks: None) -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
     with pytest.MonkeyPatch.context() as patch:
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
-        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(fit, "BATCH_SIZE", 64)
         patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
         patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
         yield

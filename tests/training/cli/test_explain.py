@@ -105,9 +105,6 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
     gallery = tmp_path / "gallery"
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
-    options_of_model = ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
-    assert given == [*options_of_model, "--gallery", str(gallery)]
-    assert option_arguments(**vars(RecognizerArguments(model))) == ["--model", str(model)]
     assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
     assert seen == [(0.9, "classifiers", gallery)] * 2
 
