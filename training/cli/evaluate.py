@@ -32,8 +32,7 @@ class EvaluationOptions(options.WorkerOptions):
 
     model: Annotated[list[Path], typer.Option(help="Run directory, or the directory of a training with several folds.")]
     out: Annotated[
-        Path | None,
-        typer.Option(help="Directory for report.html and report.json; an interrupted evaluation resumes."),
+        Path | None, typer.Option(help="Directory for report.html and report.json; an interrupted evaluation resumes.")
     ] = None
     quiet: options.QuietOption = False
 

@@ -82,10 +82,6 @@ def with_focal_factor(frame: RGBDFrame, factor: float) -> RGBDFrame:
     return change(frame, intrinsics=change(k, fx=k.fx * factor, fy=k.fy * factor))
 
 
-def far(frame: RGBDFrame) -> RGBDFrame:
-    return with_focal_factor(change(frame, depth=(frame.depth * 5).astype(np.uint16)), 5)
-
-
 def with_one_mask_of_two_thirds(frame: RGBDFrame) -> RGBDFrame:
     labels = np.zeros(frame.depth.shape, np.uint8)
     labels[: labels.shape[0] * 2 // 3] = 255
@@ -101,7 +97,7 @@ DEPTH: dict[str, tuple[Callable[[RGBDFrame], RGBDFrame], str]] = {
     "no labels, metres per unit": (lambda f: change(with_scale(f, 0.001), labels=None), "depth-unit: .*1000"),
     "no depth": (lambda f: change(f, depth=f.depth * 0), "depth-missing"),
     "little depth": (lambda f: change(f, depth=f.depth * (np.indices(f.depth.shape)[1] % 10 == 0)), "depth-missing"),
-    "far": (far, "distance: .*0.5 to 1.5 m"),
+    "far": (lambda f: with_focal_factor(change(f, depth=f.depth * np.uint16(5)), 5), "distance: .*0.5 to 1.5 m"),
     "a mask of touching objects": (with_one_mask_of_two_thirds, "labels-foreground"),
 }
 
