@@ -45,7 +45,7 @@ def explain(
         with with_context(source.name):
             frame = source.read()
             labels = frame.instances if instance is None else instance
-        if not len(labels):
+        if not labels:
             print_note(f"skipped: {source.name}: it has no instances")
         for label in labels:
             directory = out / source.name / str(label)
