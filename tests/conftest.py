@@ -156,29 +156,35 @@ def browser() -> "Iterator[Browser]":
         yield playwright.chromium.launch(executable_path=chromium)
 
 
-def _run_command(capfd: pytest.CaptureFixture[str], status: int, arguments: tuple[object, ...]) -> tuple[str, str]:
-    from commands import run_thor2
+@pytest.fixture
+def texts(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[str, str]]:
+    """Return a function that runs a command, which must have a status, and returns its standard output and error."""
 
-    capfd.readouterr()
-    assert run_thor2(*arguments) == status
-    return capfd.readouterr()
+    def run(*arguments: object, status: int = 0) -> tuple[str, str]:
+        from commands import run_thor2
+
+        capfd.readouterr()
+        assert run_thor2(*arguments) == status
+        return capfd.readouterr()
+
+    return run
 
 
 @pytest.fixture
-def printed(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def printed(texts: Callable[..., tuple[str, str]]) -> Callable[..., str]:
     """Return a function that runs a command, which must succeed, and returns what it prints."""
-    return lambda *arguments: _run_command(capfd, 0, arguments)[0]
+    return lambda *arguments: texts(*arguments)[0]
 
 
 @pytest.fixture
-def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(texts: Callable[..., tuple[str, str]]) -> Callable[..., str]:
     """Return a function that runs a command, which must fail, and returns the line that says why.
 
     Commands that fail before they begin their work print nothing else; others do if `at_once` is False.
     """
 
     def run(*arguments: object, at_once: bool = True) -> str:
-        out, error = _run_command(capfd, 2, arguments)
+        out, error = texts(*arguments, status=2)
         *others, line = error.splitlines()
         assert line.startswith("error: ") and not any("error: " in other or "Traceback" in other for other in others)
         assert not at_once or (out, others) == ("", []), error

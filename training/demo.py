@@ -17,7 +17,6 @@ import numpy as np
 
 from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.model.run_directory import load_run
 from thor2_jax.networks import FEATURES
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
 from training.embedding.distractors import AUGMENTATIONS
@@ -107,10 +106,10 @@ def run_demo(
     job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
     shown = numbered(progress, job.stages | SCENE_STAGES)
     run_train_job(job, shown, stages={})
-    trained = load_run(out / "run")
     pictures.mkdir(exist_ok=True)
     scenes = _compose_scenes(objects, seed, shown)
     (run,) = load_runs([out / "run"])
+    trained = run.model.run
     answers = _answer_scenes(run, scenes, shown)
     report = compute_results("demo", [run], answers)
     cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]

@@ -22,7 +22,7 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
-__all__ = ["RecognizerArguments", "recognize_frames", "segmentation_failure", "track_frames"]
+__all__ = ["RecognizerArguments", "recognize_frames", "track_frames"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,17 @@ class FrameAnswer:
     def detections(self) -> list[Detection]:
         """The answers with the positions of the objects; empty without a frame."""
         return [] if self.frame is None else detections_of(self.frame, self.recognitions)
+
+    @property
+    def segmentation_failure(self) -> str:
+        """Why no instance was found in a segmented frame if its depth is unusable; otherwise an empty string."""
+        if self.frame is None or self.recognitions:
+            return ""
+        depth = self.frame.depth_m
+        if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+            return ""
+        wanted = f"from {MIN_DEPTH} to {MAX_DEPTH} m"
+        return f"segment: nothing was found, since no pixel has depth {wanted}: {unit_question(self.frame)}"
 
     def as_json(self) -> dict[str, Any]:
         """Return {"frame", "instances"} or {"frame", "error"}; recordings add "depth_gap", boxes and positions."""
@@ -81,17 +92,6 @@ def recognize_frames(
             yield FrameAnswer(source.name, error=reason_of(error), recorded=recorded)
         else:
             yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start, recorded=recorded)
-
-
-def segmentation_failure(answer: FrameAnswer) -> str:
-    """Return why no instance was found in a segmented frame if its depth is unusable; otherwise an empty string."""
-    if answer.frame is None or answer.recognitions:
-        return ""
-    depth = answer.frame.depth_m
-    if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
-        return ""
-    wanted = f"from {MIN_DEPTH} to {MAX_DEPTH} m"
-    return f"segment: nothing was found, since no pixel has depth {wanted}: {unit_question(answer.frame)}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -173,10 +173,8 @@ def train_run(
             views = [source.read(index).view for index in range(len(source.shards))]
             label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
             view = np.concatenate(views)
-        folds = settings.folds
-        is_held_out = folds > 1 or settings.distractors is not None
-        parts = folds
-        if folds == 1 and is_held_out:  # fewer parts if a class has few views
+        parts = settings.folds
+        if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
             fewest = min(len(np.unique(view[label == index])) for index in range(len(source.classes)))
             parts = max(2, min(HELD_OUT, fewest))
         fold_of = fold_of_views(label, view, source.classes, parts, settings.fit.seed)
@@ -184,15 +182,13 @@ def train_run(
         if first:
             if not resumed:
                 check_out(out)  # another process may have begun in the meantime
-                (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
         wait_for_all("begun")
-        held_out = [fold_of == fold if is_held_out else None for fold in range(folds)]
-        runs = [
-            _Fold(settings, source, out, fold, samples, label, view, mask, progress).train()
-            for fold, mask in enumerate(held_out)
-        ]
+        runs = []
+        for fold in range(settings.folds):
+            held_out = None if parts == 1 else fold_of == fold
+            runs.append(_Fold(settings, source, out, fold, samples, label, view, held_out, progress).train())
         wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")

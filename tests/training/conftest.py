@@ -16,8 +16,9 @@ from small_runs import random_classifier
 
 from thor2_jax import figures
 from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
-from thor2_jax.networks import MLP, input_size
+from thor2_jax.networks import MLP, EmbeddingSizes, input_size
 from training import train_run
+from training.embedding import fit
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
@@ -84,6 +85,15 @@ def weights(request: pytest.FixtureRequest) -> str:
     if request.param == "random":
         request.getfixturevalue("unfitted")
     return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def small_networks() -> Iterator[None]:
+    """Let the embeddings of runs have small networks, which are fitted in small batches."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        patch.setattr(fit, "BATCH_SIZE", 64)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,10 @@ from small_runs import SMALL_CONFIG
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from thor2_jax.networks import EmbeddingSizes
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
 from training import train_run as module
-from training.embedding import distractors, fit
+from training.embedding import distractors
 from training.embedding.distractors import Distractors, render_clouds
 from training.fitting.calibration import fit_calibration
 from training.fitting.loop import Checkpoints, FitOptions
@@ -34,13 +33,11 @@ SOURCE = MemoryViews(CLOUDS, SMALL_CONFIG)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A user's cache, in which the first training keeps the samples of the distractors; small networks and batches."""
+def cache(small_networks: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A user's cache, in which the first training keeps the samples of the distractors."""
     directory = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THOR2_CACHE", str(directory))
-        patch.setattr(module, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(fit, "BATCH_SIZE", 64)
         yield directory
 
 

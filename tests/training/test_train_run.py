@@ -250,7 +250,6 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)
         assert one.temperatures == {"tops": pytest.approx(fit_temperature(probabilities, samples.label[rows]))}
         record = runs[fold].record
-        assert record["temperatures"] == one.temperatures
         curve = record["curves"]["tops"]
         logged += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
         best = max(row["held_out_accuracy"] for row in curve)

@@ -37,4 +37,4 @@ def adapt(
     )
     if adaptation.uncertainty_after >= adaptation.uncertainty_before:
         console.print(f"these frames do not show that their colours need a correction; {model} may serve as well")
-    finish(f"written to {out}", "recognize a frame", "recognize", "FRAME", "--model", out)
+    finish(f"written to {out}", "recognize a frame", "recognize", "FRAME", model=out)

@@ -30,7 +30,7 @@ from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
-__all__ = ["app", "console", "enable_compilation_cache", "finish", "main", "print_note", "show_help", "show_progress"]
+__all__ = ["app", "console", "finish", "main", "option_arguments", "print_note", "show_help", "show_progress"]
 
 MAX_BYTES = 2**30
 
@@ -132,9 +132,15 @@ MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 """Options whose value may be empty, or whose command checks the value itself."""
 
 
-def finish(result: str, purpose: str, *command: object, file: TextIO | None = None) -> None:
-    """Print where the result of a command is, and the most likely next command: `thor2` with the words of `command`."""
-    words = shlex.join(map(str, ("thor2", *command)))
+def option_arguments(**values: object) -> list[str]:
+    """Return the command-line options with these values, in their order; None leaves an option out, True is a flag."""
+    given = {f"--{name.replace('_', '-')}": value for name, value in values.items() if value is not None}
+    return [str(part) for option, value in given.items() for part in ([option] if value is True else [option, value])]
+
+
+def finish(result: str, purpose: str, *command: object, file: TextIO | None = None, **options: object) -> None:
+    """Print where the result of a command is, and the most likely next command: `thor2`, its words and its options."""
+    words = shlex.join(map(str, ("thor2", *command, *option_arguments(**options))))
     print(escape_characters(f"{result}; {purpose} with: {words}"), file=file, flush=True)
 
 

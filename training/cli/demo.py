@@ -32,4 +32,4 @@ def demo(
     for part, values in figures.accuracy.items():
         table.add_row(part, *(f"{v:.3f}" for v in values))
     console.print(table)
-    finish(f"report: {out / 'report.html'}", "try its model in a browser", "serve", "--model", out / "run")
+    finish(f"report: {out / 'report.html'}", "try its model in a browser", "serve", model=out / "run")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def doctor(
     given: options.FrameOptions,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Run directory trained on the objects, to check the channel order.")
+        Path | None, typer.Option(help="Run directory trained on the objects, to check the channel order.")
     ] = None,
     meshes: Annotated[
         Path | None,
@@ -60,7 +60,7 @@ def doctor(
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     result = f"frames checked: {len(sources)}"
     if is_sound and not as_json:
-        finish(result, "recognize", "recognize", *given.arguments, "--model", model or "RUN")
+        finish(result, "recognize", "recognize", *given.arguments, model=model or "RUN")
     elif not as_json:
         finish(result, "after a change, check again", *sys.argv[1:])
     if not is_sound:

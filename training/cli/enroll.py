@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.grouped_options
 def enroll(
     *,
-    model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
+    model: Annotated[Path, typer.Option(help="Run directory; created if it does not exist.")],
     name: Annotated[str | None, typer.Argument(help="Name of the object. Default: enroll every object.")] = None,
     given: options.FrameOptions,
     mesh: Annotated[
@@ -96,7 +96,7 @@ def enroll(
     enrolled = f"enrolled in {gallery or model}, which recognizes {known.gallery.summary}"
     # `thor2 recognize` uses the gallery in the run directory.
     then = ("serve the objects", "serve") if gallery else ("recognize a frame", "recognize", "FRAME")
-    finish(enrolled, *then, *options.model_arguments(model, gallery))
+    finish(enrolled, *then, model=model, gallery=gallery)
 
 
 @contextlib.contextmanager

@@ -30,12 +30,9 @@ MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", hel
 class EvaluationOptions(options.WorkerOptions):
     """The models to evaluate, and the directory of the report."""
 
-    model: Annotated[
-        list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
-    ]
+    model: Annotated[list[Path], typer.Option(help="Run directory, or the directory of a training with several folds.")]
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
+        Path | None, typer.Option(help="Directory for report.html and report.json; an interrupted evaluation resumes.")
     ] = None
     quiet: options.QuietOption = False
 
@@ -133,7 +130,7 @@ def _evaluate(
     # A model may be a directory of folds or sequences; the command is for the first run in it.
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
-    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), "--model", run, "--out", "why")
+    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

@@ -45,7 +45,7 @@ def explain(
         with with_context(source.name):
             frame = source.read()
             labels = frame.instances if instance is None else instance
-        if not len(labels):
+        if not labels:
             print_note(f"skipped: {source.name}: it has no instances")
         for label in labels:
             directory = out / source.name / str(label)
@@ -62,10 +62,9 @@ def explain(
             console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
-    same_model = options.model_arguments(model, gallery)
+    pages = f"{explained} pages in {out}"
     if segment == MODEL:  # enrolling does not accept labels that depend on the model
-        finish(f"{explained} pages in {out}", "list the objects of the model", "objects", *same_model)
-        return
-    segmented = ["--segment", segment] if segment else []
-    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", last, *same_model, "--extend"]
-    finish(f"{explained} pages in {out}", "if a name is wrong, add this view of the object", *again)
+        finish(pages, "list the objects of the model", "objects", model=model, gallery=gallery)
+    else:
+        then = "if a name is wrong, add this view of the object", "enroll", "NAME", *given.arguments
+        finish(pages, *then, segment=segment, instance=last, model=model, gallery=gallery, extend=True)

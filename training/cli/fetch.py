@@ -33,4 +33,4 @@ def ycb(
         meshes = fetch_ycb(options.split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
         console.print(name)
-    finish(f"{len(meshes)} meshes in {out}", "train on them", "train", "--meshes", out, "--out", "run")
+    finish(f"{len(meshes)} meshes in {out}", "train on them", "train", meshes=out, out="run")

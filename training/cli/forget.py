@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from training.cli import options
-from training.cli.app import app, finish
+from training.cli.app import app, finish, option_arguments
 
 
 @app.command()
@@ -21,4 +21,4 @@ def forget(
     recognizer.forget(name)
     result = f"{name} is forgotten; {gallery or model} recognizes {recognizer.gallery.summary}"
     dashes = ["--"] if name.startswith("-") else []
-    finish(result, "enroll it again", "enroll", *options.model_arguments(model, gallery), *dashes, name, "FRAME")
+    finish(result, "enroll it again", "enroll", *option_arguments(model=model, gallery=gallery), *dashes, name, "FRAME")

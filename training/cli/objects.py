@@ -50,4 +50,4 @@ def objects(
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
     result = f"{gallery or model} recognizes {known.summary}"
-    finish(result, "enroll an object", "enroll", "NAME", "FRAME", *options.model_arguments(model, gallery))
+    finish(result, "enroll an object", "enroll", "NAME", "FRAME", model=model, gallery=gallery)

@@ -12,7 +12,7 @@ from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, Topics
-from training.cli.app import print_note
+from training.cli.app import option_arguments, print_note
 
 __all__ = [
     "AnswerByOption",
@@ -33,10 +33,8 @@ __all__ = [
     "check_alone",
     "check_belongs",
     "find_segmenter",
-    "given_options",
     "given_values",
     "grouped_options",
-    "model_arguments",
     "recording_option",
     "split_names",
 ]
@@ -50,37 +48,32 @@ if TYPE_CHECKING:
 UnknownOption = Annotated[
     float | None,
     typer.Option(
-        "--unknown-below",
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own threshold for "
         "trained classes; for enrolled objects, a threshold that depends on their number of views.",
     ),
 ]
 AnswerByOption = Annotated[
-    str | None, typer.Option("--answer-by", help="classifiers, gallery or both. Default: all that the run has.")
+    str | None, typer.Option(help="classifiers, gallery or both. Default: all that the run has.")
 ]
-ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+ModelOption = Annotated[Path, typer.Option(help="Run directory of a trained model.")]
 SegmentOption = Annotated[
     str | None,
     typer.Option(
-        "--segment",
         help="Segmenter to use instead of labels: table, model (for piles; only in recognize and explain), or another "
         "one.",
     ),
 ]
 GalleryOption = Annotated[
-    Path | None, typer.Option("--gallery", help="Directory of the gallery. Default: gallery in the run directory.")
+    Path | None, typer.Option(help="Directory of the gallery. Default: gallery in the run directory.")
 ]
 MeshScaleOption = Annotated[
-    float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
+    float, typer.Option(help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]
-NamesOption = Annotated[
-    Path | None, typer.Option("--names", help="JSON or YAML table: object name -> mesh. Default: all meshes.")
-]
-HostOption = Annotated[str, typer.Option("--host", help="Address to listen on; 0.0.0.0 for other machines.")]
+NamesOption = Annotated[Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")]
+HostOption = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")]
 AllowHostOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--allow-host",
         metavar="NAME",
         help="Additional name or address of this machine in requests, such as robot.local; repeatable. localhost and "
         "the address of the connection are always allowed.",
@@ -93,26 +86,10 @@ recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
 """Option for recordings; the help lists these in a panel of their own."""
 
 
-def model_arguments(model: Path, gallery: Path | None) -> list[object]:
-    """Return the arguments with which the next command uses the same run directory and gallery."""
-    return ["--model", model, *(["--gallery", gallery] if gallery else [])]
-
-
 def given_values(record: Any) -> dict[str, Any]:
     """Return the fields of a dataclass that differ from their defaults: the options that were given."""
     values = ((field, getattr(record, field.name)) for field in dataclasses.fields(record))
     return {field.name: value for field, value in values if value != field.default}
-
-
-def given_options(record: Any, without: str = "") -> list[str]:
-    """Return the command-line options that pass the values of a record to another command.
-
-    Args:
-        record: a dataclass, such as `FrameOptions` or `RecognizerArguments`.
-        without: name of a field that is not an option.
-    """
-    given = [(f"--{name.replace('_', '-')}", value) for name, value in given_values(record).items() if name != without]
-    return [str(part) for pair in given for part in pair]
 
 
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
@@ -159,8 +136,9 @@ class FrameOptions:
     @property
     def arguments(self) -> list[str]:
         """The arguments that pass the same frames to another command."""
-        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in self.frames or ()]
-        return [*frames, *given_options(self, without="frames")]
+        given = given_values(self)
+        frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
+        return [*frames, *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
@@ -274,7 +252,7 @@ MAX_WORKERS = 1024
 """Largest number of processes of a command; each process needs memory and open files."""
 
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
 ]
 
 

@@ -19,9 +19,7 @@ from training.cli import options
 from training.cli.app import app, console, finish, print_note
 
 if TYPE_CHECKING:
-    from thor2_jax.frames.frames import RGBDFrame
     from thor2_jax.model.recognition import Recognition
-    from thor2_jax.model.result_files import ResultTables
     from training.frame_recognition import FrameAnswer
 
 MAX_LISTED = 5
@@ -48,27 +46,39 @@ class OutputOptions:
     ] = None
 
 
-class _AnswerFiles:
-    """The files for the answers, of which unusable ones are refused before any frame is recognized."""
+class _Answers:
+    """The answers as they are printed and written; unusable files are refused before any frame is recognized.
 
-    def __init__(self, given: OutputOptions, frames: Sequence[str], in_directories: bool) -> None:
+    Attributes:
+        tables: the COCO and BOP results, while the files are open.
+        failed: names of the frames that could not be recognized.
+        empty: for each recognized frame, its `segmentation_failure`.
+        has_unknown: whether an instance got no name.
+    """
+
+    def __init__(self, given: OutputOptions, frames: Sequence[str], *, several: bool, as_json: bool) -> None:
         """Check the paths.
 
         Args:
             given: the paths.
             frames: name of each frame; empty for a recording, whose frames are not known yet.
-            in_directories: whether each frame has a directory of its name in `given.out`.
+            several: whether there may be several frames: each has a directory of its name in `given.out`, and one that
+                fails does not stop the others.
+            as_json: whether the answers are printed as JSON instead of tables.
         """
         from thor2_jax.files import check_output_directory, check_output_file
         from thor2_jax.model import result_files
         from thor2_jax.recordings.detection_files import DetectionBag, RerunFile
         from training.readers.bop import read_object_names
 
-        self._given, self._frames, self._in_directories = given, frames, in_directories
+        self._given, self._frames, self._several, self._as_json = given, frames, several, as_json
+        self.failed: list[str] = []
+        self.empty: list[str] = []
+        self.has_unknown = False
         if given.out is not None:
-            resumable = {name.split("/")[0] for name in frames} if in_directories else result_files.RESULT_FILES
+            resumable = {name.split("/")[0] for name in frames} if several else result_files.RESULT_FILES
             check_output_directory(given.out, resumable=resumable)
-            for name in frames if in_directories else [""]:
+            for name in frames if several else [""]:
                 result_files.check_no_foreign_results(given.out / name)
         if given.coco is not None and given.bop is not None and given.coco.absolute() == given.bop.absolute():
             raise InputError(f"coco and bop are {given.coco}; expected two files")
@@ -79,24 +89,42 @@ class _AnswerFiles:
         check_output_file("bop", given.bop, result_files.is_bop_file)
 
     @contextlib.contextmanager
-    def opened(self, classes: Sequence[str]) -> Iterator["ResultTables"]:
-        """Open the files and yield the tables of COCO and BOP results; all files are completed at the end."""
+    def opened(self, classes: Sequence[str]) -> Iterator[None]:
+        """Open the files, and complete them at the end; the error of a damaged recording says what they have."""
         from thor2_jax.model.result_files import ResultTables
 
-        self._tables = ResultTables(self._frames, classes, self._numbers)
-        with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
-            yield self._tables
-        self._tables.write(self._given.coco, self._given.bop)
+        self.tables = ResultTables(self._frames, classes, self._numbers)
+        try:
+            with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
+                yield
+        except InputError as error:
+            if self._frames or not self.empty:
+                raise
+            place = f" and are in {self.written}" if self.written else ""
+            raise InputError(f"{error}; {len(self.empty)} frames were recognized before{place}") from None
+        self.tables.write(self._given.coco, self._given.bop)
 
-    def write(self, answer: "FrameAnswer", frame: "RGBDFrame") -> None:
-        """Write the answers for a frame."""
+    def add(self, answer: "FrameAnswer") -> None:
+        """Print and write the answers for a frame."""
         from thor2_jax.model.result_files import write_recognitions
 
-        place, out = answer.recorded, self._given.out
+        frame, place, out = answer.frame, answer.recorded, self._given.out
+        if frame is None and not self._several:
+            raise InputError(str(answer.error))
+        if self._as_json:
+            print(json.dumps(answer.as_json()), flush=True)
+        if frame is None:
+            self.failed.append(answer.name)
+            print_note(f"failed: {answer.name}: {answer.error}")
+            return
+        self.empty.append(answer.segmentation_failure)
+        self.has_unknown |= any(each.name is None for each in answer.recognitions)
+        if not self._as_json:
+            _print_table(answer.name if self._several else None, answer.recognitions)
         if self._given.coco or self._given.bop:
-            self._tables.add(answer.name, frame, answer.detections, answer.seconds)
+            self.tables.add(answer.name, frame, answer.detections, answer.seconds)
         if out is not None:
-            write_recognitions(out / answer.name if self._in_directories else out, frame, answer.recognitions)
+            write_recognitions(out / answer.name if self._several else out, frame, answer.recognitions)
         if self._bag is not None and place is not None:
             self._bag.write(frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
         if self._rerun is not None:
@@ -136,7 +164,8 @@ def recognize(
     the frames are a sequence of one camera, in the order of their names, and an object has one name in all frames.
     """
     from thor2_jax.segmentation.segmenters import TABLE
-    from training.frame_recognition import RecognizerArguments, recognize_frames, segmentation_failure, track_frames
+    from thor2_jax.tracking.viewpoints import read_poses
+    from training.frame_recognition import RecognizerArguments, recognize_frames, track_frames
     from training.readers.frames import segmented_source
 
     given.check()
@@ -161,13 +190,9 @@ def recognize(
     else:
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
-    frame_poses = None
-    if poses is not None:
-        from thor2_jax.tracking.viewpoints import read_poses  # imports SciPy
-
-        frame_poses = read_poses(poses, [source.name for source in sources])
-    files = _AnswerFiles(outputs, [source.name for source in sources], in_directories=bool(frames or recording))
-    as_json, failed, empty, unknown, damage = as_json or recording is not None, [], [], False, None
+    names, as_json = [source.name for source in sources], as_json or recording is not None
+    frame_poses = None if poses is None else read_poses(poses, names)
+    results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
     with contextlib.ExitStack() as stack:
         if bag is not None:
             for note in stack.enter_context(bag).notes:
@@ -183,47 +208,24 @@ def recognize(
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:
             answers = recognize_frames(recognizer.recognize, sources)
-        results = stack.enter_context(files.opened(recognizer.classes))
-        try:
-            for answer in answers:
-                if answer.frame is None:
-                    failed.append(answer.name)
-                    if not (frames or recording):
-                        raise InputError(str(answer.error))
-                    print_note(f"failed: {answer.name}: {answer.error}")
-                if as_json:
-                    print(json.dumps(answer.as_json()), flush=True)
-                if answer.frame is None:
-                    continue
-                empty.append(segmentation_failure(answer) if segment or recording else "")
-                unknown |= any(each.name is None for each in answer.recognitions)
-                if not as_json:
-                    _print_table(answer.name if frames else None, answer.recognitions)
-                files.write(answer, answer.frame)
-        except InputError as error:
-            if bag is None:
-                raise
-            damage = str(error)
-    if damage is not None:
-        before = f"; {len(empty)} frames were recognized before"
-        before += f" and are in {files.written}" if files.written else ""
-        raise InputError(damage + (before if empty else ""))
+        stack.enter_context(results.opened(recognizer.classes))
+        for answer in answers:
+            results.add(answer)
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    result = f"written to {files.written}" if files.written else f"frames recognized: {len(empty)}"
+    failed, empty, written = results.failed, results.empty, results.written
+    result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
     notes = sys.stderr if as_json else None
-    if unknown:
+    if results.has_unknown:
         print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
-    segments = ["--segment", segment] if segment else []
-    next_command = ("explain", *given.arguments, *segments, *options.given_options(arguments), "--out", "why")
-    finish(result, "see why", *next_command, file=notes)
-    if results.n_without_number:
-        print_note(f"{results.n_without_number} instances have a name that {outputs.names} does not number")
+    finish(result, "see why", "explain", *given.arguments, file=notes, segment=segment, **vars(arguments), out="why")
+    if results.tables.n_without_number:
+        print_note(f"{results.tables.n_without_number} instances have a name that {outputs.names} does not number")
     if failed:
         total, listed = len(failed) + len(empty), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
-    if empty and all(empty):
+    if (segment or recording) and empty and all(empty):
         raise InputError(empty[0])
 
 

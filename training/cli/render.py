@@ -67,4 +67,4 @@ def render(
         if crops is not None:
             render_crops(job, dataset, crops, pool, of_stage(progress, "render crops"))
     views = f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
-    finish(views, "train on them", "train", "--dataset", out, "--out", "run")
+    finish(views, "train on them", "train", dataset=out, out="run")

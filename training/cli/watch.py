@@ -90,10 +90,9 @@ def watch(
             time.sleep(NOTICE_SECONDS)
             raise
         recognized = f"{view.n_frames} of {n_shown} were recognized"
-        segments = ["--segment", segment] if segment else []
-        recognize = *(given_frames.arguments or ["FRAME"]), *segments, *options.given_options(arguments)
-        shown = f"no more frames, {recognized}; Ctrl-C ends"
-        finish(shown, "store the answers", "recognize", *recognize, "--out", "answers", file=sys.stderr)
+        then = "store the answers", "recognize", *(given_frames.arguments or ["FRAME"])
+        same = {"segment": segment, **vars(arguments), "out": "answers"}
+        finish(f"no more frames, {recognized}; Ctrl-C ends", *then, file=sys.stderr, **same)
         view.publish_state("ended", f"There are no more frames; {recognized}.")
         while True:
             time.sleep(60)

@@ -1,5 +1,6 @@
 """The files of an explanation: a self-contained page, its pictures and JSON."""
 
+import base64
 import itertools
 import json
 import re
@@ -73,13 +74,14 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
     with atomic_directory(directory) as unfinished:
         sections: dict[str, list[Picture]] = {}
         for picture in pictures(explanation, frame):
-            save_figure(picture.figure, unfinished / f"{picture.name}.png")
-            shown = Picture(f"{picture.name}.png", picture.caption, "third" if picture.section == "slices" else "half")
+            file = unfinished / f"{picture.name}.png"
+            save_figure(picture.figure, file)
+            content = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
+            shown = Picture(content, picture.caption, "third" if picture.section == "slices" else "half")
             sections.setdefault(picture.section, []).append(shown)
         write_text(unfinished / VALUES, json.dumps(explanation.as_json()) + "\n")
         title, lead = f"Why {explanation.title}?", _lead(explanation, name)
-        content = _page_sections(explanation, sections)
-        write_page(unfinished / PAGE, title=title, lead=lead, sections=content, embed=True)
+        write_page(unfinished / PAGE, title=title, lead=lead, sections=_page_sections(explanation, sections))
         remove_written(directory, _WRITTEN)
 
 

@@ -1,6 +1,5 @@
 """A report as one self-contained HTML page of text, tables and pictures."""
 
-import base64
 import dataclasses
 import html
 from collections.abc import Sequence
@@ -17,10 +16,10 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture in a file next to the page.
+    """A picture in a file next to the page, or in the page.
 
     Attributes:
-        path: path relative to the page.
+        path: path relative to the page, or a `data:` URL with the picture.
         caption: caption and alternative text.
         width: width on a wide screen: full, a half, a third, or small, so that many pictures fit side by side.
     """
@@ -70,30 +69,27 @@ def _table(table: Table) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _figure(picture: Picture, embedded_from: Path | None) -> str:
+def _figure(picture: Picture) -> str:
     path, caption = html.escape(picture.path), html.escape(picture.caption)
-    if embedded_from is not None:
-        content = base64.b64encode((embedded_from / picture.path).read_bytes()).decode()
-        path = f"data:image/{Path(picture.path).suffix[1:]};base64,{content}"
     kind = "" if picture.width == "full" else f' class="{picture.width}"'
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 
-def _content(section: Section, embedded_from: Path | None) -> str:
+def _content(section: Section) -> str:
     elements = []
     if section.text:
         elements.append(f"<p>{html.escape(section.text)}</p>")
     if section.table is not None:
         elements.append(_table(section.table))
-    figures = "".join(_figure(picture, embedded_from) for picture in section.pictures)
+    figures = "".join(map(_figure, section.pictures))
     elements.append(f'<div class="pictures">{figures}</div>')
     if section.folded is not None:
         summary = f"<summary>{html.escape(section.folded.heading)}</summary>"
-        elements.append(f"<details>{summary}\n{_content(section.folded, embedded_from)}</details>")
+        elements.append(f"<details>{summary}\n{_content(section.folded)}</details>")
     return "\n".join(elements)
 
 
-def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Section], embed: bool = False) -> None:
+def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Section]) -> None:
     """Write the page atomically.
 
     Args:
@@ -101,13 +97,11 @@ def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Se
         title: title and heading.
         lead: paragraph below the heading.
         sections: sections of the page.
-        embed: embed the pictures, which must be PNG files, so that the page does not need their files.
 
     Raises:
-        OSError: the file cannot be written, or a picture to embed cannot be read.
+        OSError: the file cannot be written.
     """
-    embedded_from = Path(path).parent if embed else None
-    content = (f"<h2>{html.escape(each.heading)}</h2>\n{_content(each, embedded_from)}" for each in sections)
+    content = (f"<h2>{html.escape(each.heading)}</h2>\n{_content(each)}" for each in sections)
     write_text(
         path,
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'

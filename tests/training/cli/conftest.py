@@ -5,16 +5,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import Command, Recognize, Texts, json_lines, run_thor2
+from commands import Command, Recognize, json_lines
 from small_runs import SMALL_CONFIG, untrained_run
 from small_runs import small_embedding as embedding_of_tests
 
 from thor2_jax.gallery import embedding, enrollment
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
-from thor2_jax.networks import EmbeddingSizes
-from training import protocol, train_run
-from training.embedding import fit
+from training import protocol
 from training.protocol import DEFAULT, PAPER
 from training.views import mesh_views
 
@@ -31,30 +29,16 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def texts(capfd: pytest.CaptureFixture[str]) -> Texts:
-    """Return a function that runs a command, which must have a status, and returns its standard output and error."""
-
-    def run(*arguments: object, status: int = 0) -> tuple[str, str]:
-        capfd.readouterr()
-        assert run_thor2(*arguments) == status
-        return capfd.readouterr()
-
-    return run
-
-
-@pytest.fixture
 def recognize(model: Path, printed: Command) -> Recognize:
     """Return a function that recognizes frames with the model and returns what it prints, an object for each frame."""
     return lambda *options: json_lines(printed("recognize", "--model", model, *options))
 
 
 @pytest.fixture(scope="module")
-def small_descriptors() -> Iterator[None]:
+def small_descriptors(small_networks: None) -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
     with pytest.MonkeyPatch.context() as patch:
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
-        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(fit, "BATCH_SIZE", 64)
         patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
         patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
         yield

@@ -48,8 +48,7 @@ def adapted(request: pytest.FixtureRequest, model: Path, video: Path, tmp_path_f
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "given":  # tests/thor2_jax/adaptation has those of the estimate
             transform = ColorTransform(warmth=0.2)
-            given = lambda instances, *_: Adaptation(transform, len(instances), 0.5, 0.4)  # noqa: E731
-            patch.setattr(module, "estimate_transform", given)
+            patch.setattr(module, "estimate_transform", lambda each, *_: Adaptation(transform, len(each), 0.5, 0.4))
         assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
     return out
 

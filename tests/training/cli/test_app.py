@@ -30,8 +30,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command, environment = [sys.executable, *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=HANG)
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=HANG)
 
 
 def test_closed_streams_are_no_error() -> None:

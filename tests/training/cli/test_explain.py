@@ -14,7 +14,7 @@ from written_files import ParsedPage
 from thor2_jax import capacity
 from thor2_jax.errors import InputError
 from thor2_jax.recognizer import Recognizer
-from training.cli import options
+from training.cli.app import option_arguments
 from training.frame_recognition import RecognizerArguments
 from training.reports import explanation_page
 
@@ -104,10 +104,7 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
     gallery = tmp_path / "gallery"
-    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers", gallery))
-    options_of_model = ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
-    assert given == [*options_of_model, "--gallery", str(gallery)]
-    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
+    given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
     assert seen == [(0.9, "classifiers", gallery)] * 2
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, json_lines, run_thor2
+from commands import Command, Texts, json_lines
 from dataset_files import write_bop
 from image_files import encode_image
 from rendered_objects import write_box
@@ -82,10 +82,6 @@ def with_focal_factor(frame: RGBDFrame, factor: float) -> RGBDFrame:
     return change(frame, intrinsics=change(k, fx=k.fx * factor, fy=k.fy * factor))
 
 
-def far(frame: RGBDFrame) -> RGBDFrame:
-    return with_focal_factor(change(frame, depth=(frame.depth * 5).astype(np.uint16)), 5)
-
-
 def with_one_mask_of_two_thirds(frame: RGBDFrame) -> RGBDFrame:
     labels = np.zeros(frame.depth.shape, np.uint8)
     labels[: labels.shape[0] * 2 // 3] = 255
@@ -101,7 +97,7 @@ DEPTH: dict[str, tuple[Callable[[RGBDFrame], RGBDFrame], str]] = {
     "no labels, metres per unit": (lambda f: change(with_scale(f, 0.001), labels=None), "depth-unit: .*1000"),
     "no depth": (lambda f: change(f, depth=f.depth * 0), "depth-missing"),
     "little depth": (lambda f: change(f, depth=f.depth * (np.indices(f.depth.shape)[1] % 10 == 0)), "depth-missing"),
-    "far": (far, "distance: .*0.5 to 1.5 m"),
+    "far": (lambda f: with_focal_factor(change(f, depth=f.depth * np.uint16(5)), 5), "distance: .*0.5 to 1.5 m"),
     "a mask of touching objects": (with_one_mask_of_two_thirds, "labels-foreground"),
 }
 
@@ -252,22 +248,20 @@ def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
     assert "size" in codes(depth=encode_image(np.ascontiguousarray(original.depth[::2, ::2])))
 
 
-def test_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str], printed: Command, refused: Command) -> None:
+def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Command) -> None:
     files = copy_of(tmp_path)
     command = ("doctor", *(part for name, path in vars(files).items() for part in (f"--{name}", path)))
     assert "nothing found" in printed(*command)
-    assert run_thor2(*command, "--depth-scale", 100, "--json") == 1
-    report = json.loads(capfd.readouterr().out)
+    report = json.loads(texts(*command, "--depth-scale", 100, "--json", status=1)[0])
     assert [finding["code"] for finding in report["findings"]] == ["depth-unit"]
     assert "1000" in report["findings"][0]["advice"] and report["notes"]
-    assert run_thor2(*command, "--depth-scale", 100) == 1
-    assert capfd.readouterr().out.startswith("depth-unit: ")
+    assert texts(*command, "--depth-scale", 100, status=1)[0].startswith("depth-unit: ")
     assert "mesh_scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
     files.color.unlink()
     assert f"{files.color} is missing" in refused(*command, "--json")
 
 
-def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], printed: Command) -> None:
+def test_folders_of_frames(tmp_path: Path, texts: Texts, printed: Command) -> None:
     """The names in labels.json tell which mesh an object is compared with; a frame that is missing files fails."""
     for name in ("breakfast", "tools"):
         shutil.copytree(SAMPLES / name, tmp_path / "frames" / name)
@@ -281,21 +275,18 @@ def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], pr
     camera = tmp_path / "frames" / "tools" / "intrinsics.json"
     values = json.loads(camera.read_text())
     camera.write_text(json.dumps(values | {"fx": values["fx"] / 2, "fy": values["fy"] / 2}))
-    assert run_thor2(*command) == 1
-    reports = json_lines(capfd.readouterr().out)
+    reports = json_lines(texts(*command, status=1)[0])
     assert [[finding["code"] for finding in report["findings"]] for report in reports] == [[], ["intrinsics-focal"]]
     assert printed("doctor", tmp_path / "frames" / "tools").startswith("tools:\n")
     frame_files(tmp_path / "frames" / "breakfast").color.unlink()
-    assert run_thor2(*command) == 2
-    out, err = capfd.readouterr()
+    out, err = texts(*command, status=2)
     assert [report["frame"] for report in json_lines(out)] == ["tools"]
     assert "failed: breakfast: " in err and "error: 1 of 2 frames" in err
     color = frame_files(tmp_path / "frames" / "breakfast").color
     color.mkdir()
-    assert run_thor2(*command) == 2
-    assert f"failed: breakfast: {color}: Is a directory\n" in capfd.readouterr().err
+    assert f"failed: breakfast: {color}: Is a directory\n" in texts(*command, status=2)[1]
 
 
-def test_scenes_of_bop(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("doctor", write_bop(tmp_path / "000001"), "--json") == 1  # its images have few pixels
-    assert [line["frame"] for line in json_lines(capfd.readouterr().out)] == ["000001/000001"]
+def test_scenes_of_bop(tmp_path: Path, texts: Texts) -> None:
+    out, _ = texts("doctor", write_bop(tmp_path / "000001"), "--json", status=1)  # its images have few pixels
+    assert [line["frame"] for line in json_lines(out)] == ["000001/000001"]
