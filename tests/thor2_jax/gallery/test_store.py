@@ -245,6 +245,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "source surrogate": lambda path: edit(path / "index.json", objects=[ENTRY | {"source": "\ud800"}]),
     "missing file": lambda path: next((path / "objects").iterdir()).unlink(),
     "cut file": lambda path: os.truncate(next((path / "objects").iterdir()), 200),
+    "file of another object": lambda path: shutil.copyfile(*(path / "objects").iterdir()),
 }
 
 
