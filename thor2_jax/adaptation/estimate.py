@@ -189,8 +189,7 @@ def adaptation_criterion(model: Model) -> Criterion:
     """
 
     def fused(oriented: LookDescriptors) -> jax.Array:
-        computed: jax.Array = fused_probabilities(infer(model, oriented).probabilities, model.rule)
-        return computed
+        return fused_probabilities(infer(model, oriented).probabilities, model.rule)
 
     if model.answers_by() != "gallery":
         network, config, classify = model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)

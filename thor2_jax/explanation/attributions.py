@@ -90,8 +90,7 @@ def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets,
         return relaxed_strips(cloud.points.T, cloud.colors, cloud.mask, sets, config, weight)
 
     each = jax.lax.map(lambda weight: jax.vmap(one, in_axes=(0, None))(aligned, weight), weights)
-    flat: Strips = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each)
-    return flat
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each)
 
 
 def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArray[np.float32]:

@@ -28,9 +28,7 @@ from thor2_jax.model.model import Model
 from thor2_jax.networks import EMBEDDING
 from thor2_jax.types import PointClouds, Strips, matmul
 
-__all__ = ["ClassScores", "Unit", "classifier_scores", "gallery_scores"]
-
-Unit = Literal["log-odds", "similarity"]
+__all__ = ["ClassScores", "classifier_scores", "gallery_scores"]
 
 ROWS = 8
 """Number of versions of a cloud that are described in one call."""
@@ -51,7 +49,7 @@ class ClassScores:
     """
 
     names: tuple[str, ...]
-    unit: Unit
+    unit: Literal["log-odds", "similarity"]
     config: DescriptorConfig
     network: ColorNetwork
     count: int
@@ -119,8 +117,7 @@ def packed(instance: PreparedInstance) -> PointClouds:
 
 def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:
     """Repeat the K looks at a cloud, [K, N] to [times * K, N]."""
-    repeated: PointClouds = jax.tree.map(lambda a: jnp.tile(a, (times,) + (1,) * (a.ndim - 1)), aligned)
-    return repeated
+    return jax.tree.map(lambda a: jnp.tile(a, (times,) + (1,) * (a.ndim - 1)), aligned)
 
 
 def _checked(config: DescriptorConfig) -> DescriptorConfig:

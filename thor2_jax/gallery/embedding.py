@@ -355,13 +355,12 @@ class Embedding:
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)
-            further = []
-            for prefix in map(_FURTHER.format, range(count)):
-                further.append(model_from_arrays(embedding.create_further, arrays, prefix))
+            prefixes = map(_FURTHER.format, range(count))
+            further = tuple(model_from_arrays(embedding.create_further, arrays, prefix) for prefix in prefixes)
         file, references = path.with_name(REFERENCES_FILE), None
         if file.is_file():
             references = References.load(file, content_digest([content]), embedding.size)
-        embedding = dataclasses.replace(embedding, further=tuple(further), references=references)
+        embedding = dataclasses.replace(embedding, further=further, references=references)
         # The fingerprint is computed from the file itself, which another version of this software may have written.
         embedding.__dict__["_content"] = content
         return embedding

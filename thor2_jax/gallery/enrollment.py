@@ -10,7 +10,7 @@ import datetime
 import functools
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 __all__ = [
     "LOOKS",
     "ObjectGallery",
-    "augmented_copies",
     "augmented_view",
     "embed_looks",
     "enrolled_object",
@@ -66,8 +65,8 @@ def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]
     return views + augmented_copies(views, source)
 
 
-def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float16]:
-    """Return the embeddings [E, D] of an object's views.
+def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float32]:
+    """Return the embeddings [V, K, D] of the looks at an object's views.
 
     Args:
         embedding: the embedding.
@@ -76,7 +75,7 @@ def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> ND
     """
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    return embed_looks(embedding, views).reshape(-1, embedding.size).astype(np.float16)
+    return embed_looks(embedding, views)
 
 
 def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:
@@ -86,15 +85,15 @@ def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str
     return GalleryObject(flat, clouds, source, date)
 
 
-def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], source: str) -> GalleryObject:
+def enrolled_views(embedding: Embedding, views: Sequence[PreparedInstance], source: str) -> GalleryObject:
     """Return the views of an object as a gallery stores them; the arguments are those of `_embed_views`.
 
     Raises:
         InputError: there is no view, or a view has no points or is too large.
     """
-    clouds = CompactClouds.of(list(views))
-    if not len(clouds):
+    if not views:
         raise InputError("views is empty; expected at least one view of the object")
+    clouds = CompactClouds.of(views)
     return enrolled_object(_embed_views(embedding, clouds, source), clouds, source)
 
 
@@ -243,12 +242,11 @@ class ObjectGallery:
         return True
 
     def _reembedded(self, gallery: Gallery) -> Gallery:
-        objects = {
-            name: dataclasses.replace(
-                views, embeddings=_embed_views(self.embedding, views.clouds, views.source), file=None
-            )
-            for name, views in gallery.objects.items()
-        }
+        objects = {}
+        for name, views in gallery.objects.items():
+            embeddings = _embed_views(self.embedding, views.clouds, views.source)
+            again = enrolled_object(embeddings, views.clouds, views.source)
+            objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
     def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:

@@ -91,13 +91,12 @@ class CompactClouds:
 
     @classmethod
     def of(cls, views: Sequence[PreparedInstance]) -> "CompactClouds":
-        """Round prepared instances to compact clouds.
+        """Round prepared instances, at least one, to compact clouds.
 
         Raises:
             InputError: an instance has no points or is larger than 2 `MAX_DISTANCE`.
         """
-        points = [np.zeros((0, 3), np.int16)]
-        centres = []
+        points, centres = [], []
         for number, view in enumerate(views):
             if not len(view.points):
                 raise InputError(f"views[{number}] has no points ({view.reason}); leave it out")
@@ -112,10 +111,10 @@ class CompactClouds:
             centres.append(centre)
         return cls(
             np.concatenate(points),
-            np.concatenate([np.zeros((0, 3), np.uint8), *(view.colors for view in views)]),
-            np.concatenate([np.zeros(0, bool), *(view.boundary for view in views)]),
+            np.concatenate([view.colors for view in views]),
+            np.concatenate([view.boundary for view in views]),
             np.array([len(view.points) for view in views], np.int32),
-            np.array(centres, np.float32).reshape(-1, 3),
+            np.array(centres),
         )
 
     def __len__(self) -> int:
@@ -322,15 +321,14 @@ class Gallery:
         values = np.zeros((len(queries), self._n_owners))
         np.add.at(values, (np.arange(len(queries))[:, None], owner[index]), duals)
         scores, trained = values[:, : len(self.objects)].clip(0, 1), values[:, len(self.objects) : -1]
-        if self.references is not None and trained.shape[1]:
+        if trained.shape[1]:
             scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)
         return scores.astype(np.float32)
 
     @functools.cached_property
     def _outputs(self) -> tuple[str | None, ...]:
         """The name of each output of the classifiers; None for hidden classes."""
-        hidden = set(self.hidden)
-        return tuple(None if name in hidden else name for name in self.trained)
+        return tuple(None if name in self.hidden else name for name in self.trained)
 
     @functools.cached_property
     def answered_names(self) -> tuple[str, ...]:

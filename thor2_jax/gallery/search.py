@@ -40,8 +40,7 @@ def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     Small products gain nothing from several threads. On a busy machine the threads wait for one another, and a query of
     10 ms can take seconds.
     """
-    limited: contextlib.AbstractContextManager[Any] = _thread_pools().limit(limits=1, user_api="blas")
-    return limited
+    return _thread_pools().limit(limits=1, user_api="blas")
 
 
 class ExactSearch:
@@ -72,10 +71,8 @@ class ExactSearch:
 
 def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:
     """Return the indices [Q, min(count, N)] of the largest values [Q, N], the largest first, ties by index."""
-    if values.shape[1] > count:
-        chosen = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
-    else:
-        chosen = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    count = min(count, values.shape[1])
+    chosen = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
     order = np.argsort(-np.take_along_axis(values, chosen, axis=1), axis=1, kind="stable")
     return np.take_along_axis(chosen, order, axis=1)
 

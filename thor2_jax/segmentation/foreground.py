@@ -204,11 +204,11 @@ NEAR, FAR = 2, 6
 
 
 def _depth_edges(depth: DepthImage) -> tuple[tuple[Mask, Mask], Mask]:
-    """Return the steps of a depth image along rows and along columns, and its folds, each [H, W]."""
+    """Return the steps of a depth image along rows and along columns, and its folds, each [H, W].
+
+    The image has depth, since it has a plane.
+    """
     known = depth.valid
-    if not known.any():
-        none = np.zeros(known.shape, bool)
-        return (none, none), none
     inverse = depth.inverse[known].take(nearest_known(known))
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
     unknown = (~known).view(np.uint8)

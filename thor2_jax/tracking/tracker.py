@@ -45,16 +45,7 @@ from thor2_jax.tracking.viewpoints import (
 if TYPE_CHECKING:
     from thor2_jax.recognizer import Recognizer
 
-__all__ = [
-    "FusedEvidence",
-    "MIN_OVERLAP",
-    "TrackedRecognition",
-    "Tracker",
-    "match",
-    "occupied_voxels",
-    "overlap",
-    "view_weight",
-]
+__all__ = ["FusedEvidence", "TrackedRecognition", "Tracker", "view_weight"]
 
 VOXELS = (0.01, 0.02, 0.04)
 """Voxel sides, metres."""
@@ -258,9 +249,7 @@ class Tracker:
         self._frame += 1
         self._tracks = [track for track in self._tracks if self._frame - track.seen <= MAX_MISSED]
         usable = [instance for instance in instances if instance.reason is None]
-        self._extend(usable, inference, world)
-        by_label = {track.instance.label: track for track in self._tracks if track.seen == self._frame}
-        answers = iter(self._answers([by_label[instance.label] for instance in usable]))
+        answers = iter(self._answers(self._extend(usable, inference, world)))
         return [
             next(answers) if instance.reason is None else TrackedRecognition(instance.label, reason=instance.reason)
             for instance in instances
@@ -296,8 +285,8 @@ class Tracker:
 
     def _extend(
         self, usable: Sequence[PreparedInstance], inference: Inference, world: NDArray[np.float64] | None
-    ) -> None:
-        """Add every instance to its track, or start a new track."""
+    ) -> list[_Track]:
+        """Add every instance to its track, or start a new track; return the track of each instance."""
         points = [each.points if world is None else transform(world, each.points) for each in usable]
         voxels = [occupied_voxels(cloud) for cloud in points]
         matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
@@ -314,6 +303,7 @@ class Tracker:
             track.instance = merge_views(track.views, self._recognizer.model.run.config.sigma_s)
         if several:
             self._add_evidence(several, self._recognizer.infer(track.instance for track in several)[1])
+        return tracks
 
     def _add_evidence(self, tracks: Sequence[_Track], inference: Inference) -> None:
         """Add each row of an inference to its track, weighted by the described cloud."""

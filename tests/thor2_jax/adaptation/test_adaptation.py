@@ -11,6 +11,7 @@ from image_files import frame_of_squares
 from refusals import assert_refused
 from scipy.stats import entropy as scipy_entropy
 from slow_tier import slow
+from small_clouds import random_clouds
 from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
@@ -38,15 +39,12 @@ run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), 
 WARM = ColorTransform(gamma=0.2, gain=-0.1, saturation=0.3, warmth=0.1)
 
 
-def instances(count: int = 3, seed: int = 0) -> list[PreparedInstance]:
-    """Return boxes of random sizes and colours."""
-    rng = np.random.default_rng(seed)
-    made = []
-    for label in range(1, count + 1):
-        points = rng.uniform(0, rng.uniform(0.04, 0.15, 3), (200, 3)).astype(np.float32) + np.float32([0, 0, 0.7])
-        colors = (rng.integers(40, 200, 3) + rng.integers(0, 40, (200, 3))).astype(np.uint8)
-        made.append(PreparedInstance(label, points, colors, np.zeros(200, bool)))
-    return made
+def instances(count: int) -> list[PreparedInstance]:
+    clouds = random_clouds(0, [200] * count)
+    return [PreparedInstance(label, *cloud, np.zeros(200, bool)) for label, cloud in enumerate(clouds, start=1)]
+
+
+CLOUDS = pack_instances(instances(4), 4)
 
 
 def test_a_transform_follows_its_formula() -> None:
@@ -158,8 +156,7 @@ def test_gallery_answers_are_its_scores() -> None:
     for name, seed in (("mug", 0), ("bowl", 1)):
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
-    clouds = pack_instances(instances(4), 4)
-    oriented = describe_looks(clouds, embedding.network, embedding.config, 2).with_balanced(clouds)
+    oriented = describe_looks(CLOUDS, embedding.network, embedding.config, 2).with_balanced(CLOUDS)
     gallery = dataclasses.replace(recognizer.gallery, references=None)
     scores = gallery.scores(embedding.embed_oriented(oriented))
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
@@ -169,17 +166,15 @@ def test_gallery_answers_are_its_scores() -> None:
 @pytest.mark.parametrize("rule", ["max", *slow("mean", "log-mean")])
 def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
     recognizer = Recognizer(run(), rule=rule)
-    clouds = pack_instances(instances(4), 4)
-    oriented = describe_looks(clouds, run().network, run().config, 2)
+    oriented = describe_looks(CLOUDS, run().network, run().config, 2)
     expected = fused_probabilities(class_probabilities(recognizer, oriented, ("tops", "tops2")), rule)
-    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(clouds), expected, atol=1e-5)
+    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(CLOUDS), expected, atol=1e-5)
 
 
 def test_an_embedding_alone_is_the_criterion() -> None:
     recognizer = Recognizer(untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(run().config, looks=4)))
     adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
     assert recognizer.model.color_transform == adaptation.transform and adaptation.instances == 10
-    clouds = pack_instances(instances(4), 4)
-    oriented = describe_looks(clouds, recognizer.run.network, recognizer.run.config, 2)
+    oriented = describe_looks(CLOUDS, recognizer.run.network, recognizer.run.config, 2)
     expected = class_probabilities(recognizer, oriented)["embedding"]
-    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(clouds), expected, rtol=1e-6)
+    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(CLOUDS), expected, rtol=1e-6)

@@ -26,7 +26,7 @@ from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, g
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
 from thor2_jax.explanation.pictures import main_pictures
 from thor2_jax.figures import png_bytes
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
@@ -35,16 +35,15 @@ NETWORK = colornet.load_default()
 CLASSES = ("a", "b", "c")
 FOUR = dataclasses.replace(SMALL_CONFIG, looks=4)
 
+LABELS = np.zeros((120, 160), np.uint8)
+LABELS[10:60, 10:45], LABELS[10:40, 75:125], LABELS[100:103, 5:8] = 3, 7, 5
+DEPTH = np.broadcast_to(600 + np.arange(160) // 2, LABELS.shape).astype(np.uint16)
+COLOR = np.zeros((*LABELS.shape, 3), np.uint8)
+COLOR[:35], COLOR[35:] = (200, 30, 30), (30, 30, 200)
+FRAME = thor2.RGBDFrame(COLOR, DEPTH, LABELS, thor2.Intrinsics(300.0, 300.0, 79.5, 59.5))
+"""Two usable instances of a tilted plane, half red and half blue, and one that is too small."""
 
-@pytest.fixture(scope="module")
-def frame() -> thor2.RGBDFrame:
-    """Two usable instances of a tilted plane, half red and half blue, and one that is too small."""
-    labels = np.zeros((120, 160), np.uint8)
-    labels[10:60, 10:45], labels[10:40, 75:125], labels[100:103, 5:8] = 3, 7, 5
-    depth = np.broadcast_to(600 + np.arange(160) // 2, labels.shape).astype(np.uint16)
-    color = np.zeros((*labels.shape, 3), np.uint8)
-    color[:35], color[35:] = (200, 30, 30), (30, 30, 200)
-    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(300.0, 300.0, 79.5, 59.5))
+INSTANCE = prepare_instance(FRAME, 3, FOUR.sigma_s)
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +52,8 @@ def recognizer() -> Recognizer:
 
 
 @pytest.fixture(scope="module")
-def instance(frame: thor2.RGBDFrame) -> PreparedInstance:
-    return prepare_instance(frame, 3, FOUR.sigma_s)
-
-
-@pytest.fixture(scope="module")
-def explanation(recognizer: Recognizer, frame: thor2.RGBDFrame) -> Explanation:
-    return explain(recognizer, frame, 3)
+def explanation(recognizer: Recognizer) -> Explanation:
+    return explain(recognizer, FRAME, 3)
 
 
 def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> ClassScores:
@@ -79,14 +73,12 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])
 @pytest.mark.parametrize("make_run", [untrained_run, *slow(untrained_embedding_run)])
-def test_margin_is_the_log_odds_of_the_answer(
-    rule: str, make_run: Callable[..., TrainedRun], frame: thor2.RGBDFrame, instance: PreparedInstance
-) -> None:
+def test_margin_is_the_log_odds_of_the_answer(rule: str, make_run: Callable[..., TrainedRun]) -> None:
     recognizer = Recognizer(make_run(CLASSES, config=FOUR), rule=rule)
-    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     scores = classifier_scores(recognizer.model)
-    values = scores.of_instances([instance])
-    of_masks = scores.of_masks(scores.orient(instance), np.ones((9, len(instance.points)), bool))
+    values = scores.of_instances([INSTANCE])
+    of_masks = scores.of_masks(scores.orient(INSTANCE), np.ones((9, len(INSTANCE.points)), bool))
     np.testing.assert_allclose(of_masks, values.repeat(9, axis=0), atol=1e-4)  # in more than one batch
     index = CLASSES.index(str(answer.name))
     assert values[0].argmax() == index
@@ -94,27 +86,25 @@ def test_margin_is_the_log_odds_of_the_answer(
 
 
 @pytest.mark.slow
-def test_the_margin_of_a_calibrated_answer_is_that_among_the_classes(
-    frame: thor2.RGBDFrame, instance: PreparedInstance
-) -> None:
+def test_the_margin_of_a_calibrated_answer_is_that_among_the_classes() -> None:
     record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.0))}
     recognizer = Recognizer(untrained_embedding_run(CLASSES, config=FOUR, record=record))
-    explanation = explain(recognizer, frame, 3)
-    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    explanation = explain(recognizer, FRAME, 3)
+    (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     assert explanation.name == answer.name and set(explanation.recognition.top) == {"embedding"}
     assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
-    described = describe_looks(pack_instances([instance], 1), NETWORK, FOUR)
+    described = describe_looks(pack_instances([INSTANCE], 1), NETWORK, FOUR)
     probabilities = class_probabilities(recognizer, described)["embedding"][0]
     share = float(probabilities.max() / probabilities.sum())
     assert explanation.attributions.margin == pytest.approx(logit(share), abs=1e-3)
 
 
 @pytest.mark.parametrize("looks", [*slow(1, 2), 4])
-def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: thor2.RGBDFrame) -> None:
+def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int) -> None:
     run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
     recognizer = Recognizer(run)
-    recognizer.enroll("mixed", [(frame, 3)])
-    instances, inference = recognizer.infer(recognizer.prepare(frame))
+    recognizer.enroll("mixed", [(FRAME, 3)])
+    instances, inference = recognizer.infer(recognizer.prepare(FRAME))
     usable = [one for one in instances if one.reason is None]
     embeddings = np.asarray(inference.embeddings)[: len(usable)]
     assert embeddings.shape[1] == 2
@@ -123,36 +113,34 @@ def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: t
     np.testing.assert_allclose(gallery_scores(recognizer.model).of_instances(usable)[:, 0], expected, atol=1e-5)
 
 
-def test_forgotten_classes_have_no_score(instance: PreparedInstance) -> None:
+def test_forgotten_classes_have_no_score() -> None:
     recognizer = Recognizer(untrained_run(CLASSES, config=FOUR))
-    whole = classifier_scores(recognizer.model).of_instances([instance])
+    whole = classifier_scores(recognizer.model).of_instances([INSTANCE])
     recognizer.forget("b")
     scores = classifier_scores(recognizer.model)
     assert scores.names == ("a", "c")
-    np.testing.assert_allclose(scores.of_instances([instance]), whole[:, [0, 2]], rtol=1e-5)
+    np.testing.assert_allclose(scores.of_instances([INSTANCE]), whole[:, [0, 2]], rtol=1e-5)
 
 
-def test_parts_keep_the_mask_of_each_look(instance: PreparedInstance) -> None:
+def test_parts_keep_the_mask_of_each_look() -> None:
     """Without the points of the rim, the second look, which has none of them, is unchanged; without others, empty."""
-    rim = instance.rim
+    rim = INSTANCE.rim
     assert rim is not None and 0 < rim.sum() < len(rim) / 2
     for number in range(4):
         scores = toy(lambda oriented, k=number: oriented.each.images[:, k].sum(axis=(1, 2, 3)), FOUR)
         masks = np.array([rim | True, ~rim, rim])
-        whole, inner, outer = scores.of_masks(scores.orient(instance), masks)[:, 1]
+        whole, inner, outer = scores.of_masks(scores.orient(INSTANCE), masks)[:, 1]
         assert whole > 1e-3
         assert (inner == pytest.approx(whole, rel=1e-6)) == (number == 1)
         assert (outer == 0) == (number == 1)
 
 
-def test_selected_points_keep_their_flags(recognizer: Recognizer, instance: PreparedInstance) -> None:
-    kept = np.arange(len(instance.points)) % 3 > 0
-    selected = attributions.select_points(instance, kept)
-    packed = pack_instances([selected], 1)
-    assert instance.rim is not None and packed.rim is not None
-    np.testing.assert_array_equal(packed.rim[0, : kept.sum()], instance.rim[kept])
-    assert np.isfinite(classifier_scores(recognizer.model).of_instances([selected])).all()
-    assert attributions.select_points(dataclasses.replace(instance, rim=None), kept).rim is None
+def test_selected_points_keep_their_flags() -> None:
+    kept = np.arange(len(INSTANCE.points)) % 3 > 0
+    packed = pack_instances([attributions.select_points(INSTANCE, kept)], 1)
+    assert INSTANCE.rim is not None and packed.rim is not None
+    np.testing.assert_array_equal(packed.rim[0, : kept.sum()], INSTANCE.rim[kept])
+    assert attributions.select_points(dataclasses.replace(INSTANCE, rim=None), kept).rim is None
 
 
 RED = np.asarray(NETWORK.membership(np.array([200, 30, 30], np.uint8))) > 0
@@ -164,16 +152,13 @@ def redness(oriented: LookDescriptors) -> jax.Array:
     return counts[:, RED].sum(axis=1) / 100
 
 
-@pytest.fixture(scope="module")
-def red() -> ClassScores:
-    """Scores whose programs two tests share."""
-    return toy(redness)
+REDNESS = toy(redness)
 
 
-def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: ClassScores) -> None:
-    left = attributions.leave_out(red, red.orient(instance), 1, np.zeros(len(instance.points), np.float32))
-    oriented = describe_looks(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
-    margin = jax.jit(lambda o: red.margin(red.of_descriptors(o), 1)[0])
+def test_a_left_out_slice_is_an_empty_slice() -> None:
+    left = attributions.leave_out(REDNESS, REDNESS.orient(INSTANCE), 1, np.zeros(len(INSTANCE.points), np.float32))
+    oriented = describe_looks(pack_instances([INSTANCE], 1), NETWORK, SMALL_CONFIG)
+    margin = jax.jit(lambda o: REDNESS.margin(REDNESS.of_descriptors(o), 1)[0])
     for number in range(2):
         kept = (np.arange(2) != number).reshape(2, 1, 1)
         blanked = {name: getattr(oriented.each, name) * kept for name in ("images", "embeddings")}
@@ -183,10 +168,10 @@ def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance, red: Cla
     assert left.agreement is None  # all attributions are equal
 
 
-def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> float:
+def relaxed(scores: ClassScores, weight: float) -> float:
     """Return the relaxed margin of name 1 with a weight for all points."""
     config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
-    aligned = scores.orient(instance)
+    aligned = scores.orient(INSTANCE)
     weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
     sets = region_sets(NETWORK)
     cut = jax.vmap(lambda points, colors, mask: relaxed_strips(points.T, colors, mask, sets, config, weights))
@@ -195,21 +180,19 @@ def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> f
 
 
 @pytest.mark.slow
-def test_attributions_are_complete(
-    recognizer: Recognizer, instance: PreparedInstance, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_attributions_are_complete(recognizer: Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
     monkeypatch.setattr(attributions, "STEPS", 32)
     scores = classifier_scores(recognizer.model)
-    gradients = attributions.path_gradients(scores, scores.orient(instance), 1)
-    assert gradients.shape[0] == 32 and not gradients[:, len(instance.points) :].any()
-    slope = (relaxed(scores, instance, 1.0) - relaxed(scores, instance, 0.5)) / 0.5
+    gradients = attributions.path_gradients(scores, scores.orient(INSTANCE), 1)
+    assert gradients.shape[0] == 32 and not gradients[:, len(INSTANCE.points) :].any()
+    slope = (relaxed(scores, 1.0) - relaxed(scores, 0.5)) / 0.5
     assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
 
 
-def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
+def test_weightless_points_are_left_out() -> None:
     config = dataclasses.replace(SMALL_CONFIG, relaxation=attributions.RELAXATION)
-    aligned = thor2.align(pack_instances([instance], 1), config)
+    aligned = thor2.align(pack_instances([INSTANCE], 1), config)
     cloud = jax.tree.map(lambda a: a[0], aligned)
     some = jnp.arange(len(cloud.mask)) % 3 > 0
     sets = region_sets(NETWORK)
@@ -224,11 +207,11 @@ def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), weighted, masked)
 
 
-def test_points_of_the_decisive_color_are_found(instance: PreparedInstance, red: ClassScores) -> None:
-    cloud = red.orient(instance)
-    attributed = attributions.attribute_points(red, cloud, instance, 1)
-    is_red = instance.colors[:, 0] > instance.colors[:, 2]
-    aligned = np.asarray(cloud.points[0])[: len(instance.points)]
+def test_points_of_the_decisive_color_are_found() -> None:
+    cloud = REDNESS.orient(INSTANCE)
+    attributed = attributions.attribute_points(REDNESS, cloud, INSTANCE, 1)
+    is_red = INSTANCE.colors[:, 0] > INSTANCE.colors[:, 2]
+    aligned = np.asarray(cloud.points[0])[: len(INSTANCE.points)]
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
     assert attributed.values[is_red & inside].min() > 5 * np.abs(attributed.values[~is_red]).max()
     assert attributed.holds and attributed.most_attributed > 0
@@ -244,38 +227,38 @@ def test_smoothing_averages_over_neighbours() -> None:
 
 
 @pytest.mark.slow
-def test_smallest_change_is_smallest_and_confirmed(instance: PreparedInstance) -> None:
+def test_smallest_change_is_smallest_and_confirmed() -> None:
     def width(oriented: LookDescriptors) -> jax.Array:
         return -oriented.each.images.sum(axis=(1, 2, 3, 4))
 
     raw = toy(width)
-    threshold = -0.75 * float(raw.of_instances([instance])[0, 1])
+    threshold = -0.75 * float(raw.of_instances([INSTANCE])[0, 1])
     scores = toy(lambda oriented: width(oriented) + threshold)
-    assert scores.of_instances([instance])[0].argmax() == 0
-    change = smallest_change(scores, instance, 0, "extent")
+    assert scores.of_instances([INSTANCE])[0].argmax() == 0
+    change = smallest_change(scores, INSTANCE, 0, "extent")
     assert change is not None and change.answer == "special" and change.margin < 0
-    changed = apply_change(instance, change, SMALL_CONFIG)
+    changed = apply_change(INSTANCE, change, SMALL_CONFIG)
     assert scores.of_instances([changed])[0].argmax() == 1
     less = dataclasses.replace(change, values=tuple(float(v) ** 0.9 for v in change.values))
-    assert scores.of_instances([apply_change(instance, less, SMALL_CONFIG)])[0].argmax() == 0
+    assert scores.of_instances([apply_change(INSTANCE, less, SMALL_CONFIG)])[0].argmax() == 0
     never = toy(lambda oriented: width(oriented) - 100)
-    assert smallest_change(never, instance, 0, "color") is None
+    assert smallest_change(never, INSTANCE, 0, "color") is None
 
 
-def test_changed_extents_keep_the_other_sides(instance: PreparedInstance) -> None:
+def test_changed_extents_keep_the_other_sides() -> None:
     rng = np.random.default_rng(0)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    changed = changed_instance(instance, "extent", np.log([1.5, 1.0, 0.5]), axes)
-    before, after = (np.ptp(one.points @ axes.T, axis=0) for one in (instance, changed))
+    changed = changed_instance(INSTANCE, "extent", np.log([1.5, 1.0, 0.5]), axes)
+    before, after = (np.ptp(one.points @ axes.T, axis=0) for one in (INSTANCE, changed))
     np.testing.assert_allclose(after / before, [1.5, 1.0, 0.5], rtol=1e-3)
-    shifted = changed_instance(instance, "color", np.array([0.1, 0, -1]), axes)
-    np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(instance.colors[:, 0] + 25.5, 255), atol=0.51)
+    shifted = changed_instance(INSTANCE, "color", np.array([0.1, 0, -1]), axes)
+    np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(INSTANCE.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
 
 
 @pytest.mark.slow
-def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
-    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer) -> None:
+    (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     assert explanation.name == answer.name and explanation.runner_up in set(CLASSES) - {answer.name}
     assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
     n = len(explanation.instance.points)
@@ -300,23 +283,23 @@ def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -
 
 
 @pytest.mark.slow
-def test_pixels_have_the_value_of_their_point(explanation: Explanation, frame: thor2.RGBDFrame) -> None:
-    painted = pixel_attributions(explanation, frame)
+def test_pixels_have_the_value_of_their_point(explanation: Explanation) -> None:
+    painted = pixel_attributions(explanation, FRAME)
     known = np.isfinite(painted)
-    assert known.sum() > 0.8 * (frame.labels == 3).sum() and not known[frame.labels != 3].any()
+    assert known.sum() > 0.8 * (FRAME.labels == 3).sum() and not known[FRAME.labels != 3].any()
     row, column = np.argwhere(known)[100]
-    depth = frame.depth[row, column] / 1000
+    depth = FRAME.depth[row, column] / 1000
     point = np.array([(column - 79.5) / 300 * depth, (row - 59.5) / 300 * depth, depth])
     nearest = np.linalg.norm(explanation.instance.points - point, axis=1).argmin()
     assert painted[row, column] == explanation.attributions.values[nearest]
 
 
 @pytest.mark.slow
-def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
+def test_gallery_answers_are_explained() -> None:
     recognizer = Recognizer(untrained_run((), features=()))
-    recognizer.enroll("red", [(frame, 7)])
-    recognizer.enroll("mixed", [(frame, 3)])
-    explanation = explain(recognizer, frame, 3)
+    recognizer.enroll("red", [(FRAME, 7)])
+    recognizer.enroll("mixed", [(FRAME, 3)])
+    explanation = explain(recognizer, FRAME, 3)
     assert explanation.name == "mixed" and explanation.scores.unit == "similarity"
     assert [one.name for one in explanation.nearest] == ["mixed", "red"]
     nearest = explanation.nearest[0]
@@ -325,17 +308,17 @@ def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
     assert explanation.attributions.margin > 0
 
 
-def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
+def test_errors_name_the_argument(recognizer: Recognizer) -> None:
     for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be used: ")):
-        assert_refused(match, explain, recognizer, frame, label)
-    assert_refused("no object", explain, Recognizer(untrained_run((), features=())), frame, 3)
+        assert_refused(match, explain, recognizer, FRAME, label)
+    assert_refused("no object", explain, Recognizer(untrained_run((), features=())), FRAME, 3)
     released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
-    assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), frame, 3)
+    assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), FRAME, 3)
 
 
-def test_titles_of_the_photo_of_a_tall_object_are_inside(explanation: Explanation, frame: thor2.RGBDFrame) -> None:
+def test_titles_of_the_photo_of_a_tall_object_are_inside(explanation: Explanation) -> None:
     """The titles touched the border of a picture whose sides have a ratio of 1.2."""
-    labels = np.where(np.arange(len(frame.labels))[:, None] < 58, frame.labels, 0)
-    picture = next(main_pictures(explanation, dataclasses.replace(frame, labels=labels)))
+    labels = np.where(np.arange(len(FRAME.labels))[:, None] < 58, FRAME.labels, 0)
+    picture = next(main_pictures(explanation, dataclasses.replace(FRAME, labels=labels)))
     with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
         assert (np.asarray(image)[:2] == 255).all()

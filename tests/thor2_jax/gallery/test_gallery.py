@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -228,14 +229,12 @@ def test_queries_that_the_index_answers_in_part_are_searched_exactly() -> None:
     search = IndexSearch(embeddings)
     whole = search._index
 
-    class Unreachable:
-        """An index whose second query reaches 5 views, as can be after several threads have built it."""
+    def search_in_part(vectors: np.ndarray, count: int) -> list:
+        """Reach 5 views by the second query, as can be after several threads have built the index."""
+        rows = list(whole.search(vectors, count))
+        rows[1] = dataclasses.replace(rows[1], keys=rows[1].keys[:5], distances=rows[1].distances[:5])
+        return rows
 
-        def search(self, vectors: np.ndarray, count: int) -> list:
-            rows = list(whole.search(vectors, count))
-            rows[1] = dataclasses.replace(rows[1], keys=rows[1].keys[:5], distances=rows[1].distances[:5])
-            return rows
-
-    search._index = Unreachable()
+    search._index = SimpleNamespace(search=search_in_part)
     for found, exact in zip(search.nearest(queries, 20), ExactSearch(embeddings).nearest(queries, 20), strict=True):
         np.testing.assert_allclose(found, exact, atol=2e-3)

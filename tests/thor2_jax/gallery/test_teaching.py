@@ -1,18 +1,18 @@
 """Enrolling, forgetting and answering with galleries; the weights are random, since accuracy is not checked."""
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from image_files import tilted
+from image_files import frame_of_squares
 from refusals import assert_refused
 from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery, augmented_copies
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import Calibration
@@ -21,59 +21,40 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
 from training.objects.builtin_objects import builtin_objects
 
+embedding = functools.cache(small_embedding)
+run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2")))
 
-@pytest.fixture(scope="module")
-def embedding() -> Embedding:
-    return small_embedding()
-
-
-@pytest.fixture(scope="module")
-def run() -> TrainedRun:
-    return untrained_run(("a", "b", "c"), ("tops", "tops2"))
+RED, BLUE = (10, 10, (220, 30, 30)), (60, 100, (30, 40, 220))
+BRICK, BOOK = frame_of_squares({1: RED}), frame_of_squares({1: BLUE})
+CLUTTER = frame_of_squares({1: RED, 2: BLUE, 3: (70, 20, (90, 200, 60))})
 
 
-def frame(*shapes: tuple[int, int, int, int, tuple[int, int, int]], seed: int = 0) -> thor2.RGBDFrame:
-    """Return a frame of tilted rectangles (top, left, height, width, colour); depth grows to the right."""
-    rng = np.random.default_rng(seed)
-    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
-    labels = np.zeros((240, 320), np.uint8)
-    for number, (top, left, height, width, rgb) in enumerate(shapes, 1):
-        place = slice(top, top + height), slice(left, left + width)
-        labels[place] = number
-        color[place] = np.clip(np.array(rgb) + rng.integers(-9, 10, (height, width, 3)), 0, 255)
-    return dataclasses.replace(tilted(labels), color=color)
-
-
-RED, BLUE = (20, 20, 60, 120, (220, 30, 30)), (120, 180, 90, 60, (30, 40, 220))
-CLUTTER = frame(RED, BLUE, (150, 40, 40, 40, (90, 200, 60)))
-
-
-def taught(run: TrainedRun, embedding: Embedding, **options: object) -> thor2.Recognizer:
-    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding), **options)  # type: ignore[arg-type]
-    recognizer.enroll("brick", [frame(RED, seed=1), (CLUTTER, 1)])
-    recognizer.enroll("book", [frame(BLUE, seed=2)])
+def taught(run: TrainedRun, **options: object) -> thor2.Recognizer:
+    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding()), **options)  # type: ignore[arg-type]
+    recognizer.enroll("brick", [BRICK, (CLUTTER, 1)])
+    recognizer.enroll("book", [BOOK])
     return recognizer
 
 
-def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) -> None:
-    recognizer = taught(untrained_run((), ()), embedding)
+def test_enrolled_objects_are_recognized_without_training() -> None:
+    recognizer = taught(untrained_run((), ()))
     assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "gallery"
-    answers = recognizer.recognize(frame(RED, BLUE, seed=3))
+    answers = recognizer.recognize(frame_of_squares({1: (20, 15, (200, 40, 50)), 2: (65, 90, (50, 60, 200))}))
     assert [answer.name for answer in answers] == ["brick", "book"]
     for answer in answers:
         assert answer.classifier == "gallery" and list(answer.top) == ["gallery"] and answer.confidence is not None
         assert answer.top["gallery"][0] == (answer.name, pytest.approx(answer.confidence))
 
 
-def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     objects = ObjectGallery(tuple(builtin_objects()))
     assert objects.gallery.summary == "18 toy objects of the demo; none of yours"
     objects.forget("apple")
     assert objects.gallery.summary.startswith("17 toy objects")
-    objects = taught(run, embedding).objects
+    objects = taught(run()).objects
     assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
     assert not ObjectGallery(()).weak_rejection
-    alone = taught(untrained_run((), ()), embedding).objects
+    alone = taught(untrained_run((), ())).objects
     assert "2 of 2 enrolled objects" in alone.weak_rejection
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
     assert alone.weak_rejection.startswith("1 of 2")
@@ -83,8 +64,8 @@ def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monke
     assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
 
 
-def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = taught(run, embedding)
+def test_forgetting_restores_every_answer() -> None:
+    recognizer = taught(run())
     before = recognizer.recognize(CLUTTER)
     recognizer.enroll("pen", [(CLUTTER, 3)])
     assert [answer.name for answer in recognizer.recognize(CLUTTER, answer_by="gallery")] == ["brick", "book", "pen"]
@@ -92,41 +73,41 @@ def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding)
     assert recognizer.recognize(CLUTTER) == before
 
 
-def test_both_answers_by_the_union_of_classes(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = taught(run, embedding)
+def test_both_answers_by_the_union_of_classes() -> None:
+    recognizer = taught(run())
     assert recognizer.model.answers_by() == "both" and recognizer.classes == ("a", "b", "c", "brick", "book")
     for answer in recognizer.recognize(CLUTTER):
         assert list(answer.top) == ["tops", "tops2", "gallery"] and 0 <= answer.confidence <= 1  # type: ignore[operator]
     by_classifiers = recognizer.recognize(CLUTTER, answer_by="classifiers")
-    expected = thor2.Recognizer(run).recognize(CLUTTER)
+    expected = thor2.Recognizer(run()).recognize(CLUTTER)
     assert [(a.name, a.confidence) for a in by_classifiers] == [(a.name, a.confidence) for a in expected]
 
 
-def test_the_record_and_the_argument_choose_what_answers(run: TrainedRun, embedding: Embedding) -> None:
-    stored = taught(dataclasses.replace(run, record={"answer_by": "gallery"}), embedding)
+def test_the_record_and_the_argument_choose_what_answers() -> None:
+    stored = taught(dataclasses.replace(run(), record={"answer_by": "gallery"}))
     assert (stored.model.answers_by(), stored.model.answers_by("both")) == ("gallery", "both")
-    assert taught(run, embedding, answer_by="classifiers").model.answers_by() == "classifiers"
-    assert_refused("answer_by is 'all'", thor2.Recognizer, run, answer_by="all")
+    assert taught(run(), answer_by="classifiers").model.answers_by() == "classifiers"
+    assert_refused("answer_by is 'all'", thor2.Recognizer, run(), answer_by="all")
 
 
 CALIBRATION = dataclasses.asdict(Calibration(0.0, 1.0, 0.0, 1.0, unknown_below=0.625))
 
 
-def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embedding) -> None:
+def test_the_default_thresholds_of_each_source() -> None:
     """A trained class has the run's threshold, an object that of its views; brick has two, and book one.
 
     The scores .3118 and .255 have the odds (.3118 / .2)^3 and (.255 / .2)^3, hence .791 and .675.
     """
-    calibrated = taught(dataclasses.replace(run, record={"calibration": CALIBRATION}), embedding)
-    calibrated.enroll("b", [frame(RED)], extend=True)
-    calibrated.enroll("c", [frame(RED)], replace=True)
+    calibrated = taught(dataclasses.replace(run(), record={"calibration": CALIBRATION}))
+    calibrated.enroll("b", [BRICK], extend=True)
+    calibrated.enroll("c", [BRICK], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
     assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.791, 0.675, 0.675]
     assert calibrated.thresholds("gallery")[1:].tolist() == [0.675, 0.791, 0.675, 0.675]
-    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.791, 0.675]
-    explicit = taught(run, embedding, unknown_below=0.25)
+    assert taught(run()).thresholds().tolist() == [0, 0, 0, 0.791, 0.675]
+    explicit = taught(run(), unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
-    assert thor2.Recognizer(run).model.thresholds().tolist() == [0, 0, 0]
+    assert thor2.Recognizer(run()).model.thresholds().tolist() == [0, 0, 0]
 
 
 NAMED = {0.67: [None, None], 0.68: [None, "book"], 0.79: [None, "book"], 0.8: ["brick", "book"]}
@@ -134,12 +115,10 @@ NAMED = {0.67: [None, None], 0.68: [None, "book"], 0.79: [None, "book"], 0.8: ["
 
 
 @pytest.mark.parametrize("unknown_below", [None, 0.0])
-def test_a_gallery_alone_rejects_unknown_objects(
-    unknown_below: float | None, embedding: Embedding, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gallery_alone_rejects_unknown_objects(unknown_below: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Values as given: the brick has two views and is named from .791, the book has one and is named from .675."""
     instance = instance_view(CLUTTER, 1, 2.5)
-    recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
+    recognizer = taught(untrained_run((), ()), unknown_below=unknown_below)
     _, inference = recognizer.infer([instance])
     for score, names in NAMED.items():
         for column, name in enumerate(["brick", "book"] if unknown_below == 0 else names):
@@ -150,15 +129,15 @@ def test_a_gallery_alone_rejects_unknown_objects(
             assert answer.reason is None or answer.reason.startswith("unknown: ")
 
 
-def test_a_refused_name_leaves_no_directory(tmp_path: Path, embedding: Embedding) -> None:
-    objects = ObjectGallery(("a", "b"), embedding)
+def test_a_refused_name_leaves_no_directory(tmp_path: Path) -> None:
+    objects = ObjectGallery(("a", "b"), embedding())
     objects.open(tmp_path / "gallery")
     assert_refused("mug", objects.forget, "mug")
     assert not (tmp_path / "gallery").exists()
 
 
-def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
+def test_a_forgotten_class_is_never_answered() -> None:
+    recognizer = thor2.Recognizer(dataclasses.replace(run(), embedding=embedding()))
     first = {answer.name for answer in recognizer.recognize(CLUTTER)}
     for name in first:
         recognizer.forget(name)  # type: ignore[arg-type]
@@ -170,19 +149,19 @@ def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embeddi
     assert_refused("name", recognizer.forget, next(iter(first)))
 
 
-def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = taught(run, embedding)
+def test_unusable_views_are_refused_and_nothing_changes() -> None:
+    recognizer = taught(run())
     before = recognizer.gallery
-    assert_refused(r"frames\[1\].*3 instances", recognizer.enroll, "new", [frame(RED), CLUTTER])
+    assert_refused(r"frames\[1\].*3 instances", recognizer.enroll, "new", [BRICK, CLUTTER])
     assert_refused("instance is 9", recognizer.enroll, "new", [(CLUTTER, 9)])
     assert_refused("instance is 9", recognizer.enroll, "new", [[CLUTTER, 9]])
-    assert_refused("cannot be used", recognizer.enroll, "new", [frame((5, 5, 4, 4, (0, 0, 0)))])
+    assert_refused("cannot be used", recognizer.enroll, "new", [frame_of_squares({1: RED}, 3)])
     assert_refused("views is empty", recognizer.enroll, "new", [])
     assert recognizer.gallery is before
 
 
-def test_views_get_augmented_copies(embedding: Embedding) -> None:
-    recognizer = taught(untrained_run((), ()), embedding)
+def test_views_get_augmented_copies() -> None:
+    recognizer = taught(untrained_run((), ()))
     views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
     copies = augmented_copies(views, "frames")
     assert len(copies) == 8 and len(augmented_copies(views * 5, "frames")) == 0
@@ -196,9 +175,9 @@ def test_views_get_augmented_copies(embedding: Embedding) -> None:
     assert [len(objects[name].embeddings) for name in ("mesh", "frames")] == [8, 20]
 
 
-def test_a_run_directory_keeps_its_gallery(embedding: Embedding, tmp_path: Path) -> None:
+def test_a_run_directory_keeps_its_gallery(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    save_run(dataclasses.replace(untrained_run((), ()), embedding=embedding), path)
+    save_run(dataclasses.replace(untrained_run((), ()), embedding=embedding()), path)
     assert load_run(path).classes == ()
     first, second = thor2.Recognizer.load(path), thor2.Recognizer.load(path)
     assert first.recognize(CLUTTER)[0].name is None
@@ -212,10 +191,10 @@ def test_a_run_directory_keeps_its_gallery(embedding: Embedding, tmp_path: Path)
     assert first.objects.refresh() is False and (tmp_path / "elsewhere" / "index.json").is_file()
 
 
-def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path: Path) -> None:
+def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
     path, other = tmp_path / "run", small_embedding(1)
     save_run(untrained_run((), ()), path)
-    embedding.save(path / EMBEDDING_FILE)
+    embedding().save(path / EMBEDDING_FILE)
     thor2.Recognizer.load(path).enroll("brick", [(CLUTTER, 1)])
     other.save(path / EMBEDDING_FILE)
     assert_refused("gallery.*reembed", thor2.Recognizer.load, path)

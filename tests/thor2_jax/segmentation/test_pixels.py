@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-pytest.importorskip("cv2")
-
 from thor2_jax.segmentation.pixels import label_borders, nearest_known
 
 MASK = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(60, 90)), 2) > 0

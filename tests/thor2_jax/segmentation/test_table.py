@@ -99,21 +99,23 @@ def test_frames_without_things() -> None:
     assert [segment_table(each).any() for each in frames] == [False] * 6
 
 
+def assert_one_thing(frame: RGBDFrame, **changed: Any) -> None:
+    """Assert that the only piece of a changed frame is its only box."""
+    labels = segment_table(dataclasses.replace(frame, **changed))
+    assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.85
+
+
 def test_a_soft_shadow_is_not_a_thing() -> None:
     frame = render(APART[:1])
     row, column = np.mgrid[0:240, 0:320]
     shade = 1 - 0.4 * np.exp(-((row - 170) ** 2 + (column - 230) ** 2) / (2 * 25**2))
-    color = (frame.color * shade[..., None]).astype(np.uint8)
-    assert segment_table(dataclasses.replace(frame, color=color)).max() == 1
+    assert_one_thing(frame, color=(frame.color * shade[..., None]).astype(np.uint8))
 
 
 def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
     frame = render([Box(0.0, 0.0, (0.06, 0.04), 0.12, YELLOW)])
     shadow = np.roll(frame.label_image, (4, 14), axis=(0, 1)).astype(bool) & (frame.label_image == 0)
-    color = np.where(shadow[..., None], frame.color * 0.3, frame.color).astype(np.uint8)
-    labels = segment_table(dataclasses.replace(frame, color=color))
-    assert labels.max() == 1
-    assert best_overlaps(labels, frame.label_image)[0] > 0.85
+    assert_one_thing(frame, color=np.where(shadow[..., None], frame.color * 0.3, frame.color).astype(np.uint8))
 
 
 def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
@@ -121,9 +123,7 @@ def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
     lower = (frame.label_image == 1) & (np.arange(240)[:, None] > np.nonzero(frame.label_image)[0].mean())
     color, depth = frame.color.copy(), frame.depth.copy()
     color[lower], depth[lower] = (25, 25, 25), 0
-    labels = segment_table(dataclasses.replace(frame, color=color, depth=depth))
-    assert labels.max() == 1
-    assert best_overlaps(labels, frame.label_image)[0] > 0.85
+    assert_one_thing(frame, color=color, depth=depth)
 
 
 def test_wall_sized_and_tiny_pieces_are_dropped() -> None:
