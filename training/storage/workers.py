@@ -24,7 +24,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
-from thor2_jax.errors import needs_extra
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.service.signals import signals_blocked
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
@@ -161,7 +161,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             duration of the map.
 
     Raises:
-        InputError: Ray is not installed.
+        InputError: Ray is not installed. The map raises it if the address is not one of Ray.
     """
     with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
@@ -176,7 +176,10 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
         with warnings.catch_warnings():
             # JAX warns about forks, but Ray's forks are safe, since they execute another program at once.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-            cluster = ray.init(address, log_to_driver=False, logging_level="error")
+            try:
+                cluster = ray.init(address, log_to_driver=False, logging_level="error")
+            except ValueError as error:
+                raise InputError(f"address is {address}; expected HOST:PORT or ray://HOST:PORT ({error})") from None
         with cluster:
             # Ray accepts functions only, not other callables such as partial functions.
             task = function if inspect.isfunction(function) else lambda item: function(item)

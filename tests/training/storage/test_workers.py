@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 from processes import HANG, is_running, wait_until
+from refusals import assert_refused
 
-from training.storage.workers import IN_PROCESS, local_workers
+from training.storage.workers import IN_PROCESS, local_workers, ray_workers
 
 # A worker cannot import functions of a test file; it can import `eval`, whose items contain the work.
 SLOW_FIRST = ["__import__('time').sleep(0.3) or 0", *map(str, range(1, 9))]
@@ -49,6 +50,11 @@ def test_ctrl_c_is_blocked_from_the_start_of_a_worker() -> None:
 def test_exceptions_of_the_function_are_raised(workers: int) -> None:
     with pytest.raises(ZeroDivisionError), closing(local_workers(workers)(eval, ["1", "1 / 0", "2"])) as results:
         list(results)
+
+
+def test_an_address_that_is_none_of_a_cluster() -> None:
+    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    assert_refused("address is a; expected HOST:PORT", list, ray_workers(1, "a")(eval, ["1"]))
 
 
 @pytest.mark.slow
