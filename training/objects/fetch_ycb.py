@@ -65,7 +65,6 @@ def fetch_ycb(
     directory = Path(directory)
     if not directory.is_dir():
         check_output_directory(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
     with locked(directory):
         for name in objects:
