@@ -39,18 +39,19 @@ _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var"
 """Last part of an NNX path -> last part of the tensor's name."""
 
 
-def _tensors(model: nnx.Module) -> tuple[Any, dict[str, tuple[Any, Any, tuple[int, ...]]]]:
+def _tensors(model: nnx.Module) -> tuple[Any, dict[str, tuple[Any, str, tuple[int, ...]]]]:
     """Return the state of a backbone, and tensor name -> variable, its name in the module, and the tensor's shape.
 
     The last two axes of kernels are the first ones of the tensor, reversed.
     """
     state, tensors = nnx.state(model, (nnx.Param, nnx.BatchStat)), {}
     prefix: str = getattr(model, "PREFIX", "")
-    for (*modules, kind), variable in nnx.to_flat_state(state):
+    for path, variable in nnx.to_flat_state(state):
+        *modules, kind = map(str, path)
         shape = variable.shape
         if kind == "kernel":
             shape = (shape[-1], shape[-2], *shape[:-2])
-        tensors[prefix + ".".join(map(str, (*modules, _TENSORS.get(kind, kind))))] = variable, kind, shape
+        tensors[prefix + ".".join([*modules, _TENSORS.get(kind, kind)])] = variable, kind, shape
     return state, tensors
 
 
