@@ -33,7 +33,6 @@ __all__ = [
     "Predictions",
     "RULES",
     "Rule",
-    "WHOLE",
     "fuse_by",
     "fusions",
     "main_fusion",

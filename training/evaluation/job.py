@@ -32,7 +32,7 @@ from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import Progress, locked
 from training.storage.workers import WorkerPool
 
-__all__ = ["Answering", "answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
+__all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
 
 Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None, None]]
 """Function that yields the frames with these numbers and their answers, such as `answer_frames_in_pool`."""
