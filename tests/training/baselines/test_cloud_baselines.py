@@ -62,14 +62,11 @@ def test_predictions_match_scikit_learn(depth: int | None) -> None:
     )
 
 
-def test_single_leaf_trees_and_missing_arrays() -> None:
+def test_trees_of_a_single_leaf() -> None:
     grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
-    nodes = module.tree_arrays(grown)
     run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
-    probabilities = load_forest(nodes, run)(BaselineInputs(normal((60, 0)), None, None))
+    probabilities = load_forest(module.tree_arrays(grown), run)(BaselineInputs(normal((60, 0)), None, None))
     np.testing.assert_allclose(probabilities, grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
-    with pytest.raises(KeyError, match="root"):
-        load_forest({name: nodes[name] for name in nodes if name != "root"}, run)
 
 
 ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))

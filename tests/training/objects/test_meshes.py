@@ -47,26 +47,26 @@ def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
 
 
 QUADRANTS = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
-
-
 FACTOR = np.array([128, 255, 51, 255], np.uint8)
-SCALED = np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).astype(int).tolist()
 CORNERS = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
 BETWEEN = [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
+QUADS: dict[str, tuple[Any, str, Any]] = {
+    "texture of a GLB": (textured_quad(PBR), "glb", QUADRANTS),
+    "texture of an OBJ": (textured_quad(SIMPLE), "obj", QUADRANTS),
+    "factor": (textured_quad(PBRMaterial(baseColorFactor=FACTOR)), "glb", [[128, 255, 51]] * 4),
+    "texture and factor": (
+        textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)),
+        "glb",
+        np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).tolist(),
+    ),
+    "vertices of a GLB": (colored(QUAD, CORNERS), "glb", BETWEEN),
+    "vertices of a PLY": (colored(QUAD, CORNERS), "ply", BETWEEN),
+}
 
 
-@pytest.mark.parametrize(
-    ("quad", "suffix", "expected"),
-    [
-        pytest.param(textured_quad(PBR), "glb", QUADRANTS, id="texture of a GLB"),
-        pytest.param(textured_quad(SIMPLE), "obj", QUADRANTS, id="texture of an OBJ"),
-        pytest.param(textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)), "glb", SCALED, id="both"),
-        pytest.param(textured_quad(PBRMaterial(baseColorFactor=FACTOR)), "glb", [[128, 255, 51]] * 4, id="factor"),
-        pytest.param(colored(QUAD, CORNERS), "glb", BETWEEN, id="vertices of a GLB"),
-        pytest.param(colored(QUAD, CORNERS), "ply", BETWEEN, id="vertices of a PLY"),
-    ],
-)
-def test_colours_are_those_of_the_file(tmp_path: Path, quad: Any, suffix: str, expected: list[list[int]]) -> None:
+@pytest.mark.parametrize("name", QUADS)
+def test_colours_are_those_of_the_file(tmp_path: Path, name: str) -> None:
+    quad, suffix, expected = QUADS[name]
     quad.export(tmp_path / f"quad.{suffix}")
     mesh = load_mesh(tmp_path / f"quad.{suffix}")
     assert mesh.faces.shape == (2, 3) and mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
