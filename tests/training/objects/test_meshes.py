@@ -48,17 +48,14 @@ def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
 
 QUADRANTS = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
 FACTOR = np.array([128, 255, 51, 255], np.uint8)
+SCALED = np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).tolist()
 CORNERS = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
 BETWEEN = [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
 QUADS: dict[str, tuple[Any, str, Any]] = {
     "texture of a GLB": (textured_quad(PBR), "glb", QUADRANTS),
     "texture of an OBJ": (textured_quad(SIMPLE), "obj", QUADRANTS),
     "factor": (textured_quad(PBRMaterial(baseColorFactor=FACTOR)), "glb", [[128, 255, 51]] * 4),
-    "texture and factor": (
-        textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)),
-        "glb",
-        np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).tolist(),
-    ),
+    "texture and factor": (textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)), "glb", SCALED),
     "vertices of a GLB": (colored(QUAD, CORNERS), "glb", BETWEEN),
     "vertices of a PLY": (colored(QUAD, CORNERS), "ply", BETWEEN),
 }
