@@ -8,12 +8,11 @@ The files have the tensor names of timm: `layer1.0.conv1.weight` is the kernel o
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +30,6 @@ __all__ = [
     "TEMPLATES",
     "check_weights",
     "crop_size",
-    "load_weights",
     "network_inputs",
     "pretrained_files",
     "weights_file",
@@ -41,24 +39,25 @@ _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var"
 """Last part of an NNX path -> last part of the tensor's name."""
 
 
-def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
-    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    return state, dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
+def _tensors(model: nnx.Module) -> tuple[Any, dict[str, tuple[Any, str, tuple[int, ...]]]]:
+    """Return the state of a backbone, and tensor name -> variable, its name in the module, and the tensor's shape.
 
-
-def _tensor_name(path: tuple[Any, ...], prefix: str) -> str:
-    return prefix + ".".join(map(str, (*path[:-1], _TENSORS.get(path[-1], path[-1]))))
-
-
-def _torch_shape(shape: tuple[int, ...], kind: str) -> tuple[int, ...]:
-    """Return the shape of a PyTorch tensor, in which the last two axes of kernels are in front, reversed."""
-    return (shape[-1], shape[-2], *shape[:-2]) if kind == "kernel" else shape
+    The last two axes of kernels are the first ones of the tensor, reversed.
+    """
+    state, tensors = nnx.state(model, (nnx.Param, nnx.BatchStat)), {}
+    prefix: str = getattr(model, "PREFIX", "")
+    for path, variable in nnx.to_flat_state(state):
+        *modules, kind = map(str, path)
+        shape = variable.shape
+        if kind == "kernel":
+            shape = (shape[-1], shape[-2], *shape[:-2])
+        tensors[prefix + ".".join([*modules, _TENSORS.get(kind, kind)])] = variable, kind, shape
+    return state, tensors
 
 
 def tensor_shapes(model: nnx.Module) -> dict[str, tuple[int, ...]]:
     """Return the names and shapes of the tensors of a backbone's file."""
-    prefix = getattr(model, "PREFIX", "")
-    return {_tensor_name(path, prefix): _torch_shape(value.shape, path[-1]) for path, value in _state(model)[1].items()}
+    return {name: shape for name, (_, _, shape) in _tensors(model)[1].items()}
 
 
 def weights_file(directory: Path, name: str) -> Path:
@@ -73,23 +72,6 @@ def weights_file(directory: Path, name: str) -> Path:
     return path
 
 
-def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> dict[str, str]:
-    """Replace the weights of backbones by weights from files in a folder, given without the suffix.
-
-    Returns:
-        Name of each file -> its SHA-256.
-
-    Raises:
-        InputError: a file does not exist; also as `load_backbone`.
-    """
-    digests = {}
-    for model, name in backbones:
-        path = weights_file(directory, name)
-        load_backbone(model, path)
-        digests[path.name] = file_digest(path)
-    return digests
-
-
 def load_backbone(model: nnx.Module, path: Path) -> None:
     """Replace the weights of a backbone by weights from a file, ignoring other tensors in the file.
 
@@ -98,34 +80,30 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     Raises:
         InputError: the file is missing or damaged, or a tensor is missing or has another shape.
     """
-    state, values = _state(model)
-    prefix = getattr(model, "PREFIX", "")
-    loaded = {}
+    state, tensors = _tensors(model)
     try:
         with safetensors.safe_open(path, "numpy") as file:
             names = set(file.keys())
-            for keys, value in values.items():
-                name, wanted = _tensor_name(keys, prefix), _torch_shape(value.shape, keys[-1])
+            for name, (variable, kind, wanted) in tensors.items():
                 if name not in names:
                     raise InputError(
                         f"weights: {path} has no tensor {name}; expected one of shape {wanted}: give the "
                         "file of the network's backbone"
                     )
                 array = file.get_tensor(name).astype(np.float32)
-                if keys[-1] == "pos_embed":
+                if kind == "pos_embed":
                     array = resampled_positions(array, wanted)
                 if array.shape != wanted:
                     raise InputError(
                         f"weights: {name} in {path} has the shape {array.shape}; expected {wanted}: give the "
                         "file of the network's backbone"
                     )
-                axes = (*range(2, array.ndim), 1, 0) if keys[-1] == "kernel" else range(array.ndim)
-                loaded[keys] = jnp.asarray(array.transpose(*axes))
+                axes = (*range(2, array.ndim), 1, 0) if kind == "kernel" else range(array.ndim)
+                variable.set_value(jnp.asarray(array.transpose(*axes)))
     except (OSError, safetensors.SafetensorError, TypeError) as error:
         raise InputError(
             f"weights: {path} cannot be read ({error}); expected a safetensors file, see docs/baselines.md"
         ) from None
-    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
     nnx.update(model, state)
 
 
@@ -162,9 +140,21 @@ class Architecture:
         """Return the network with random weights."""
         return self.create(n_classes, rngs=nnx.Rngs(seed))
 
-    def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
-        """Return the backbones of a network with their files."""
-        return [(getattr(network, backbone), file) for backbone, file in self.weights.items()]
+    def load_weights(self, network: Any, directory: Path) -> dict[str, str]:
+        """Replace the weights of the backbones of a network by weights from the files in a folder.
+
+        Returns:
+            Name of each file -> its SHA-256.
+
+        Raises:
+            InputError: a file does not exist; also as `load_backbone`.
+        """
+        digests = {}
+        for backbone, name in self.weights.items():
+            path = weights_file(directory, name)
+            load_backbone(getattr(network, backbone), path)
+            digests[path.name] = file_digest(path)
+        return digests
 
 
 TEMPLATES = "templates"
@@ -245,4 +235,4 @@ def check_weights(directory: Path, name: str) -> None:
     """
     if name in ARCHITECTURES:
         architecture = ARCHITECTURES[name]
-        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))
+        architecture.load_weights(nnx.eval_shape(lambda: architecture.build(2, 0)), directory)

@@ -89,7 +89,6 @@ def predict_forest(nodes: Mapping[str, NDArray[Any]], features: NDArray[np.float
 
 
 TREES = 200
-MIN_LEAF_SAMPLES = 2
 
 
 def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
@@ -116,9 +115,8 @@ def fit_forest(task: FitTask) -> StoredBaseline:
     """Fit a random forest on the features of every view and its mirror images."""
     x, y, view = _features_of_views(task)
     held_out = task.held_out(y, view)
-    forest = RandomForestClassifier(
-        TREES, min_samples_leaf=MIN_LEAF_SAMPLES, max_features="sqrt", random_state=task.options.seed, n_jobs=-1
-    )
+    seed = task.options.seed
+    forest = RandomForestClassifier(TREES, min_samples_leaf=2, max_features="sqrt", random_state=seed, n_jobs=-1)
     forest.fit(x[~held_out], y[~held_out])
     task.progress("grow forest", 1, 1, f"{TREES} trees")
     nodes = tree_arrays(forest)
@@ -145,7 +143,6 @@ POINTS = 384
 SHARED = (64, 128, 384)
 HEAD = 256
 INFERENCE_BATCH = 256
-SAMPLING_SEED = 0
 
 
 class PointNet(nnx.Module):
@@ -191,15 +188,13 @@ def load_pointnet(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predic
     predict = compiled_network(model, point_features)
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
-        points, colors = np.asarray(inputs.normal.points), np.asarray(inputs.normal.colors)
-        counts = np.asarray(inputs.normal.mask).sum(axis=1)
-        xyz = np.zeros((len(points), POINTS, 3), np.float32)
-        rgb, box = np.zeros_like(xyz), np.zeros((len(points), 3), np.float32)
-        for row, count in enumerate(counts.tolist()):
-            if count:  # padding follows the points
-                sample = random_indices(count, POINTS, np.random.default_rng(SAMPLING_SEED))
-                xyz[row], rgb[row] = points[row, sample], colors[row, sample] * 255
-                box[row] = points[row, :count].max(axis=0)
+        clouds = inputs.normal.unpack()
+        xyz = np.zeros((len(clouds), POINTS, 3), np.float32)
+        rgb, box = np.zeros_like(xyz), np.zeros((len(clouds), 3), np.float32)
+        for row, (points, colors) in enumerate(clouds):
+            if len(points):
+                sample = random_indices(len(points), POINTS, np.random.default_rng(0))
+                xyz[row], rgb[row], box[row] = points[sample], colors[sample] * 255, points.max(axis=0)
         return np.asarray(predict((xyz, rgb, box)))
 
     return probabilities

@@ -3,6 +3,7 @@
 The modules have the names of torchvision and timm.
 """
 
+import itertools
 from typing import Any
 
 import jax
@@ -69,12 +70,10 @@ class ResNet18(nnx.Module):
         self.channels = tuple(width * factor for factor in STAGES)
         self.conv1 = convolution(3, width, 7, 2, rngs)
         self.bn1 = batch_norm(width, rngs)
-        inputs = width
-        for number, outputs in enumerate(self.channels, 1):
+        for number, (inputs, outputs) in enumerate(itertools.pairwise((width, *self.channels)), 1):
             stride = 1 if number == 1 else 2
             blocks = [BasicBlock(inputs, outputs, stride, rngs=rngs), BasicBlock(outputs, outputs, 1, rngs=rngs)]
             setattr(self, f"layer{number}", nnx.List(blocks))
-            inputs = outputs
 
     def __call__(self, x: jax.Array) -> list[jax.Array]:
         """Return the features of the four stages for images [B, S, S, 3]: S/4 to S/32 pixels."""

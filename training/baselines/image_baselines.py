@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import model_arrays, model_from_arrays
-from training.baselines.architectures import ARCHITECTURES, TEMPLATES, load_weights, network_inputs
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, network_inputs
 from training.baselines.baseline import (
     FitTask,
     NetworkFit,
@@ -72,11 +72,6 @@ WARM_UP = 0.05
 OPTIMIZER = partial(optax.adamw, weight_decay=0.05)
 
 
-def _rows_of(crops: ViewCrops, rows: Any) -> ViewCrops:
-    """Return the crops of some rows."""
-    return ViewCrops(crops.color[rows], crops.normals[rows])
-
-
 def _read_samples(task: FitTask, size: int) -> tuple[ViewCrops, NDArray[np.int32], NDArray[np.int32]]:
     """Return the crops, class indices and view numbers of all views; a crop needs 6 bytes per pixel of memory.
 
@@ -111,7 +106,7 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
     """
     architecture = ARCHITECTURES[task.name]
     model: Any = architecture.build(len(task.source.classes), task.options.seed)
-    weights = {} if task.weights is None else load_weights(task.weights, architecture.backbones(model))
+    weights = {} if task.weights is None else architecture.load_weights(model, task.weights)
     samples, label, view = _read_samples(task, architecture.size)
     held_out = task.held_out(label, view)
     directory, rate = ("pretrained", PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
@@ -119,16 +114,17 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
 
     def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
         """Return copies of colour and normals, mirrored at random along x, with the x of the normals."""
-        crops, flip = _rows_of(samples, rows), rng.random(len(rows)) < 0.5  # fancy indices copy
-        crops.color[flip] = crops.color[flip, :, ::-1]
-        crops.normals[flip] = crops.normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
-        return crops.color, crops.normals
+        color, normals, flip = samples.color[rows], samples.normals[rows], rng.random(len(rows)) < 0.5
+        color[flip] = color[flip, :, ::-1]
+        normals[flip] = normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
+        return color, normals
 
     model.train()
     fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, OPTIMIZER, partial(_learning_rate, rate))
     fitted = fit_network(task, fit, model, label, np.flatnonzero(~held_out), n_views)
     predict = _crop_function(fitted)
-    temperature = task.temperature(label, held_out, lambda: predict(_rows_of(samples, held_out)))
+    held = ViewCrops(samples.color[held_out], samples.normals[held_out])
+    temperature = task.temperature(label, held_out, lambda: predict(held))
     return StoredBaseline(model_arrays(fitted), temperature, weights)
 
 
@@ -196,7 +192,7 @@ def _backbone(task: FitTask) -> tuple[int, nnx.Module, Mapping[str, str]]:
     if task.weights is not None:
         architecture = ARCHITECTURES[TEMPLATES]
         network = architecture.build(1, 0)
-        return 0, network.color, load_weights(task.weights, architecture.backbones(network))
+        return 0, network.color, architecture.load_weights(network, task.weights)
     for number, name in enumerate(TRAINED, 1):
         file = baseline_file(task.directory, name)
         if file.is_file():

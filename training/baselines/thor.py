@@ -14,11 +14,11 @@ relations that each object of its dataset can have.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
@@ -35,16 +35,13 @@ from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import sample_views
 from training.rendering.camera import view_angles
 
-__all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "library_arrays", "load_thor", "predictor", "view_types"]
+__all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "load_thor", "view_types"]
 
 ViewType = Literal["front", "side", "top"]
 VIEW_TYPES: tuple[ViewType, ...] = ("front", "side", "top")
 
 AREA_TOLERANCE = 0.2
 """Two areas count as equal if they differ by at most this fraction of the larger one."""
-
-Library = Mapping[tuple[ViewType, int], MLP]
-"""Classifier of each view type and number of slices."""
 
 
 def _equal(a: float, b: float) -> bool:
@@ -104,24 +101,15 @@ def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
 def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Build the library from its weights, named `<type>-<slices>/<path>`.
 
+    The class probabilities of a cloud are from the most confident classifier that the rules select for it.
+
     Raises:
         ValueError: an array is missing or has another shape.
     """
-    config, library = run.config, {}
-    for name in VIEW_TYPES:
-        for k in range(1, config.n_slices + 1):
-            create = partial(_create_mlp, k * config.image_size**2, len(run.classes))
-            library[name, k] = model_from_arrays(create, arrays, f"{name}-{k}/")
-    return predictor(library, config)
-
-
-def predictor(library: Library, config: DescriptorConfig) -> Predictor:
-    """Return a predictor from a library with a classifier for every view type and number of slices.
-
-    The class probabilities of a cloud are from the most confident classifier that the rules select for it.
-    """
-    predict = {key: compiled_network(model, as_given) for key, model in library.items()}
-    size = config.image_size**2
+    config, size, predict = run.config, run.config.image_size**2, {}
+    for name, k in itertools.product(VIEW_TYPES, range(1, config.n_slices + 1)):
+        create = partial(_create_mlp, k * size, len(run.classes))
+        predict[name, k] = compiled_network(model_from_arrays(create, arrays, f"{name}-{k}/"), as_given)
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
         normal = inputs.normal
@@ -129,24 +117,12 @@ def predictor(library: Library, config: DescriptorConfig) -> Predictor:
         types = [view_types(*areas) for areas in _face_areas(normal).tolist()]
         selected = [[(name, k) for name in names] for names, k in zip(types, slices, strict=True)]
         values = {
-            key: np.asarray(predict[key]((jnp.asarray(inputs.tops[:, : key[1] * size]),)))
-            for key in sorted({key for keys in selected for key in keys})
+            (name, k): np.asarray(predict[name, k]((inputs.tops[:, : k * size],)))
+            for name, k in set(itertools.chain(*selected))
         }
-        rows = [
-            max((values[key][row] for key in keys), key=lambda row_values: float(row_values.max()))
-            for row, keys in enumerate(selected)
-        ]
-        return np.stack(rows).astype(np.float32)
+        return np.stack([max((values[key][row] for key in keys), key=np.max) for row, keys in enumerate(selected)])
 
     return probabilities
-
-
-def library_arrays(library: Library) -> dict[str, NDArray[Any]]:
-    """Return the weights of a library in the format that `load_thor` reads."""
-    arrays: dict[str, NDArray[Any]] = {}
-    for (name, k), model in library.items():
-        arrays |= model_arrays(model, f"{name}-{k}/")
-    return arrays
 
 
 def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:
@@ -171,7 +147,7 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     samples, _ = sample_views(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
     best = np.zeros((len(samples), len(task.run.classes)), np.float32)
-    library: dict[tuple[ViewType, int], MLP] = {}
+    arrays: dict[str, NDArray[Any]] = {}
 
     def fit_classifier(name: ViewType, rows: NDArray[np.intp], k: int) -> MLP:
         """Fit the classifier of one view type, whose samples have these rows, on the first `k` slices."""
@@ -189,11 +165,12 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
         for k in range(1, config.n_slices + 1):
-            library[name, k] = fit_classifier(name, rows, k)
+            model = fit_classifier(name, rows, k)
+            arrays |= model_arrays(model, f"{name}-{k}/")
         # Held-out views are not occluded, so they are classified by all slices, as in `THOR`.
         context, held_rows = FitContext("tops", task.run.network, config), rows[held_out[rows]]
-        values = sample_probabilities(library[name, config.n_slices], samples, held_rows, context)
+        values = sample_probabilities(model, samples, held_rows, context)
         better = values.max(axis=1) > best[held_rows].max(axis=1)
         best[held_rows[better]] = values[better]
     temperature = task.temperature(samples.label, held_out, lambda: best[held_out])
-    return StoredBaseline(library_arrays(library), temperature)
+    return StoredBaseline(arrays, temperature)

@@ -33,7 +33,6 @@ __all__ = [
     "Predictions",
     "RULES",
     "Rule",
-    "WHOLE",
     "fuse_by",
     "fusions",
     "main_fusion",
@@ -217,20 +216,19 @@ class Predictions(NamedTuple):
 
 
 def fuse_by(
-    rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float] | None = None
+    rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float]
 ) -> Predictions:
     """Return the predicted classes and their fused probabilities.
 
     Args:
         rule: fusion rule.
         probabilities: [B, C] class probabilities of each classifier.
-        temperatures: temperature of each classifier; needed for "calibrated".
+        temperatures: temperature of each classifier; read for "calibrated" only.
     """
     if set(probabilities) <= set(WHOLE):
         (values,) = probabilities.values()  # scores, which need not sum to 1
         return Predictions(values.argmax(axis=1), values.max(axis=1))
     if rule == "calibrated":
-        assert temperatures is not None
         probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
         rule = "max"
     fused = fused_probabilities(probabilities, rule)

@@ -32,7 +32,7 @@ from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import Progress, locked
 from training.storage.workers import WorkerPool
 
-__all__ = ["Answering", "answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
+__all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
 
 Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None, None]]
 """Function that yields the frames with these numbers and their answers, such as `answer_frames_in_pool`."""
@@ -228,11 +228,8 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
     return answers
 
 
-def _position(frame: RGBDFrame, label: int) -> tuple[float, float, float] | None:
+def _position(frame: RGBDFrame, label: int) -> list[float] | None:
     """Return the median x, y and z of an instance's points, rounded to 0.1 mm; None if no pixel has depth."""
     points = frame.points(frame.instance_pixels.get(label, np.zeros(0, np.intp)))
     points = points[points[:, 2] > 0]
-    if not len(points):
-        return None
-    x, y, z = np.median(points, axis=0).round(4).tolist()
-    return x, y, z
+    return list(np.median(points, axis=0).round(4).tolist()) if len(points) else None

@@ -90,16 +90,16 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
         table: an entry of `report["published_tables"]`.
         main: title of the column whose answers the recognizer gives.
     """
-    methods = list(dict.fromkeys(method for cell in table["cells"] for method in cell["published"]))
+    methods = dict.fromkeys(method for cell in table["cells"] for method in cell["published"])
     columns: list[tuple[str, str]] = [] if main in table["ours"].values() else [("accuracy", main)]
     for method in methods:
         if method in table["ours"]:
             columns.append(("accuracy", table["ours"][method]))
         columns.append(("published", method))
     header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
-    values = [[cell[key].get(name, NO_VALUE) for key, name in columns] for cell in table["cells"]]
     # The values are in percent with two decimals, as in the publications.
-    return header, [_row(cell, each, 100.0, 2) for cell, each in zip(table["cells"], values, strict=True)]
+    rows = [_row(cell, [cell[key].get(name, NO_VALUE) for key, name in columns], 100.0, 2) for cell in table["cells"]]
+    return header, rows
 
 
 def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> None:
@@ -289,15 +289,14 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     if curve is None and not shares["threshold"]["runs"]:
         return []
     n_known = report["instances"]["scored"]
-    rows = [
-        [f"known, recognized correctly ({n_known:,} instances)", "accuracy", "accuracy_at_threshold"],
-        ["known, recognized incorrectly", "incorrect", "incorrect_at_threshold"],
+    values = {name: _mean_std(statistics) for name, statistics in shares.items()}
+    table = [
+        [f"known, recognized correctly ({n_known:,} instances)", values["accuracy"], values["accuracy_at_threshold"]],
+        ["known, recognized incorrectly", values["incorrect"], values["incorrect_at_threshold"]],
     ]
-    table = [[name, *(_mean_std(shares[key]) for key in keys)] for name, *keys in rows]
     if n_unknown:
-        named = _mean_std(shares["unknown_named_at_threshold"])
-        table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", named])
-    header = ["objects", "without rejection", f"threshold {_mean_std(shares['threshold'])}"]
+        table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", values["unknown_named_at_threshold"]])
+    header = ["objects", "without rejection", f"threshold {values['threshold']}"]
     text = f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected "
     text += "as unknown. "
     if shares["threshold"]["runs"]:

@@ -99,7 +99,7 @@ class Run:
             inputs: inputs of the baselines; None if no run has any.
         """
         model = self.model
-        clouds = described.packed if GALLERY in self.predictors and described.usable else None
+        clouds = described.packed if GALLERY in self.predictors else None
         inference = jax.tree.map(np.asarray, infer(model, described.oriented, clouds, tuple(model.classifiers)))
         default = {name: inference.probabilities[name] for name in model.chosen_classifiers()}
         values = dict(inference.probabilities)
@@ -111,8 +111,6 @@ class Run:
         values = {name: model.gallery.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
             scores = object_scores(model, inference)
-            if scores is None:  # no instance is usable
-                scores = np.zeros((len(inference.overflow), len(model.gallery.names)), np.float32)
             values[GALLERY] = model.combined({}, scores)
         if BOTH in self.predictors:
             values[BOTH] = model.combined(default, scores)

@@ -5,6 +5,7 @@ answers are not independent. Therefore, accuracy is also averaged over placement
 show how steady a recognizer is.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -197,35 +198,32 @@ def find_placements(frames: Sequence[FrameAnswers]) -> list[NDArray[np.intp]]:
         The numbers of the placements, counted from 0 over all frames.
     """
     numbers: list[NDArray[np.intp]] = []
-    count = 0
+    new = itertools.count()
     for index, frame in enumerate(frames):
-        before = frames[index - 1] if index else None
-        own = np.full(len(frame.instances), -1, np.intp)
-        if before is not None and sequence_of(before.frame) == sequence_of(frame.frame):
-            pairs = _unmoved(before.instances, frame.instances)
-            if pairs and len(pairs) >= MIN_UNMOVED * max(len(before.instances), len(frame.instances)):
-                for previous, current in pairs:
-                    own[current] = numbers[-1][previous]
-        new = own < 0
-        own[new] = count + np.arange(new.sum())
-        count += int(new.sum())
-        numbers.append(own)
+        unmoved = {}
+        if index and sequence_of(frames[index - 1].frame) == sequence_of(frame.frame):
+            unmoved = _unmoved(frames[index - 1].instances, frame.instances)
+        own = [numbers[-1][unmoved[k]] if k in unmoved else next(new) for k in range(len(frame.instances))]
+        numbers.append(np.array(own, np.intp))
     return numbers
 
 
-def _unmoved(before: Sequence[InstancePrediction], now: Sequence[InstancePrediction]) -> list[tuple[int, int]]:
-    """Return index pairs of instances with the same name that are at most `MAX_MOVE` apart, the nearest pairs first."""
+def _unmoved(before: Sequence[InstancePrediction], now: Sequence[InstancePrediction]) -> dict[int, int]:
+    """Return the indices of unmoved instances: now -> before; empty if the objects count as rearranged.
+
+    The instances have the same name and are at most `MAX_MOVE` apart; the nearest pairs have precedence.
+    """
     distances = [
         (float(np.linalg.norm(np.subtract(a.position, b.position))), i, j)
         for i, a in enumerate(before)
         for j, b in enumerate(now)
         if a.truth == b.truth and a.position is not None and b.position is not None
     ]
-    pairs: list[tuple[int, int]] = []
+    unmoved: dict[int, int] = {}
     for distance, i, j in sorted(distances):
-        if distance <= MAX_MOVE and all(i != a and j != b for a, b in pairs):
-            pairs.append((i, j))
-    return pairs
+        if distance <= MAX_MOVE and j not in unmoved and i not in unmoved.values():
+            unmoved[j] = i
+    return unmoved if len(unmoved) >= MIN_UNMOVED * max(len(before), len(now)) else {}
 
 
 def placement_accuracy(placement: NDArray[np.intp], correct: Flags) -> float:
@@ -249,9 +247,8 @@ def steadiness(placement: NDArray[np.intp], answer: NDArray[np.intp]) -> float:
     Returns:
         The fraction; NaN if no placement has two instances.
     """
-    numbers = np.unique(placement, return_inverse=True)[1]
-    sizes = np.bincount(numbers)
-    pairs, counts = np.unique(np.stack([numbers, answer]), axis=1, return_counts=True)
+    sizes = np.bincount(placement)
+    pairs, counts = np.unique(np.stack([placement, answer]), axis=1, return_counts=True)
     agreeing = np.zeros_like(sizes)
     np.maximum.at(agreeing, pairs[0], counts)
     several = sizes > 1

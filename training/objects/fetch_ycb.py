@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import httpx
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.files import check_output_directory, temporary_directory
+from thor2_jax.files import atomic_directory, check_output_directory
 from training.objects.meshes import load_mesh
 from training.storage.jobs import Progress, locked
 
@@ -65,7 +65,6 @@ def fetch_ycb(
     directory = Path(directory)
     if not directory.is_dir():
         check_output_directory(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
     with locked(directory):
         for name in objects:
@@ -128,9 +127,7 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
     """
     total = 0
     try:
-        with temporary_directory(directory) as temporary:
-            folder = temporary / name
-            folder.mkdir()
+        with atomic_directory(directory / name) as folder:
             with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
                 for member in content:
                     path = PurePosixPath(member.name)
@@ -146,12 +143,10 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
                 while stream.read(CHUNK_BYTES):
                     pass
             load_mesh(folder / MESH_FILE)
-            folder.chmod(0o755)
-            folder.rename(directory / name)
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None
     except InputError as error:
-        reason = str(error).replace(f"{temporary}/", "")
+        reason = str(error).replace(f"{folder.parent}/", "")
         raise InputError(
             f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
         ) from None

@@ -148,9 +148,8 @@ def _ring_surface(points: Array, v: Array, texture: NDArray[np.uint8]) -> Textur
     first, second, third = np.moveaxis(vertices[faces], 1, 0)
     faces = faces[np.linalg.norm(np.cross(second - first, third - first), axis=1) > 1e-12]
     u, v = np.meshgrid(np.linspace(0, 1, n), v)
-    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
     # Coordinates are clipped, so that the last texel does not wrap around to the first.
-    uv = uv.clip(1e-4, 1 - 1e-4)
+    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32).clip(1e-4, 1 - 1e-4)
     return TexturedMesh(vertices, faces.astype(np.int32), uv[faces], (texture,), np.zeros(len(faces), np.int32))
 
 

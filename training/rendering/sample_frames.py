@@ -24,7 +24,6 @@ SAMPLES = (
 )
 """Directory, title, seed and number of objects of each sample; selected by eye."""
 
-LIGHT_CHANGE = 0.2
 NOISE = 0.5
 """Factor of the depth noise. Noise dominates the file size; with this factor, four samples have less than 400 kB."""
 
@@ -45,7 +44,7 @@ def write_sample_frames(directory: str | Path) -> None:
     index = []
     for name, title, seed, n_objects in SAMPLES:
         rng = np.random.default_rng(seed)
-        scene = compose_scene(objects, rng, n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE)
+        scene = compose_scene(objects, rng, n_objects=n_objects, noise=NOISE, light=0.2)
         _write(_crop(scene.frame), directory / name)
         index.append({"folder": name, "title": title, "objects": sorted(set(scene.truth.values()))})
     (directory / "index.json").write_text(json.dumps(index, indent=1) + "\n")

@@ -21,7 +21,6 @@ from training.rendering.scenes import compose_views
 __all__ = ["write_sample_recording"]
 
 CAMERA = Camera.from_field_of_view(320, 240, 57)
-SEED, N_OBJECTS, NOISE = 8, 4, 0.03
 FRAMES, HERTZ, ARC = 16, 8, 0.1
 """Number of frames, frame rate, and angle in radians by which the camera moves around the table."""
 
@@ -44,8 +43,8 @@ def write_sample_recording(path: str | Path) -> None:
     topics = {COLOR: COMPRESSED_IMAGE, DEPTH: COMPRESSED_IMAGE, INFO: "sensor_msgs/msg/CameraInfo"}
     with MessageBag(Path(path), topics) as bag:
         views = compose_views(
-            builtin_objects(), np.random.default_rng(SEED), N_OBJECTS, FRAMES, CAMERA, ARC,
-            clutter=0.0, noise=NOISE, light=0.0, level=True,
+            builtin_objects(), np.random.default_rng(8), 4, FRAMES, CAMERA, ARC,
+            clutter=0.0, noise=0.03, light=0.0, level=True,
         )  # fmt: skip
         for number, (scene, _) in enumerate(views):
             stamp = START + number * 10**9 // HERTZ

@@ -62,15 +62,11 @@ def test_predictions_match_scikit_learn(depth: int | None) -> None:
     )
 
 
-def test_single_leaf_trees_and_missing_arrays() -> None:
+def test_trees_of_a_single_leaf() -> None:
     grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
-    nodes = module.tree_arrays(grown)
     run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
-    inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32), None)
-    probabilities = load_forest(nodes, run)(inputs)
+    probabilities = load_forest(module.tree_arrays(grown), run)(BaselineInputs(normal((60, 0)), None, None))
     np.testing.assert_allclose(probabilities, grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
-    with pytest.raises(KeyError, match="root"):
-        load_forest({name: nodes[name] for name in nodes if name != "root"}, run)
 
 
 ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))
@@ -80,9 +76,8 @@ def pointnet(classes: int = 5) -> Predictor:
     return load_pointnet(ARRAYS, SimpleNamespace(classes=("",) * classes))  # type: ignore[arg-type]
 
 
-def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
-    clouds = thor2.PointClouds.pack(random_clouds(seed, sizes))
-    return BaselineInputs(clouds, np.zeros((len(sizes), 1), np.float32), None)
+def inputs(sizes: tuple[int, ...]) -> BaselineInputs:
+    return BaselineInputs(thor2.PointClouds.pack(random_clouds(0, sizes)), None, None)
 
 
 def test_probabilities_match_numpy() -> None:
@@ -110,5 +105,5 @@ def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     for row, size in enumerate(sizes):
         cloud = np.asarray(both.normal.points)[row, :size], np.asarray(both.normal.colors)[row, :size]
-        one = BaselineInputs(thor2.PointClouds.pack([cloud]), both.tops[:1], None)
+        one = BaselineInputs(thor2.PointClouds.pack([cloud]), None, None)
         np.testing.assert_allclose(pointnet()(one)[0], probabilities[row], atol=1e-6)

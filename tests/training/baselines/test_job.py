@@ -1,6 +1,5 @@
 """Training, storing and loading the baselines of a run directory."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from commands import Command
 from refusals import assert_refused
-from safetensors.numpy import load, save
 from small_clouds import random_clouds
 from small_runs import untrained_run
 
@@ -19,7 +17,13 @@ from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import cloud_baselines, job
-from training.baselines.baseline import baseline_inputs
+from training.baselines.baseline import (
+    StoredBaseline,
+    baseline_file,
+    baseline_inputs,
+    read_baseline,
+    write_baseline,
+)
 from training.baselines.cloud_baselines import load_forest
 from training.baselines.job import CLOUD_BASELINES, check_baselines, load_baselines, train_baselines
 from training.evaluation.runs import load_runs
@@ -111,13 +115,14 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: C
     assert not (tmp_path / "run").exists()
 
 
-def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    (folder / "baselines").mkdir()
-    file = folder / "baselines" / "forest.safetensors"
-    content = (trained / "baselines" / "forest.safetensors").read_bytes()
-    about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
-    lacking, others = (save(tensors, {"about": json.dumps(about)}) for tensors in ({}, load(content)))
-    for damaged in (content[:-9], content[:-1] + bytes([content[-1] ^ 1]), lacking, others):
-        file.write_bytes(damaged)
-        assert_refused("forest.safetensors", load_baselines, folder, load_run(folder))
+def test_damaged_and_foreign_files_are_refused(trained: Path, tmp_path: Path) -> None:
+    folder, whole = write_run(tmp_path / "run"), baseline_file(trained, "forest")
+    file, content, stored = baseline_file(folder, "forest"), whole.read_bytes(), read_baseline(whole, NAMES)
+    for write, message in (
+        (lambda: write_baseline(file, stored, ("a", "b"), 1.0), "has other classes"),
+        (lambda: write_baseline(file, StoredBaseline({}, None), NAMES, 1.0), "does not match its run"),
+        (lambda: file.write_bytes(content[:-9]), "cannot be read"),
+        (lambda: file.write_bytes(content[:-1] + bytes([content[-1] ^ 1])), "cannot be read"),
+    ):
+        write()
+        assert_refused(f"forest.safetensors {message}", load_baselines, folder, load_run(folder))

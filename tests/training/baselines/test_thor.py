@@ -1,6 +1,5 @@
 """THOR: the rules that select classifiers, and the predictions of the library."""
 
-import functools
 import itertools
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -12,9 +11,9 @@ from flax import nnx
 from small_runs import random_classifier
 
 import thor2_jax as thor2
-from thor2_jax.networks import MLP
+from thor2_jax.networks import model_arrays
 from training.baselines.baseline import BaselineInputs
-from training.baselines.thor import VIEW_TYPES, camera_types, library_arrays, load_thor, predictor, view_types
+from training.baselines.thor import VIEW_TYPES, camera_types, load_thor, view_types
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -42,12 +41,6 @@ def test_view_types_by_face_areas() -> None:
         assert {view_types(*each) for each in areas} == {types}
 
 
-@functools.cache
-def library() -> dict[Any, MLP]:
-    pairs = enumerate(itertools.product(VIEW_TYPES, (1, 2, 3)))
-    return {(name, k): random_classifier(16 * k, 4, seed) for seed, (name, k) in pairs}
-
-
 def box(size: Sequence[float], camera: Sequence[float], edge: float | None = None) -> tuple[Any, Any, Any]:
     """Return points of a normalized box, its camera and its occlusion boundary, which lies at x = edge."""
     xyz = np.array(list(itertools.product(*(np.linspace(0, side, 9) for side in size))), np.float32)
@@ -63,15 +56,19 @@ def test_most_confident_selected_classifier_decides() -> None:
         box(size, (0.1, 0.05, -3.0), edge=size[0]),  # the far end is occluded: two slices
         box(size, (0.1, 0.05, -3.0), edge=0.0),  # the near end is occluded
         box((0.1, 0.1, 0.1), (0.0, -2.0, 0.0)),  # all equal: front
+        (np.zeros((0, 3), np.float32), (0.0, 0.0, 0.0), None),  # no points
     )
     points, cameras, boundaries = zip(*boxes, strict=True)
     clouds = [(xyz, np.zeros_like(xyz)) for xyz in points]
     normal = thor2.PointClouds.pack(clouds, camera=np.array(cameras), boundary=boundaries)
-    inputs = BaselineInputs(normal, np.random.default_rng(0).random((5, 48)).astype(np.float32), None)
-    models = library()
+    inputs = BaselineInputs(normal, np.random.default_rng(0).random((6, 48)).astype(np.float32), None)
+    pairs = enumerate(itertools.product(VIEW_TYPES, (1, 2, 3)))
+    models = {(name, k): random_classifier(16 * k, 4, seed) for seed, (name, k) in pairs}
+    arrays = {path: a for (name, k), each in models.items() for path, a in model_arrays(each, f"{name}-{k}/").items()}
     selected = [("front side", 3), ("side top", 3), ("front side", 2), ("front side", 3), ("front", 3)]
-    arrays, run = library_arrays(models), SimpleNamespace(config=CONFIG, classes=("",) * 4)
+    run = SimpleNamespace(config=CONFIG, classes=("",) * 4)
     probabilities = load_thor(arrays, run)(inputs)
+    assert probabilities.shape == (6, 4) and np.isfinite(probabilities).all()
     apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (names, k) in enumerate(selected):
         tops = inputs.tops[row : row + 1, : 16 * k]
@@ -80,10 +77,3 @@ def test_most_confident_selected_classifier_decides() -> None:
     del arrays["side-2/head/bias"]
     with pytest.raises(ValueError, match="head/bias"):
         load_thor(arrays, run)
-
-
-def test_empty_clouds_give_finite_probabilities() -> None:
-    empty = np.zeros((0, 3), np.float32)
-    normal = thor2.PointClouds.pack([(empty, empty)])
-    probabilities = predictor(library(), CONFIG)(BaselineInputs(normal, np.zeros((1, 48), np.float32), None))
-    assert probabilities.shape == (1, 4) and np.isfinite(probabilities).all()

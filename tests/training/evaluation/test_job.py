@@ -325,4 +325,4 @@ def test_position_is_the_median_of_the_points() -> None:
     frame = thor2.RGBDFrame(np.zeros((3, 5, 3), np.uint8), depth, labels, thor2.Intrinsics(10.0, 10.0, 0.0, 0.0))
     truth = dict.fromkeys((1, 2, 3), "mug")
     ((_, answers),) = answer_frames([Run("run", "", NamesInOrder())], [LabelledFrame("f", frame, truth, {})])
-    assert [instance.position for instance in answers.instances] == [(0.4, 0.2, 2.0), None, None]
+    assert [instance.position for instance in answers.instances] == [[0.4, 0.2, 2.0], None, None]

@@ -69,7 +69,7 @@ def test_the_page_says_which_column_gives_the_names(feature: str, names: str) ->
 
 def test_fusion_rules_match_hand_calculation() -> None:
     """Scores of the gallery are not normalized. A temperature of 4 turns 0.9 into 0.634, which is less than 0.8."""
-    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])})
+    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])}, {})
     assert list(index) == [0, 1] and list(confidence) == [0.2, 0.7]
     both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
     roots = np.sqrt([0.9 * 0.2, 0.1 * 0.8])

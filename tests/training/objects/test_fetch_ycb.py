@@ -18,7 +18,7 @@ from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from training.objects.fetch_ycb import fetch_ycb
-from training.objects.meshes import find_meshes, load_mesh
+from training.objects.meshes import find_meshes
 
 NAME = "003_cracker_box"
 OBJ = b"mtllib textured.mtl\nusemtl m\nv 0 0 0\nv .1 0 0\nv 0 .1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
@@ -82,7 +82,6 @@ def test_mesh_is_where_training_finds_it(server: Any, tmp_path: Path) -> None:
     meshes = fetch_ycb([NAME], tmp_path, url=server.url, progress=lambda *values: seen.append(values))
     assert meshes == find_meshes(tmp_path) == {NAME: tmp_path / NAME / "textured.obj"}
     assert {path.name: path.read_bytes() for path in (tmp_path / NAME).iterdir()} == mesh_files("")
-    assert load_mesh(meshes[NAME]).textures[0].shape == (64, 64, 3)
     assert seen[-1][0] == NAME and seen[-1][1] == seen[-1][2] == len(archive(mesh_files())) // 1000
     fetch_ycb([NAME], tmp_path, url=server.url)
     assert server.requests == [None]

@@ -25,13 +25,18 @@ QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 QUAD_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 # Rows from the top: red, green / blue, white.
 CHECKERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
-PBR = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
+TEXTURE = {"baseColorTexture": Image.fromarray(CHECKERS)}
+PBR = PBRMaterial(**TEXTURE)
 SIMPLE = SimpleMaterial(image=Image.fromarray(CHECKERS))
 
 
 def textured_quad(material: PBRMaterial | SimpleMaterial, uv: np.ndarray = QUAD_UV) -> trimesh.Trimesh:
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False)
+
+
+def colored(vertices: np.ndarray, colors: Any = ((99, 99, 99),) * 4) -> trimesh.Trimesh:
+    return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
 
 
 def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
@@ -42,41 +47,34 @@ def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
 
 
 QUADRANTS = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
+FACTOR = np.array([128, 255, 51, 255], np.uint8)
+SCALED = np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).tolist()
+CORNERS = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
+BETWEEN = [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
+QUADS: dict[str, tuple[Any, str, Any]] = {
+    "texture of a GLB": (textured_quad(PBR), "glb", QUADRANTS),
+    "texture of an OBJ": (textured_quad(SIMPLE), "obj", QUADRANTS),
+    "factor": (textured_quad(PBRMaterial(baseColorFactor=FACTOR)), "glb", [[128, 255, 51]] * 4),
+    "texture and factor": (textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)), "glb", SCALED),
+    "vertices of a GLB": (colored(QUAD, CORNERS), "glb", BETWEEN),
+    "vertices of a PLY": (colored(QUAD, CORNERS), "ply", BETWEEN),
+}
 
 
-@pytest.mark.parametrize("suffix", ["glb", "obj"])
-def test_textures_are_upright(tmp_path: Path, suffix: str) -> None:
-    textured_quad(PBR if suffix == "glb" else SIMPLE).export(tmp_path / f"quad.{suffix}")
+@pytest.mark.parametrize("name", QUADS)
+def test_colours_are_those_of_the_file(tmp_path: Path, name: str) -> None:
+    quad, suffix, expected = QUADS[name]
+    quad.export(tmp_path / f"quad.{suffix}")
     mesh = load_mesh(tmp_path / f"quad.{suffix}")
-    assert len(mesh.faces) == 2 and mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
-    assert quadrant_colors(mesh) == QUADRANTS
+    assert mesh.faces.shape == (2, 3) and mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
+    assert quadrant_colors(mesh) == expected
     np.testing.assert_allclose(mesh.centre, [0.05, 0.05, 0])
 
 
-def test_base_colour_factor_with_and_without_a_texture(tmp_path: Path) -> None:
-    factor = np.array([128, 255, 51, 255], np.uint8)
-    both = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS), baseColorFactor=factor)
-    textured_quad(both).export(tmp_path / "both.glb")
-    expected = np.rint(np.array(QUADRANTS) * factor[:3] / 255).astype(int).tolist()
-    assert quadrant_colors(load_mesh(tmp_path / "both.glb")) == expected
-    textured_quad(PBRMaterial(baseColorFactor=factor)).export(tmp_path / "plain.glb")
-    assert quadrant_colors(load_mesh(tmp_path / "plain.glb")) == [[128, 255, 51]] * 4
-
-
-@pytest.mark.parametrize("suffix", ["glb", "ply"])
-def test_vertex_colours_are_interpolated(tmp_path: Path, suffix: str) -> None:
-    colors = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
-    trimesh.Trimesh(QUAD, QUAD_FACES, vertex_colors=colors, process=False).export(tmp_path / f"quad.{suffix}")
-    mesh = load_mesh(tmp_path / f"quad.{suffix}")
-    assert quadrant_colors(mesh) == [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
-
-
 def test_face_colours(tmp_path: Path) -> None:
-    lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {a}" for a in "xyz"), "element face 2"]
-    lines += ["property list uchar int vertex_indices", *(f"property uchar {c}" for c in ("red", "green", "blue"))]
-    lines += ["end_header", *(" ".join(map(str, p)) for p in QUAD), "3 0 1 2 10 20 30", "3 0 2 3 40 50 60"]
-    (tmp_path / "quad.ply").write_text("\n".join(lines) + "\n")
-    assert quadrant_colors(load_mesh(tmp_path / "quad.ply"))[1::2] == [[10, 20, 30], [40, 50, 60]]
+    colors = [[10, 20, 30], [40, 50, 60]]
+    trimesh.Trimesh(QUAD, QUAD_FACES, face_colors=colors, process=False).export(tmp_path / "quad.ply")
+    assert quadrant_colors(load_mesh(tmp_path / "quad.ply"))[1::2] == colors
 
 
 def test_parts_of_a_scene_are_placed_and_merged(tmp_path: Path) -> None:
@@ -112,11 +110,6 @@ def test_merging_and_moving() -> None:
     corner_uv = np.zeros((2, 3, 2), np.float32)
     textured = TexturedMesh(QUAD, QUAD_FACES.astype(np.int32), corner_uv, (CHECKERS,), np.zeros(2, np.int32))
     assert_refused("vertex colours", merge_meshes, [painted, textured])
-
-
-def colored(vertices: np.ndarray) -> trimesh.Trimesh:
-    colors = np.full((len(vertices), 3), 99, np.uint8)
-    return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
 
 
 ASCII_PLY = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
