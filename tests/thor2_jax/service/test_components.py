@@ -199,13 +199,13 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
     messages: list[str] = []
     explained: queue.Queue[tuple[int, bool]] = queue.Queue()
 
-    def compile_shape(*_: int) -> None:
+    def compile_shape(*_: object) -> None:
         with pytest.raises(RequestError) as error:
             service.check_ready()
         messages.append(error.value.message)
         jax.jit(lambda x: x * len(messages))(1.0)
 
-    monkeypatch.setattr(service.engine, "compile", compile_shape)
+    monkeypatch.setattr(service.engine, "infer", compile_shape)
     monkeypatch.setattr(pipeline, "compile_explanations", lambda _, *programs: explained.put(programs[:2]))
     with caplog.at_level("INFO"):
         service.start()
