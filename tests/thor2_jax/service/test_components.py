@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import jax
@@ -35,47 +35,25 @@ from thor2_jax.service.settings import Settings
 from .conftest import Files
 
 
-class Device:
-    """Double numbers; wait for permission before each batch."""
-
-    def __init__(self) -> None:
-        self.batches: list[list[int]] = []
-        self.permits, self.called = threading.Semaphore(0), threading.Event()
-
-    def __call__(self, numbers: list[int]) -> list[int]:
-        self.called.set()
-        self.permits.acquire()
-        self.batches.append(numbers)
-        if 13 in numbers:
-            raise ArithmeticError("thirteen")
-        return [2 * n for n in numbers]
+def double(numbers: list[int]) -> list[int]:
+    if 13 in numbers:
+        raise ArithmeticError("thirteen")
+    return [2 * n for n in numbers]
 
 
 def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
-    device = Device()
+    device, begin = Mock(side_effect=double), threading.Event()
     batcher = Batcher(device, max_batch=4)
-    first = batcher.submit([1])
-    assert device.called.wait(HANG)  # The device is now processing it.
-    others = [batcher.submit(numbers) for numbers in ([2, 3], [4], [5, 6, 7, 8, 9, 10])]
-    device.permits.release(10)
-    batcher.close()
-    assert [job.result(0) for job in (first, *others)] == [[2], [4, 6], [8], [10, 12, 14, 16, 18, 20]]
-    assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
-
-
-def test_cancelled_and_failing_jobs_are_isolated() -> None:
-    device = Device()
-    batcher = Batcher(device, max_batch=1)
-    first = batcher.submit([1])
-    assert device.called.wait(HANG)
-    cancelled, failing, last = (batcher.submit([number]) for number in (3, 13, 5))
+    batcher._device.submit(begin.wait)  # The device is busy while the jobs arrive.
+    jobs = [[2, 3], [4], [5, 6, 7, 8, 9, 10], [11], [12, 13, 14, 15], [16]]
+    *finished, cancelled, failing, last = [batcher.submit(numbers) for numbers in jobs]
     assert cancelled.cancel()
-    device.permits.release(10)
-    assert first.result(HANG) == [2] and last.result(HANG) == [10]
-    with pytest.raises(ArithmeticError):
-        failing.result(HANG)
-    assert device.batches == [[1], [13], [5]]
+    begin.set()
     batcher.close()
+    assert [job.result(0) for job in (*finished, last)] == [[4, 6], [8], [10, 12, 14, 16, 18, 20], [32]]
+    assert isinstance(failing.exception(0), ArithmeticError)
+    batches = [[2, 3, 4, 5], [6, 7, 8, 9], [10], [12, 13, 14, 15], [16]]
+    assert [call.args for call in device.mock_calls] == [(batch,) for batch in batches]
 
 
 FAR = time.monotonic() + HANG
@@ -113,14 +91,6 @@ def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch
     assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
 
 
-def failing(frame: thor2.RGBDFrame) -> np.ndarray:
-    raise RuntimeError("no weights\nin this folder")
-
-
-def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
-    raise SystemExit(3)
-
-
 def many(frame: thor2.RGBDFrame) -> np.ndarray:
     return np.arange(frame.depth.size).reshape(frame.depth.shape)
 
@@ -128,8 +98,8 @@ def many(frame: thor2.RGBDFrame) -> np.ndarray:
 @pytest.mark.parametrize(
     ("segmenter", "status", "words"),
     [
-        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
-        (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
+        (Mock(side_effect=RuntimeError("no\nweights")), 500, "segmenter Mock failed .*RuntimeError: no weights"),
+        (Mock(side_effect=SystemExit(3)), 500, "segmenter Mock failed .*SystemExit: 3"),
         (many, 422, "labels has 76799 instances"),
         (None, 422, "labels is missing"),
     ],
@@ -226,18 +196,15 @@ def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused = app.state.service.metrics.requests.labels("/v1/recognize", "429")._value
-    deadlines, timeout = dict[float, asyncio.Timeout](), asyncio.timeout
+    timeout = Mock(return_value=asyncio.Timeout(None))
 
     async def wait_for_refusals(*_: Any) -> Any:
         while refused.get() < 3:
             await asyncio.sleep(0.01)
         return NOTHING
 
-    def record(seconds: float) -> asyncio.Timeout:
-        return deadlines.setdefault(seconds, timeout(seconds))
-
     async def stuck(*_: Any) -> None:
-        deadlines[app.state.service.settings.deadline].reschedule(0)  # it passes now
+        timeout.return_value.reschedule(0)  # it passes now
         await asyncio.sleep(HANG)
 
     recognize.side_effect = wait_for_refusals
@@ -246,8 +213,9 @@ def test_full_queue_is_429_and_deadline_504(
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
     assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.
     recognize.side_effect = stuck
-    monkeypatch.setattr(asyncio, "timeout", record)
-    assert calls(app, frame_request(files))[0].status_code == 504 and len(deadlines) == 1
+    monkeypatch.setattr(asyncio, "timeout", timeout)
+    assert calls(app, frame_request(files))[0].status_code == 504
+    timeout.assert_called_once_with(HANG)
 
 
 @pytest.mark.parametrize(("adapt", "status"), [(False, 200), (True, 403)])

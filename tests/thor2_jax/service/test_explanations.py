@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from image_files import encode_image
-from page_actions import answered, assert_fits, upload, wait_until
+from page_actions import answered, assert_fits, wait_until
 from PIL import Image
 from playwright.sync_api import Route, expect
 from processes import HANG
@@ -210,9 +210,8 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
         page.locator(f'#objects button[data-label="{label}"]').click()
         page.get_by_role("button", name="Why?").click()
 
-    page = open_page(url=teaching_url)
+    page = open_page(url=teaching_url, files=files)
     page.route("**/v1/why", compile_first, times=2)
-    upload(page, files)
     ask_why(3)
     expect(page.locator("#why-status")).to_contain_text("still being compiled")
     expect(page.get_by_role("button", name="Why?")).to_be_disabled()

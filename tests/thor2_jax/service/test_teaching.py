@@ -1,7 +1,6 @@
 """Enrolling and forgetting objects over HTTP: changes, undo, several processes, and bad input."""
 
 import json
-import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from thor2_jax.gallery import store
 from thor2_jax.service import pipeline
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.pipeline import Service
 from thor2_jax.service.settings import Settings
 
 from .conftest import Files, assert_conforms
@@ -58,14 +58,10 @@ def recognized(http: httpx.Client, files: Files) -> list[str | None]:
     return [one["name"] for one in http.post("/v1/recognize", files=files).json()["instances"]]
 
 
-def compilations(http: httpx.Client) -> str:
-    return re.findall(r"^thor2_compilations_after_warm_up_total (.*)$", http.get("/metrics").text, re.M)[0]
-
-
-def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
+def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files, service: Service) -> None:
     before = http.post("/v1/recognize", files=files).json()["instances"]
     assert list(before[3]["top"]) == ["tops", "tops2"]
-    compiled = compilations(http)  # by other tests in this process
+    compiled = service.metrics.compilations._value.get()  # by other tests in this process
     answer = enroll(http, files, "tall")
     record = answer.json()
     assert (record["name"], record["trained"], record["views"], record["source"]) == ("tall", False, 1, "frames")
@@ -81,7 +77,7 @@ def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: File
     for name in ("wide", "tall"):
         assert http.delete(f"/v1/objects/{name}").status_code == 200
     assert http.post("/v1/recognize", files=files).json()["instances"] == before
-    assert compilations(http) == compiled
+    assert service.metrics.compilations._value.get() == compiled
 
 
 def test_extend_replace_and_undo(http: httpx.Client, files: Files) -> None:
