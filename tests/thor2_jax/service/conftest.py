@@ -15,22 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import hypothesis
 import pytest
-import schemathesis
 import uvicorn
 from fastapi import FastAPI
-from hypothesis import HealthCheck
 from image_files import encode_image, patches, tilted
 from page_actions import upload
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from processes import HANG, wait_until
-from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-)
 from segmentation_scenes import Box, render
 from small_runs import small_embedding, untrained_run
 
@@ -48,9 +39,6 @@ Open = Callable[..., Page]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
 """The classes of the run: the objects of the page's sample frames."""
-
-CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
-"""Checks that compare an answer with the OpenAPI document."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -201,18 +189,6 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
 def service(teaching_url: str, teaching_app: FastAPI) -> Service:
     """The service behind this URL, for tests that replace its attributes."""
     return teaching_app.state.service
-
-
-def assert_conforms(url: str, path: str, method: str, examples: int) -> None:
-    """Send generated requests for an operation and check the answers against the service's OpenAPI document."""
-    document, everything = schemathesis.openapi.from_url(f"{url}/openapi.json"), list(HealthCheck)
-
-    @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
-    @hypothesis.given(case=document[path][method].as_strategy())
-    def call(case: schemathesis.Case) -> None:
-        case.call_and_validate(checks=CHECKS, timeout=HANG)
-
-    call()
 
 
 @pytest.fixture

@@ -191,12 +191,6 @@ def test_why_returns_pictures(
         assert one["title"] and one["caption"].endswith(".")
 
 
-def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
-    damaged = files | {"depth": b"damaged"}
-    for sent, instance, field in ((files, 4, "instance"), (files, "x", "instance"), (damaged, 3, "depth")):
-        check_refused(ask(teaching_url, sent, instance), 422, field)
-
-
 def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_url: str, files: Files) -> None:
     requests: list[Route] = []
 
