@@ -22,7 +22,7 @@ from image_files import encode_image, patches, tilted
 from page_actions import upload
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from processes import HANG, wait_until
-from segmentation_scenes import Box, render
+from segmentation_scenes import APART, render
 from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
@@ -88,12 +88,7 @@ def files(frame: thor2.RGBDFrame) -> Files:
 @pytest.fixture(scope="session")
 def scene() -> thor2.RGBDFrame:
     """Three boxes apart on a table."""
-    boxes = [
-        Box(-0.2, 0.05, (0.04, 0.06), 0.12, (190, 30, 40)),
-        Box(0.0, -0.1, (0.05, 0.03), 0.06, (30, 60, 190)),
-        Box(0.2, 0.1, (0.03, 0.03), 0.15, (30, 150, 60)),
-    ]
-    return render(boxes)
+    return render(APART)
 
 
 @pytest.fixture(scope="session")
@@ -103,11 +98,10 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
 
 
 SERVE = """
-import sys, threading
+import threading
 from thor2_jax.service import engine, pipeline
 engine.POINT_BUCKETS = (engine.MIN_BATCH_POINTS,)  # the tests send no larger clouds
-if "--warm-why" in sys.argv:
-    pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
+pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
 from training.cli import main
 main()
 """
