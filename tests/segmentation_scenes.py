@@ -31,6 +31,14 @@ class Box:
     bottom: float = 0.0
 
 
+APART = [
+    Box(-0.2, 0.05, (0.04, 0.06), 0.12, (190, 30, 40)),
+    Box(0.0, -0.1, (0.05, 0.03), 0.06, (30, 60, 190)),
+    Box(0.2, 0.1, (0.03, 0.03), 0.15, (30, 150, 60)),
+]
+"""Three boxes apart from one another."""
+
+
 def camera_pose(tilt: float = 40.0, turn: float = 0.0, roll: float = 0.0) -> Rotation:
     """Return the rotation table <- camera of a camera that looks at the origin, `tilt` degrees from straight down."""
     down = Rotation.from_euler("x", 180, degrees=True)

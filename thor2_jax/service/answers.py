@@ -91,11 +91,9 @@ def explained_frame(
     remaining = iter(results)
     instances: list[schemas.ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
-        details = None
-        if instance.reason is None:
-            result = next(remaining)
-            if len(instances) < schemas.MAX_EXPLAINED:
-                details = _details(model, instance, result, recognition)
+        result = next(remaining) if instance.reason is None else None
+        is_shown = len(instances) < schemas.MAX_EXPLAINED
+        details = _details(model, instance, result, recognition) if result and is_shown else None
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 

@@ -313,5 +313,5 @@ async def _on_error(_: Request, error: Exception) -> Response:
 
 
 def _problem_response(error: RequestError, headers: dict[str, str] | None = None) -> JSONResponse:
-    problem = Problem(field=error.field, message=error.message, further=error.further)
+    problem = Problem.model_validate(error, from_attributes=True)
     return JSONResponse(problem.model_dump(exclude_defaults=True), error.status, headers)

@@ -23,7 +23,7 @@ from thor2_jax.files import read_npy
 from thor2_jax.frames.frames import ImageSizeError, RGBDFrame, decode_image
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.printable import check_name
-from thor2_jax.service.problem import FieldError, RequestError, field_errors
+from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import FORM, MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_POINTS, CloudsBody
 
 __all__ = ["check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds", "read_body", "read_form"]
@@ -141,9 +141,8 @@ def _parse_fields(parsers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         except RequestError as error:
             errors.append(error)
     if errors:
-        first, *others = errors
-        first.further = [FieldError(field=error.field, message=error.message) for error in others]
-        raise first
+        errors[0].further = errors[1:]
+        raise errors[0]
     return values
 
 

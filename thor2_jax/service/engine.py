@@ -193,17 +193,16 @@ class InferenceEngine:
         batches = [b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)]
         return [(b, n) for n in POINT_BUCKETS if n >= MIN_BATCH_POINTS for b in batches]
 
-    def compile(self, n_clouds: int, n_points: int) -> None:
-        """Compile the programs for one of `batch_shapes`."""
-        self.infer([], (n_clouds, n_points))
-
     def compile_adaptation(self) -> None:
         """Compile the programs of the adaptation, with `adapt`."""
         if self._online is not None:
             self._online.compile()
 
     def infer(self, instances: Sequence[PreparedInstance], shape: tuple[int, int] | None = None) -> list[CloudResult]:
-        """Describe and classify at most `max_batch` clouds, in one of `batch_shapes`: by default the smallest."""
+        """Describe and classify at most `max_batch` clouds, in one of `batch_shapes`: by default the smallest.
+
+        Without clouds, the programs for this shape are compiled.
+        """
         n_points = batch_points(len(instance.points) for instance in instances)
         clouds = pack_instances(instances, *(shape or (_padded_batch(len(instances)), n_points)))
         network, config = self.run.network, self.run.config

@@ -113,12 +113,12 @@ class Service:
     def _warm_up(self) -> None:
         start, shapes = time.monotonic(), self.engine.batch_shapes
         try:
-            for k, (n_clouds, n_points) in enumerate(shapes, 1):
+            for k, shape in enumerate(shapes, 1):
                 if self.state != "starting":
                     return
                 self.progress = f"compiling {k} of {len(shapes)}"
-                log.info("%s: %d clouds of %d points", self.progress, n_clouds, n_points)
-                self.engine.compile(n_clouds, n_points)
+                log.info("%s: %d clouds of %d points", self.progress, *shape)
+                self.engine.infer([], shape)
             self.engine.compile_adaptation()
         except Exception:
             log.exception("warm-up failed")

@@ -57,7 +57,7 @@ class RequestError(Exception):
         self.status, self.field, self.retry_after = status, field, retry_after
         text = _DESCRIPTIONS[status] if message is None else escape_characters(message)
         self.message = text[:-1] if text.endswith("....") else text  # the list of a message may end in three dots
-        self.further: list[FieldError] = []
+        self.further: list[RequestError] = []
 
 
 @contextlib.contextmanager

@@ -6,20 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from segmentation_scenes import CAMERA, TABLE_TOP, Box, best_overlaps, camera_pose, cast, render, surface
+from segmentation_scenes import APART, CAMERA, TABLE_TOP, Box, best_overlaps, camera_pose, cast, render, surface
 from slow_tier import slow
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.table import _refined, _trimmed, segment_table
 
-RED, BLUE, GREEN, YELLOW = (190, 30, 40), (30, 60, 190), (30, 150, 60), (220, 200, 40)
-APART = [
-    Box(-0.2, 0.05, (0.04, 0.06), 0.12, RED),
-    Box(0.0, -0.1, (0.05, 0.03), 0.06, BLUE),
-    Box(0.2, 0.1, (0.03, 0.03), 0.15, GREEN),
-]
-
-
+RED, BLUE, YELLOW = (190, 30, 40), (30, 60, 190), (220, 200, 40)
 TOUCHING = [Box(0.0, 0.12, (0.08, 0.03), 0.2, RED), Box(0.01, -0.06, (0.05, 0.03), 0.1, (180, 40, 40))]
 STACKED = [Box(0.0, 0.0, (0.09, 0.09), 0.05, YELLOW), Box(0.0, 0.04, (0.05, 0.04), 0.12, BLUE, bottom=0.05)]
 STRIPS = [Box(-0.15, 0.0, (0.08, 0.008), 0, BLUE), Box(0.1, 0.1, (0.008, 0.07), 0, (20, 20, 20))]

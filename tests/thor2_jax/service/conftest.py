@@ -10,28 +10,19 @@ import ssl
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import httpx
-import hypothesis
 import pytest
-import schemathesis
 import uvicorn
 from fastapi import FastAPI
-from hypothesis import HealthCheck
 from image_files import encode_image, patches, tilted
-from playwright.sync_api import Browser, Page, Route, expect
+from page_actions import upload
+from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from processes import HANG, wait_until
-from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-)
-from segmentation_scenes import Box, render
+from segmentation_scenes import APART, render
 from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
@@ -48,9 +39,6 @@ Open = Callable[..., Page]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
 """The classes of the run: the objects of the page's sample frames."""
-
-CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
-"""Checks that compare an answer with the OpenAPI document."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -100,12 +88,7 @@ def files(frame: thor2.RGBDFrame) -> Files:
 @pytest.fixture(scope="session")
 def scene() -> thor2.RGBDFrame:
     """Three boxes apart on a table."""
-    boxes = [
-        Box(-0.2, 0.05, (0.04, 0.06), 0.12, (190, 30, 40)),
-        Box(0.0, -0.1, (0.05, 0.03), 0.06, (30, 60, 190)),
-        Box(0.2, 0.1, (0.03, 0.03), 0.15, (30, 150, 60)),
-    ]
-    return render(boxes)
+    return render(APART)
 
 
 @pytest.fixture(scope="session")
@@ -115,11 +98,10 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
 
 
 SERVE = """
-import sys, threading
+import threading
 from thor2_jax.service import engine, pipeline
 engine.POINT_BUCKETS = (engine.MIN_BATCH_POINTS,)  # the tests send no larger clouds
-if "--warm-why" in sys.argv:
-    pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
+pipeline.compile_explanations = lambda *_: threading.Event().wait()  # a compilation that never ends
 from training.cli import main
 main()
 """
@@ -129,20 +111,18 @@ class Server:
     """`thor2 serve` in a subprocess, which compiles programs for one padded size of clouds."""
 
     def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
-        self.log, self.url = log, ""
+        self.log = log
         options = ("--port", "0", "--max-batch", "8", "--deadline", str(HANG), "--no-warm-why", *options)
         command = [sys.executable, "-c", SERVE, "serve", "--model", str(run), "--cache", str(cache), *options]
         with log.open("wb") as stream:
             self.process = subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=stream, stderr=stream)
-        wait_until(self._is_ready, log.read_text, lambda _: time.sleep(0.05))
+        wait_until(self._is_ready, log.read_text)
+        self.url = re.findall(r"listening at (http://127\.0\.0\.1:\d+)", log.read_text())[0]
 
     def _is_ready(self) -> bool:
         text = self.log.read_text()
         assert self.process.poll() is None, text
-        self.url = "".join(re.findall(r"http://127\.0\.0\.1:\d+", text)[:1])
-        with contextlib.suppress(httpx.TransportError):
-            return bool(self.url) and httpx.get(f"{self.url}/readyz").status_code == 200
-        return False
+        return "ready: " in text
 
 
 @pytest.fixture(scope="session")
@@ -202,20 +182,7 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
 @pytest.fixture
 def service(teaching_url: str, teaching_app: FastAPI) -> Service:
     """The service behind this URL, for tests that replace its attributes."""
-    assert isinstance(teaching_app.state.service, Service)
     return teaching_app.state.service
-
-
-def assert_conforms(url: str, path: str, method: str, examples: int) -> None:
-    """Send generated requests for an operation and check the answers against the service's OpenAPI document."""
-    document, everything = schemathesis.openapi.from_url(f"{url}/openapi.json"), list(HealthCheck)
-
-    @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
-    @hypothesis.given(case=document[path][method].as_strategy())
-    def call(case: schemathesis.Case) -> None:
-        case.call_and_validate(checks=CHECKS, timeout=HANG)
-
-    call()
 
 
 @pytest.fixture
@@ -225,34 +192,18 @@ def http(server: Server) -> Iterator[httpx.Client]:
 
 
 @pytest.fixture(scope="session")
-def blank_page(browser: Browser) -> Callable[[bool], Page]:
-    """Return a page of a computer or of a phone, one of each for all tests; it waits for a tenth of the time."""
-
-    @functools.cache
-    def page(is_phone: bool) -> Page:
-        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone, reduced_motion="reduce").new_page()
-        made.add_init_script("const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms / 10)")
-        made.set_default_timeout(1000 * HANG)
-        return made
-
-    return page
+def contexts(browser: Browser) -> Callable[[bool], BrowserContext]:
+    """The contexts of a computer and of a phone (True), whose pages share a cache."""
+    return functools.cache(lambda phone: browser.new_context(is_mobile=phone, has_touch=phone, reduced_motion="reduce"))
 
 
 @pytest.fixture
-def open_page(blank_page: Callable[[bool], Page], request: pytest.FixtureRequest) -> Iterator[Callable[..., Page]]:
-    """Load the page anew; afterwards, check that no other server was contacted and no script failed."""
-    opened, sources, urls, errors = [], [], [], []
-    record = {
-        "request": lambda request: urls.append(request.url),
-        "pageerror": lambda error: errors.append(str(error)),
-        "console": lambda line: errors.append(line.text),
-    }
+def open_page(contexts: Callable[[bool], BrowserContext], request: pytest.FixtureRequest) -> Iterator[Open]:
+    """Open the page and upload `files`; afterwards, check that no other server was contacted and no script failed.
 
-    def close(page: Page) -> None:
-        page.unroute_all(behavior="ignoreErrors")
-        page.goto("about:blank")
-        for event, listener in record.items():
-            page.remove_listener(event, listener)
+    Scripts wait for a tenth of the time.
+    """
+    pages, sources, urls, errors = [], [], [], []
 
     def open_one(
         route: Callable[[Route], None] | None = None,
@@ -260,28 +211,30 @@ def open_page(blank_page: Callable[[bool], Page], request: pytest.FixtureRequest
         url: str = "",
         size: tuple[int, int] = (1280, 720),
         phone: bool = False,
-        scheme: Literal["light", "dark"] = "light",
+        files: Files | None = None,
     ) -> Page:
         url = url or request.getfixturevalue("server").url
         sources.append(f"{url}/")
-        page = blank_page(phone)
-        if page in opened:
-            close(page)
-        else:
-            opened.append(page)
+        page = contexts(phone).new_page()
+        pages.append(page)
         page.set_viewport_size({"width": size[0], "height": size[1]})
-        page.emulate_media(color_scheme=scheme)
-        for event, listener in record.items():
-            page.on(event, listener)
+        page.add_init_script("const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms / 10)")
+        page.set_default_timeout(1000 * HANG)
+        page.on("request", lambda request: urls.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: errors.append(line.text))
         if route is not None:
             page.route("**/v1/**", route)
         page.goto(url)
         expect(page.locator("#samples button")).to_have_count(samples)
+        if files is not None:
+            upload(page, files)
         return page
 
     yield open_one
-    for page in opened:
-        close(page)
+    for page in pages:
+        page.unroute_all(behavior="ignoreErrors")
+        page.close()
     assert urls and all(url.startswith(tuple(sources)) for url in urls)
     # Error statuses also appear in the console; tests check how the page shows them.
     assert [error for error in errors if "status of" not in error] == []

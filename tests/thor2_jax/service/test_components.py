@@ -10,22 +10,23 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import jax
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from processes import HANG, finish_programs, start_program
+from processes import HANG
 from service_requests import calls, check_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.service import pipeline, preparation
+from thor2_jax.service import pipeline, preparation, server
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
+from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
@@ -35,47 +36,25 @@ from thor2_jax.service.settings import Settings
 from .conftest import Files
 
 
-class Device:
-    """Double numbers; wait for permission before each batch."""
-
-    def __init__(self) -> None:
-        self.batches: list[list[int]] = []
-        self.permits, self.called = threading.Semaphore(0), threading.Event()
-
-    def __call__(self, numbers: list[int]) -> list[int]:
-        self.called.set()
-        self.permits.acquire()
-        self.batches.append(numbers)
-        if 13 in numbers:
-            raise ArithmeticError("thirteen")
-        return [2 * n for n in numbers]
+def double(numbers: list[int]) -> list[int]:
+    if 13 in numbers:
+        raise ArithmeticError("thirteen")
+    return [2 * n for n in numbers]
 
 
 def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
-    device = Device()
+    device, begin = Mock(side_effect=double), threading.Event()
     batcher = Batcher(device, max_batch=4)
-    first = batcher.submit([1])
-    assert device.called.wait(HANG)  # The device is now processing it.
-    others = [batcher.submit(numbers) for numbers in ([2, 3], [4], [5, 6, 7, 8, 9, 10])]
-    device.permits.release(10)
-    batcher.close()
-    assert [job.result(0) for job in (first, *others)] == [[2], [4, 6], [8], [10, 12, 14, 16, 18, 20]]
-    assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
-
-
-def test_cancelled_and_failing_jobs_are_isolated() -> None:
-    device = Device()
-    batcher = Batcher(device, max_batch=1)
-    first = batcher.submit([1])
-    assert device.called.wait(HANG)
-    cancelled, failing, last = (batcher.submit([number]) for number in (3, 13, 5))
+    batcher._device.submit(begin.wait)  # The device is busy while the jobs arrive.
+    jobs = [[2, 3], [4], [5, 6, 7, 8, 9, 10], [11], [12, 13, 14, 15], [16]]
+    *finished, cancelled, failing, last = [batcher.submit(numbers) for numbers in jobs]
     assert cancelled.cancel()
-    device.permits.release(10)
-    assert first.result(HANG) == [2] and last.result(HANG) == [10]
-    with pytest.raises(ArithmeticError):
-        failing.result(HANG)
-    assert device.batches == [[1], [13], [5]]
+    begin.set()
     batcher.close()
+    assert [job.result(0) for job in (*finished, last)] == [[4, 6], [8], [10, 12, 14, 16, 18, 20], [32]]
+    assert isinstance(failing.exception(0), ArithmeticError)
+    batches = [[2, 3, 4, 5], [6, 7, 8, 9], [10], [12, 13, 14, 15], [16]]
+    assert [call.args for call in device.mock_calls] == [(batch,) for batch in batches]
 
 
 FAR = time.monotonic() + HANG
@@ -113,14 +92,6 @@ def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch
     assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
 
 
-def failing(frame: thor2.RGBDFrame) -> np.ndarray:
-    raise RuntimeError("no weights\nin this folder")
-
-
-def leaving(frame: thor2.RGBDFrame) -> np.ndarray:
-    raise SystemExit(3)
-
-
 def many(frame: thor2.RGBDFrame) -> np.ndarray:
     return np.arange(frame.depth.size).reshape(frame.depth.shape)
 
@@ -128,8 +99,8 @@ def many(frame: thor2.RGBDFrame) -> np.ndarray:
 @pytest.mark.parametrize(
     ("segmenter", "status", "words"),
     [
-        (failing, 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
-        (leaving, 500, "segmenter leaving failed .*SystemExit: 3"),
+        (Mock(side_effect=RuntimeError("no\nweights")), 500, "segmenter Mock failed .*RuntimeError: no weights"),
+        (Mock(side_effect=SystemExit(3)), 500, "segmenter Mock failed .*SystemExit: 3"),
         (many, 422, "labels has 76799 instances"),
         (None, 422, "labels is missing"),
     ],
@@ -199,13 +170,13 @@ def test_a_warm_up_reports_its_progress_and_counts_later_compilations(
     messages: list[str] = []
     explained: queue.Queue[tuple[int, bool]] = queue.Queue()
 
-    def compile_shape(*_: int) -> None:
+    def compile_shape(*_: object) -> None:
         with pytest.raises(RequestError) as error:
             service.check_ready()
         messages.append(error.value.message)
         jax.jit(lambda x: x * len(messages))(1.0)
 
-    monkeypatch.setattr(service.engine, "compile", compile_shape)
+    monkeypatch.setattr(service.engine, "infer", compile_shape)
     monkeypatch.setattr(pipeline, "compile_explanations", lambda _, *programs: explained.put(programs[:2]))
     with caplog.at_level("INFO"):
         service.start()
@@ -226,18 +197,15 @@ def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: Files, recognize: AsyncMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused = app.state.service.metrics.requests.labels("/v1/recognize", "429")._value
-    deadlines, timeout = dict[float, asyncio.Timeout](), asyncio.timeout
+    timeout = Mock(return_value=asyncio.Timeout(None))
 
     async def wait_for_refusals(*_: Any) -> Any:
         while refused.get() < 3:
             await asyncio.sleep(0.01)
         return NOTHING
 
-    def record(seconds: float) -> asyncio.Timeout:
-        return deadlines.setdefault(seconds, timeout(seconds))
-
     async def stuck(*_: Any) -> None:
-        deadlines[app.state.service.settings.deadline].reschedule(0)  # it passes now
+        timeout.return_value.reschedule(0)  # it passes now
         await asyncio.sleep(HANG)
 
     recognize.side_effect = wait_for_refusals
@@ -246,8 +214,9 @@ def test_full_queue_is_429_and_deadline_504(
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
     assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.
     recognize.side_effect = stuck
-    monkeypatch.setattr(asyncio, "timeout", record)
-    assert calls(app, frame_request(files))[0].status_code == 504 and len(deadlines) == 1
+    monkeypatch.setattr(asyncio, "timeout", timeout)
+    assert calls(app, frame_request(files))[0].status_code == 504
+    timeout.assert_called_once_with(HANG)
 
 
 @pytest.mark.parametrize(("adapt", "status"), [(False, 200), (True, 403)])
@@ -286,23 +255,9 @@ def test_large_files_stay_in_memory(
 
 def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its other counts are kept."""
-    code = """if True:
-        import os
-        from unittest.mock import Mock, patch
-        from thor2_jax.service.metrics import Metrics
-        died = os.fork()
-        metrics = Metrics()
-        if not died:
-            metrics.in_progress.inc(3)
-            metrics.compilations.inc(2)
-            os._exit(0)
-        os.waitpid(died, 0)
-        metrics.in_progress.inc(1)
-        from thor2_jax.service import server
-        with patch.object(server.Multiprocess, "keep_subprocess_alive", lambda self: self.processes.clear()):
-            server._Supervisor.keep_subprocess_alive(Mock(server._Supervisor, processes=[Mock(pid=died)]))
-        print(metrics.text().decode())
-    """
     monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
-    (text,) = finish_programs(start_program(code))
-    assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text
+    monkeypatch.setattr(server.Multiprocess, "keep_subprocess_alive", lambda self: self.processes.clear())
+    for name in (f"gauge_{Metrics().in_progress._multiprocess_mode}_7.db", "counter_7.db"):
+        (tmp_path / name).touch()
+    server._Supervisor.keep_subprocess_alive(Mock(server._Supervisor, processes=[Mock(pid=7)]))
+    assert [path.name for path in tmp_path.iterdir()] == ["counter_7.db"]

