@@ -257,9 +257,9 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` to `path` in UTF-8, atomically."""
+    """Write `text` to `path` in UTF-8, atomically; bytes of a file name that are not UTF-8 are escaped."""
     with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 MAX_YAML_BYTES = 2**24

@@ -1,5 +1,6 @@
 """The commands of docs/recordings.md run on the sample recording; the run's weights are random."""
 
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,15 @@ def test_the_recording_shows_four_objects_apart() -> None:
     assert len(frames) == FRAMES
     for frame in frames[:3]:
         assert len(set(thor2.segment(frame).ravel().tolist()) - {0}) == 4
+
+
+def test_a_recording_that_exists_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["sample_recording", "table.mcap"])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(ROOT / "training/rendering/sample_recording.py"), run_name="__main__")
+    assert "table.mcap, which exists" in capsys.readouterr().err
 
 
 @pytest.mark.slow

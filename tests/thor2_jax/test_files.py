@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import os
 import shutil
 import signal
 import stat
@@ -33,6 +34,8 @@ def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
     path.write_text("old")
     write_text(str(path), "π\n")
     assert path.read_bytes() == b"\xcf\x80\n" and stat.S_IMODE(path.stat().st_mode) == 0o644
+    write_text(path, os.fsdecode(b"frame \xff"))
+    assert path.read_bytes() == b"frame \\udcff"
     with pytest.raises(FileNotFoundError):
         write_text(tmp_path / "missing" / "a.txt", "")
     assert list(tmp_path.iterdir()) == [path]

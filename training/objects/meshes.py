@@ -1,6 +1,7 @@
 """Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
 import dataclasses
+import io
 import json
 import logging
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
@@ -95,15 +97,28 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
-def _check_extensions(path: Path) -> None:
-    """Raise InputError if a GLB uses an extension of glTF that is not supported."""
+def _check_glb(path: Path) -> None:
+    """Raise InputError if a GLB uses an extension of glTF that is not supported, or holds a damaged base texture."""
     content = read_file(path) if path.suffix.lower() == ".glb" else b""
     if not content.startswith(b"glTF"):  # trimesh refuses it
         return
-    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    end = 20 + int.from_bytes(content[12:16], "little")
+    header = json.loads(content[20:end])
     if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
         uses = f"it uses {', '.join(sorted(unsupported))}"
         raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
+    for material in header.get("materials", ()):
+        base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if base is None or "source" not in (texture := header["textures"][base["index"]]):
+            continue
+        image = header["images"][texture["source"]]
+        if "bufferView" in image:  # trimesh loads the mesh without a damaged image, as white
+            view = header["bufferViews"][image["bufferView"]]
+            start = end + 8 + view.get("byteOffset", 0)
+            try:
+                Image.open(io.BytesIO(content[start : start + view["byteLength"]])).close()
+            except OSError:
+                raise InputError("its texture is damaged; export the mesh again") from None
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
@@ -161,7 +176,7 @@ def read_mesh(path: Path) -> TexturedMesh:
                 raise
 
     try:
-        _check_extensions(path)  # before trimesh fails with another message
+        _check_glb(path)  # before trimesh fails with another message
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:

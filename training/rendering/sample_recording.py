@@ -3,14 +3,15 @@
 python -m training.rendering.sample_recording table.mcap
 """
 
+import argparse
 import io
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.recordings.detection_files import COMPRESSED_IMAGE, MessageBag
 from thor2_jax.recordings.messages import ros_time
@@ -74,4 +75,9 @@ def _camera_info(camera: Intrinsics) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    write_sample_recording(sys.argv[1])
+    parser = argparse.ArgumentParser(prog="python -m training.rendering.sample_recording")
+    parser.add_argument("path", help="MCAP file (.mcap) or directory of a ROS 2 bag that does not exist")
+    try:
+        write_sample_recording(parser.parse_args().path)
+    except (InputError, OSError) as error:
+        parser.error(reason_of(error))

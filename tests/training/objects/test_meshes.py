@@ -190,6 +190,8 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
     content = (tmp_path / "quad.glb").read_bytes()
     (tmp_path / "quad.glb").write_bytes(content.replace(b"TEXCOORD_0", b"TEXCOORD_1"))
     check_refused(tmp_path / "quad.glb", "no texture coordinates")
+    (tmp_path / "quad.glb").write_bytes(content.replace(b"\x89PNG", b"\0PNG"))
+    check_refused(tmp_path / "quad.glb", "its texture is damaged")
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
