@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
+from sklearn.neighbors import sort_graph_by_row_values
 
 from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, hyab, to_lab
 from colornet.network import ColorNetwork
@@ -31,6 +32,7 @@ MIN_SAMPLES = 6
 """Smallest number of colours in the neighbourhood of a core point of DBSCAN."""
 
 _N_CUBES = (3, 8)  # chroma, hue
+_OVERLAP = (0.10, 0.25)
 
 _MIN_SHARED = 0.95
 """Fraction of the smaller node's colours above which two nodes can be redundant."""
@@ -70,8 +72,12 @@ class HyabDBSCAN:
 
     def fit_predict(self, lab: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cluster of each colour, [n, 3] CIELAB to [n] int64; -1 for noise."""
+        graph = hyab_neighbors(lab, EPS)
+        # Colours are distinct, so no other stored distance is 0; an explicit diagonal completes the graph.
+        graph.setdiag(0.0)
+        graph = sort_graph_by_row_values(graph, warn_when_not_sorted=False)
         clusterer = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed")
-        return np.asarray(clusterer.fit_predict(hyab_neighbors(lab, EPS)), np.int64)
+        return np.asarray(clusterer.fit_predict(graph), np.int64)
 
 
 def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDArray[np.int64], NDArray[np.int64]]:
@@ -85,7 +91,7 @@ def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDAr
         pairs of nodes that share a colour; and pairs of nodes [c, 2] int64 that are neighbours across the cut.
     """
     values = lens(lab)
-    cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=[0.10, 0.25])
+    cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=list(_OVERLAP))
     graph = kmapper.KeplerMapper(verbose=0).map(values, lab, clusterer=HyabDBSCAN(), cover=cover)
     names = list(graph["nodes"])
     members = [np.sort(np.asarray(graph["nodes"][name], np.int64)) for name in names]

@@ -52,7 +52,7 @@ class FrameAnswer:
 
     @property
     def segmentation_failure(self) -> str:
-        """Why no instance was found in a segmented frame if its depth is unusable; otherwise an empty string."""
+        """Why the frame has no instance if its depth is unusable, for segmented frames; otherwise an empty string."""
         if self.frame is None or self.recognitions:
             return ""
         depth = self.frame.depth_m

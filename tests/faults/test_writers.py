@@ -134,17 +134,23 @@ def test_a_run_directory_is_written_atomically(tmp_path: Path, disk: Disk) -> No
 
 def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Disk) -> None:
     path, job = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
-    first, second = (FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, []) for k in range(2))
-    AnswerFile(path, job).append(first)
-    for step in (1, 2):
+    answers = [FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, []) for k in range(3)]
+    AnswerFile(path, job).append(answers[0])
+    kept = 1
+    for step in range(1, 4):
         file = AnswerFile(path, job)
+        assert [answer.frame for answer in file.frames] == [answer.frame for answer in answers[:kept]]
         disk.fail_from(step)
-        with pytest.raises(OSError, match="answers.jsonl"):
-            file.append(second)
+        try:
+            file.append(answers[kept])
+        except OSError as error:
+            assert error.filename == str(path)
+        else:
+            kept += 1
         disk.fail_from(0)
-        assert [answer.frame for answer in AnswerFile(path, job).frames] == ["frame0"]
-    AnswerFile(path, job).append(second)
-    assert [answer.frame for answer in AnswerFile(path, job).frames] == ["frame0", "frame1"]
+    assert kept == 2
+    AnswerFile(path, job).append(answers[kept])
+    assert len(AnswerFile(path, job).frames) == 3
 
 
 def test_metrics_on_a_full_disk(tmp_path: Path, disk: Disk) -> None:

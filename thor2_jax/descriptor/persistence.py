@@ -111,7 +111,7 @@ def persistence_images(
 
     Args:
         diagrams: fields [..., J].
-        config: settings of the descriptor, without those of the next two. Static.
+        config: settings of the descriptor; its variance and exponent are not read. Static.
         variance: [], variance of the Gaussian.
         exponent: [], exponent n.
 

@@ -91,12 +91,13 @@ class CompactClouds:
 
     @classmethod
     def of(cls, views: Sequence[PreparedInstance]) -> "CompactClouds":
-        """Round prepared instances, at least one, to compact clouds.
+        """Round prepared instances to compact clouds.
 
         Raises:
             InputError: an instance has no points or is larger than 2 `MAX_DISTANCE`.
         """
-        points, centres = [], []
+        points = [np.zeros((0, 3), np.int16)]
+        centres = []
         for number, view in enumerate(views):
             if not len(view.points):
                 raise InputError(f"views[{number}] has no points ({view.reason}); leave it out")
@@ -111,10 +112,10 @@ class CompactClouds:
             centres.append(centre)
         return cls(
             np.concatenate(points),
-            np.concatenate([view.colors for view in views]),
-            np.concatenate([view.boundary for view in views]),
+            np.concatenate([np.zeros((0, 3), np.uint8), *(view.colors for view in views)]),
+            np.concatenate([np.zeros(0, bool), *(view.boundary for view in views)]),
             np.array([len(view.points) for view in views], np.int32),
-            np.array(centres),
+            np.array(centres, np.float32).reshape(-1, 3),
         )
 
     def __len__(self) -> int:

@@ -15,6 +15,7 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.concurrency import run_in_threadpool
+from starlette.convertors import PathConvertor, register_url_convertor
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -90,6 +91,13 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     for kind in (RequestError, HTTPException, ClientDisconnect, Exception):
         app.add_exception_handler(kind, _on_error)
     return app
+
+
+class _AnyText(PathConvertor):
+    regex = "(?s:.*)"  # Names with line breaks are unknown, too; `path` has no route for them.
+
+
+register_url_convertor("any", _AnyText())
 
 
 def check_host(app: ASGIApp, names: Sequence[str]) -> ASGIApp:
@@ -251,7 +259,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             known = await service.change(lambda objects: objects.undo(files["generation"]), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
-    @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
+    @routes.delete("/v1/objects/{name:any}", responses=GALLERY_ERRORS | error_responses(404))
     async def forget(name: str) -> schemas.ChangeAnswer:
         """Forget an object: remove its views; a trained class is no longer predicted."""
         async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # The request has no body.

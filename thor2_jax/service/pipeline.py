@@ -118,7 +118,7 @@ class Service:
                     return
                 self.progress = f"compiling {k} of {len(shapes)}"
                 log.info("%s: %d clouds of %d points", self.progress, *shape)
-                self.engine.infer([], shape)
+                self.engine.infer([], shape)  # compiles the programs
             self.engine.compile_adaptation()
         except Exception:
             log.exception("warm-up failed")

@@ -57,7 +57,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         InputError: the run cannot be read, or the address is in use.
     """
     settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
-    ours = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
+    loggers = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
     config = uvicorn.Config(
         functools.partial(_create_worker, settings, workers),
         factory=True,
@@ -69,7 +69,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         server_header=False,
         # Browsers revalidate each file of the page and transfer it only if it changed.
         headers=list(page_headers("'self'", "no-cache").items()),
-        log_config={**LOGGING_CONFIG, "loggers": LOGGING_CONFIG["loggers"] | ours},
+        log_config={**LOGGING_CONFIG, "loggers": LOGGING_CONFIG["loggers"] | loggers},
         timeout_graceful_shutdown=int(settings.deadline) + 5,
         timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
     )

@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +39,19 @@ _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var"
 """Last part of an NNX path -> last part of the tensor's name."""
 
 
-def _tensors(model: nnx.Module) -> tuple[Any, dict[str, tuple[Any, str, tuple[int, ...]]]]:
-    """Return the state of a backbone, and tensor name -> variable, its name in the module, and the tensor's shape.
+class _Tensor(NamedTuple):
+    """A tensor in a backbone's file: its variable in the network, the variable's last name, and the tensor's shape.
 
     The last two axes of kernels are the first ones of the tensor, reversed.
     """
+
+    variable: Any
+    kind: str
+    shape: tuple[int, ...]
+
+
+def _tensors(model: nnx.Module) -> tuple[Any, dict[str, _Tensor]]:
+    """Return the state of a backbone, and the name of each tensor -> the tensor."""
     state, tensors = nnx.state(model, (nnx.Param, nnx.BatchStat)), {}
     prefix: str = getattr(model, "PREFIX", "")
     for path, variable in nnx.to_flat_state(state):
@@ -51,13 +59,13 @@ def _tensors(model: nnx.Module) -> tuple[Any, dict[str, tuple[Any, str, tuple[in
         shape = variable.shape
         if kind == "kernel":
             shape = (shape[-1], shape[-2], *shape[:-2])
-        tensors[prefix + ".".join([*modules, _TENSORS.get(kind, kind)])] = variable, kind, shape
+        tensors[prefix + ".".join([*modules, _TENSORS.get(kind, kind)])] = _Tensor(variable, kind, shape)
     return state, tensors
 
 
 def tensor_shapes(model: nnx.Module) -> dict[str, tuple[int, ...]]:
     """Return the names and shapes of the tensors of a backbone's file."""
-    return {name: shape for name, (_, _, shape) in _tensors(model)[1].items()}
+    return {name: tensor.shape for name, tensor in _tensors(model)[1].items()}
 
 
 def weights_file(directory: Path, name: str) -> Path:

@@ -134,8 +134,11 @@ MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 
 def option_arguments(**values: object) -> list[str]:
     """Return the command-line options with these values, in their order; None leaves an option out, True is a flag."""
-    given = {f"--{name.replace('_', '-')}": value for name, value in values.items() if value is not None}
-    return [str(part) for option, value in given.items() for part in ([option] if value is True else [option, value])]
+    words: list[str] = []
+    for name, value in values.items():
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
+    return words
 
 
 def finish(result: str, purpose: str, *command: object, file: TextIO | None = None, **options: object) -> None:

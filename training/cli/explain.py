@@ -59,12 +59,13 @@ def explain(
                 continue
             write_explanation(explanation, frame, source.name, directory)
             explained, last = explained + 1, label
-            console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
+            console.print(escape_characters(f"{explanation.title}: {directory / PAGE}"))
     if not explained:
         raise InputError("no instance could be explained; see above")
     pages = f"{explained} pages in {out}"
     if segment == MODEL:  # enrolling does not accept labels that depend on the model
         finish(pages, "list the objects of the model", "objects", model=model, gallery=gallery)
     else:
-        then = "if a name is wrong, add this view of the object", "enroll", "NAME", *given.arguments
-        finish(pages, *then, segment=segment, instance=last, model=model, gallery=gallery, extend=True)
+        purpose = "if a name is wrong, add this view of the object"
+        command = "enroll", "NAME", *given.arguments
+        finish(pages, purpose, *command, segment=segment, instance=last, model=model, gallery=gallery, extend=True)

@@ -50,9 +50,9 @@ class _Answers:
     """The answers as they are printed and written; unusable files are refused before any frame is recognized.
 
     Attributes:
-        tables: the COCO and BOP results, while the files are open.
+        tables: the COCO and BOP results, from `opened` on.
         failed: names of the frames that could not be recognized.
-        empty: for each recognized frame, its `segmentation_failure`.
+        failures: the `segmentation_failure` of each recognized frame.
         has_unknown: whether an instance got no name.
     """
 
@@ -73,7 +73,7 @@ class _Answers:
 
         self._given, self._frames, self._several, self._as_json = given, frames, several, as_json
         self.failed: list[str] = []
-        self.empty: list[str] = []
+        self.failures: list[str] = []
         self.has_unknown = False
         if given.out is not None:
             resumable = {name.split("/")[0] for name in frames} if several else result_files.RESULT_FILES
@@ -98,10 +98,10 @@ class _Answers:
             with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
                 yield
         except InputError as error:
-            if self._frames or not self.empty:
+            if self._frames or not self.failures:
                 raise
             place = f" and are in {self.written}" if self.written else ""
-            raise InputError(f"{error}; {len(self.empty)} frames were recognized before{place}") from None
+            raise InputError(f"{error}; {len(self.failures)} frames were recognized before{place}") from None
         self.tables.write(self._given.coco, self._given.bop)
 
     def add(self, answer: "FrameAnswer") -> None:
@@ -117,7 +117,7 @@ class _Answers:
             self.failed.append(answer.name)
             print_note(f"failed: {answer.name}: {answer.error}")
             return
-        self.empty.append(answer.segmentation_failure)
+        self.failures.append(answer.segmentation_failure)
         self.has_unknown |= any(each.name is None for each in answer.recognitions)
         if not self._as_json:
             _print_table(answer.name if self._several else None, answer.recognitions)
@@ -190,7 +190,8 @@ def recognize(
     else:
         segmenter = options.find_segmenter(segment or TABLE, by_model)
         bag, sources = given.open_bag(), []
-    names, as_json = [source.name for source in sources], as_json or recording is not None
+    names = [source.name for source in sources]
+    as_json = as_json or recording is not None
     frame_poses = None if poses is None else read_poses(poses, names)
     results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
     with contextlib.ExitStack() as stack:
@@ -214,8 +215,8 @@ def recognize(
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    failed, empty, written = results.failed, results.empty, results.written
-    result = f"written to {written}" if written else f"frames recognized: {len(empty)}"
+    failed, failures, written = results.failed, results.failures, results.written
+    result = f"written to {written}" if written else f"frames recognized: {len(failures)}"
     notes = sys.stderr if as_json else None
     if results.has_unknown:
         print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
@@ -223,10 +224,10 @@ def recognize(
     if results.tables.n_without_number:
         print_note(f"{results.tables.n_without_number} instances have a name that {outputs.names} does not number")
     if failed:
-        total, listed = len(failed) + len(empty), first_names(failed, MAX_LISTED)
+        total, listed = len(failed) + len(failures), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
-    if (segment or recording) and empty and all(empty):
-        raise InputError(empty[0])
+    if (segment or recording) and failures and all(failures):
+        raise InputError(failures[0])
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

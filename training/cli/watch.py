@@ -90,9 +90,10 @@ def watch(
             time.sleep(NOTICE_SECONDS)
             raise
         recognized = f"{view.n_frames} of {n_shown} were recognized"
-        then = "store the answers", "recognize", *(given_frames.arguments or ["FRAME"])
-        same = {"segment": segment, **vars(arguments), "out": "answers"}
-        finish(f"no more frames, {recognized}; Ctrl-C ends", *then, file=sys.stderr, **same)
+        shown = f"no more frames, {recognized}; Ctrl-C ends"
+        command = "recognize", *(given_frames.arguments or ["FRAME"])
+        same = {"segment": segment, **vars(arguments)}
+        finish(shown, "store the answers", *command, file=sys.stderr, **same, out="answers")
         view.publish_state("ended", f"There are no more frames; {recognized}.")
         while True:
             time.sleep(60)

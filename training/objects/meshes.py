@@ -241,10 +241,11 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
+    requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         name = entry.name if entry.is_dir() else entry.stem
-        if names is not None and name not in names.values():  # scans that are not requested are not checked
+        if requested is not None and name not in requested:  # scans that are not requested are not checked
             continue
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:

@@ -179,7 +179,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             try:
                 cluster = ray.init(address, log_to_driver=False, logging_level="error")
             except ValueError as error:
-                raise InputError(f"address is {address}; expected HOST:PORT or ray://HOST:PORT ({error})") from None
+                raise InputError(f"engine is ray; expected HOST:PORT of its cluster as the address ({error})") from None
         with cluster:
             # Ray accepts functions only, not other callables such as partial functions.
             task = function if inspect.isfunction(function) else lambda item: function(item)

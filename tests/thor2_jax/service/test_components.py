@@ -45,7 +45,7 @@ def double(numbers: list[int]) -> list[int]:
 def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     device, begin = Mock(side_effect=double), threading.Event()
     batcher = Batcher(device, max_batch=4)
-    batcher._device.submit(begin.wait)  # The device is busy while the jobs arrive.
+    batcher._device.submit(begin.wait, HANG)  # The device is busy while the jobs arrive.
     jobs = [[2, 3], [4], [5, 6, 7, 8, 9, 10], [11], [12, 13, 14, 15], [16]]
     *finished, cancelled, failing, last = [batcher.submit(numbers) for numbers in jobs]
     assert cancelled.cancel()

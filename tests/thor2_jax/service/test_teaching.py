@@ -188,6 +188,7 @@ def test_bad_requests_are_refused(http: httpx.Client, files: Files) -> None:
     assert enroll(http, huge, "huge").json()["field"] in ("instance", "intrinsics")
     for name in ("missing", "a/b", "..", "%00", "", "m" * 3000):
         assert http.delete(f"/v1/objects/{name}").status_code in (404, 405)
+    check_refused(http.delete("/v1/objects/a%0Ab"), 404, "name")
     for value in ("", "x", "-1", "1e9", "9" * 40):
         check_refused(undo(http, value), 422, "generation")
     assert known(http) == {}
@@ -290,7 +291,6 @@ def test_openapi_requests_conform(method: str, path: str, http: httpx.Client) ->
     @hypothesis.settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=everything)
     @hypothesis.given(case=document[path][method].as_strategy())
     def call(case: schemathesis.Case) -> None:
-        hypothesis.assume("\n" not in case.path_parameters.get("name", ""))  # No route has this path: 405.
         case.call_and_validate(checks=CHECKS, timeout=HANG)
 
     call()

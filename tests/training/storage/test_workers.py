@@ -54,7 +54,7 @@ def test_exceptions_of_the_function_are_raised(workers: int) -> None:
 
 def test_an_address_that_is_none_of_a_cluster() -> None:
     pytest.importorskip("ray", reason="the extra [cluster] is not installed")
-    assert_refused("address is a; expected HOST:PORT", list, ray_workers(1, "a")(eval, ["1"]))
+    assert_refused("engine is ray; expected HOST:PORT", list, ray_workers(1, "a")(eval, ["1"]))
 
 
 @pytest.mark.slow
