@@ -7,7 +7,7 @@ import colornet
 from colornet.builder import merge_redundant, relabel, similarity
 from colornet.colors import MEAN_WHITE, grid_colors, hyab, to_lab
 
-from .test_color_math import reference_hyab, reference_lab
+from .test_colors import reference_hyab, reference_lab
 
 NETWORK = colornet.load_default()
 
