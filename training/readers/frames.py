@@ -191,8 +191,8 @@ class FrameFolder(LabelledFrames):
             )
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
-        kept = set(self.sources)
-        left_out = [source.name for source in sources if source not in kept]
+        used = set(self.identifiers)
+        left_out = [source.name for source in sources if source.name not in used]
         listed = first_names(left_out, MAX_LISTED)
         self.note = f"{len(left_out)} frames without labels.json: {listed}" if left_out else ""
 
