@@ -16,6 +16,8 @@ from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.inference import infer
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import FEATURES, MLP, EmbeddingSizes, input_size
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
@@ -64,6 +66,12 @@ def untrained_embedding_run(
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     first = Embedding.create(config, run.network, sizes, classes=run.classes, distractors=2)
     return dataclasses.replace(run, embedding=dataclasses.replace(first, further=(first.create_further(1),)))
+
+
+def with_surfaces(run: TrainedRun) -> TrainedRun:
+    """Return a run with the surfaces of built-in objects as those of its classes."""
+    meshes = list(builtin_objects().values())[: len(run.classes)]
+    return dataclasses.replace(run, surfaces=surfaces_of(meshes))
 
 
 def class_probabilities(

@@ -18,8 +18,8 @@ class UntaughtRecognizer:
     probabilities: Any
 
     def __init__(self, classes: Sequence[str] = ("mug", "bowl"), features: Sequence[str] = ("tops",)) -> None:
-        run = {"classes": tuple(classes), "classifiers": dict.fromkeys(features), "config": None, "record": {}}
-        self.run: Any = SimpleNamespace(**run, network=SimpleNamespace(fingerprint=""))
+        run = {"classes": tuple(classes), "classifiers": dict.fromkeys(features), "record": {}}
+        self.run: Any = SimpleNamespace(**run, config=None, surfaces=None, network=SimpleNamespace(fingerprint=""))
 
     @property
     def model(self) -> Model:
@@ -37,7 +37,8 @@ class UntaughtRecognizer:
 def described(instances: list[Any], content: Any) -> Any:
     """Return descriptors of instances, with what the toy recognizer reads."""
     usable = [instance for instance in instances if instance.reason is None]
-    return SimpleNamespace(instances=instances, usable=usable, oriented=SimpleNamespace(content=content, overflow=0))
+    oriented = SimpleNamespace(content=content, overflow=0)
+    return SimpleNamespace(instances=instances, usable=usable, oriented=oriented, packed=None)
 
 
 class NamesInOrder(UntaughtRecognizer):

@@ -3,6 +3,7 @@
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
+RUN/surfaces.safetensors              surfaces of the classes, if all were trained from meshes
 RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
@@ -256,7 +257,7 @@ class _Fold(NamedTuple):
         accuracy, confidence = {}, {}
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
-            run = dataclasses.replace(run, embedding=embedding)
+            run = dataclasses.replace(run, embedding=embedding, surfaces=self.source.surfaces)
             self.report(Stage.CALIBRATE, 0, 1)
             calibration, accuracy[EMBEDDING] = fit_calibration(run, held_out)
             self.report(Stage.CALIBRATE, 1, 1)

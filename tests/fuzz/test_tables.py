@@ -53,7 +53,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
     rgb = rng.integers(0, 256, (12, 3), dtype=np.uint8)
     numbers = np.arange(2, dtype=np.int32), np.zeros(2, np.int32)
-    content = encode(NormalizedViews(xyz, rgb, np.array([5, 7]), 0, *numbers))
+    content = encode(NormalizedViews(xyz, rgb, np.array([5, 7]), 0, *numbers, xyz[:2]))
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
     Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)

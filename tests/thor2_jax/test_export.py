@@ -9,11 +9,12 @@ import pytest
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, with_surfaces
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.export import export_recognizer
+from thor2_jax.model.inference import infer
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import FEATURES
 
@@ -22,7 +23,7 @@ CONFIG = dataclasses.replace(SMALL_CONFIG, homology="gudhi", looks=4)
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    return untrained_embedding_run("abc", FEATURES, CONFIG)
+    return with_surfaces(untrained_embedding_run("abc", FEATURES, CONFIG))
 
 
 LOADER = """
@@ -51,7 +52,7 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
 
     described = describe_looks(packed, run.network, CONFIG)  # gudhi: the other backend
     np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
-    expected = class_probabilities(thor2.Recognizer(run), described)
+    expected = infer(thor2.Recognizer(run).model, described, packed, (*FEATURES, "embedding")).probabilities
     for name, probabilities in expected.items():
         np.testing.assert_allclose(outputs[name], probabilities, rtol=0, atol=1e-5)
         assert np.abs(outputs[name][0] - outputs[name][3]).max() > 1e-4  # without its rim, the cloud is another one

@@ -10,13 +10,21 @@ from image_files import frame_of_squares, patches, tilted
 from refusals import assert_refused
 from scipy.stats import gmean
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, class_probabilities, small_embedding, untrained_run
+from small_runs import (
+    SMALL_CONFIG,
+    class_probabilities,
+    small_embedding,
+    untrained_embedding_run,
+    untrained_run,
+    with_surfaces,
+)
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.model.surfaces import with_evidence
 from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
 
@@ -128,14 +136,27 @@ def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
     config, embedding = dataclasses.replace(SMALL_CONFIG, sigma_1=0.03), small_embedding()
     model = Recognizer(dataclasses.replace(untrained_run(CLASSES, ("tops",), config), embedding=embedding)).model
     clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
-    inference = infer(model, describe_looks(clouds, model.run.network, config), clouds)
+    inference = infer(model, describe_looks(clouds, model.run.network, config), clouds, embeds=True)
     expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
     np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
 
 
+def test_instances_are_compared_with_surfaces() -> None:
+    run = untrained_embedding_run(CLASSES)
+    recognizer, compared = Recognizer(run), Recognizer(with_surfaces(run))
+    instances, before = recognizer.infer(recognizer.prepare(tilted(patches())))
+    _, after = compared.infer(instances)
+    usable = [each for each in instances if each.reason is None]
+    clouds = pack_instances(usable, len(after.overflow))
+    expected = with_evidence(before.probabilities["embedding"], compared.run.surfaces, clouds)[: len(usable)]
+    np.testing.assert_allclose(after.probabilities["embedding"][: len(usable)], expected, rtol=1e-4)
+    assert len(usable) > 1 and np.abs(before.probabilities["embedding"][: len(usable)] - expected).max() > 0.01
+
+
 @pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])
-def test_nothing_compiles_after_warm_up(run: TrainedRun, max_points: int, sizes: int) -> None:
+def test_nothing_compiles_after_warm_up(max_points: int, sizes: int) -> None:
     """JAX's monitoring counts the compilations of a recognizer that no other test uses."""
+    run = with_surfaces(untrained_embedding_run(CLASSES, THOR2))
     compiled: list[str] = []
 
     def listen(event: str, duration: float, **_: object) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
 from failures import Interrupted, stop_when
@@ -22,6 +23,8 @@ from training.embedding import distractors
 from training.embedding.distractors import Distractors, render_clouds
 from training.fitting.calibration import fit_calibration
 from training.fitting.loop import Checkpoints, FitOptions
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
 from training.protocol import Protocol
 from training.train_run import check_trained, read_metrics, train_run
 from training.views.normalized_views import MemoryViews
@@ -30,6 +33,7 @@ DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
 CLOUDS = brick_and_stick(8)
 CLASSES = tuple(CLOUDS)
 SOURCE = MemoryViews(CLOUDS, SMALL_CONFIG)
+SOURCE.surfaces = surfaces_of(list(builtin_objects().values())[: len(CLASSES)])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,7 +72,9 @@ def rows(out: Path) -> list[dict[str, Any]]:
 
 def test_a_run_without_classifiers(whole: Whole, cache: Path) -> None:
     out, run, stages, _ = whole
-    assert {path.name for path in out.iterdir()} >= {"embedding.safetensors", "references.safetensors", "run.json"}
+    names = {f"{name}.safetensors" for name in ("embedding", "references", "surfaces")}
+    assert {path.name for path in out.iterdir()} >= {*names, "run.json"}
+    jax.tree.map(np.testing.assert_array_equal, run.surfaces, SOURCE.surfaces)
     assert stages == [*SETTINGS.stages] and len(stages) == 4
     assert run.classifiers == {} and run.embedding is not None
     assert run.embedding.classes == run.classes == CLASSES and len(run.embedding.further) == 1

@@ -24,6 +24,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
+from thor2_jax.model.surfaces import with_evidence
+from thor2_jax.networks import EMBEDDING
 from thor2_jax.types import PointClouds
 
 __all__ = [
@@ -108,19 +110,28 @@ class Inference(NamedTuple):
 
 
 def infer(
-    model: Model, oriented: LookDescriptors, clouds: PointClouds | None = None, classifiers: Sequence[str] | None = None
+    model: Model,
+    oriented: LookDescriptors,
+    clouds: PointClouds | None = None,
+    classifiers: Sequence[str] | None = None,
+    *,
+    embeds: bool = False,
 ) -> Inference:
     """Evaluate a model on descriptors; arrays stay on the device.
 
     Args:
         model: the model.
         oriented: descriptors of the looks at B clouds.
-        clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
+        clouds: [B, N] the clouds in metres, which are compared with the surfaces of the classes; None if only the
+            ratios of the class probabilities are needed.
         classifiers: classifiers to evaluate, see `Model.chosen_classifiers`; empty if the gallery alone answers.
+        embeds: whether to embed the clouds for the gallery; False if the classifiers alone answer.
     """
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
-    if clouds is None:
+    if clouds is not None and model.run.surfaces is not None and EMBEDDING in probabilities:
+        probabilities[EMBEDDING] = with_evidence(probabilities[EMBEDDING], model.run.surfaces, clouds)
+    if clouds is None or not embeds:
         return Inference(oriented.overflow, probabilities)
     ours, config = model.embedding.config, model.run.config
     is_ours = dataclasses.replace(config, homology=ours.homology, looks=ours.looks) == ours
@@ -150,7 +161,7 @@ def infer_clouds(
     # If the gallery alone answers, it needs `LOOKS` looks, which `infer` would otherwise describe again.
     count = max(config.looks, LOOKS) if source == "gallery" else config.looks
     oriented = describe_looks(clouds, model.run.network, config, count)
-    return infer(model, oriented, clouds if source != "classifiers" else None, names)
+    return infer(model, oriented, clouds, names, embeds=source != "classifiers")
 
 
 def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:

@@ -7,8 +7,9 @@ RUN/weights/NAME.safetensors    parameters and batch statistics of one classifie
 RUN/embedding.safetensors       the embedding of the gallery, in place of the packaged one, which may also recognize
                                 the classes
 RUN/references.safetensors      its reference views, with which galleries reject unknown objects
+RUN/surfaces.safetensors        surfaces of the classes, if all were trained from meshes, see `surfaces`
 
-These five files are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does
+These files are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does
 not read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl`
 and `curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`,
 from which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`). A run whose embedding
@@ -16,7 +17,7 @@ recognizes the classes may have no classifiers; a run that `thor2 enroll` create
 With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
 
 A run directory appears under its name only when it is complete, and all files are checked when it is loaded. Two
-equal trainings (see `training.fitting.fit`) write the same bytes to these five files.
+equal trainings (see `training.fitting.fit`) write the same bytes to these files.
 """
 
 import dataclasses
@@ -39,7 +40,8 @@ from thor2_jax.files import (
     unpack_arrays,
 )
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
-from thor2_jax.model.run_record import RUN_FILE, RUN_FORMAT, read_description
+from thor2_jax.model.run_record import FORMAT_WITH_SURFACES, RUN_FILE, RUN_FORMAT, read_description
+from thor2_jax.model.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.networks import (
     MLP,
     Classifier,
@@ -67,6 +69,7 @@ class TrainedRun:
         classifiers: feature -> trained MLP.
         record: record of the training (options, counts, metrics) as JSON values.
         embedding: embedding of the run, which may recognize its classes, too; None for the packaged one.
+        surfaces: surfaces of the classes, with which the embedding rejects unknown objects; None for no such test.
     """
 
     config: DescriptorConfig
@@ -75,6 +78,7 @@ class TrainedRun:
     classifiers: Mapping[Feature, MLP]
     record: Mapping[str, Any]
     embedding: Embedding | None = None
+    surfaces: Surfaces | None = None
 
     @property
     def embedding_classifier(self) -> Classifier | None:
@@ -98,12 +102,14 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         (unfinished / "weights").mkdir()
         if run.embedding is not None:
             run.embedding.save(unfinished / EMBEDDING_FILE)
+        if run.surfaces is not None:
+            (unfinished / SURFACES_FILE).write_bytes(run.surfaces.content)
         contents = {name: pack_arrays(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
         embedding = run.embedding
         description = {
-            "format": RUN_FORMAT,
+            "format": RUN_FORMAT if run.surfaces is None else FORMAT_WITH_SURFACES,
             "descriptor_version": DESCRIPTOR_VERSION,
             "descriptor_config": dataclasses.asdict(run.config),
             "color_network": run.network.fingerprint,
@@ -112,6 +118,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "weights": {name: content_digest([content]) for name, content in contents.items()},
             **({} if embedding is None else {"embedding": embedding.fingerprint}),
             **({} if embedding is None or embedding.references is None else {"references": True}),
+            **({} if run.surfaces is None else {"surfaces": content_digest([run.surfaces.content])}),
             "record": run.record,
         }
         (unfinished / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
@@ -156,7 +163,10 @@ def load_run(path: str | Path) -> TrainedRun:
         raise InputError(f"model: {file} {state}; copy the whole run directory")
     if embedding is not None and embedding.references is None and description.get("references"):
         raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
-    run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding)
+    surfaces = None
+    if "surfaces" in description:
+        surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description["surfaces"]))
+    run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding, surfaces)
     if classes and not classifiers and run.embedding_classifier is None:
         state = "is missing" if embedding is None else "does not recognize the classes of run.json"
         raise InputError(f"model: {file} {state}; copy the whole run directory")
@@ -168,7 +178,8 @@ def weights_file(run: Path, name: str) -> Path:
     return run / "weights" / f"{name}.safetensors"
 
 
-def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
+def _intact(path: Path, digest: str) -> bytes:
+    """Return the content of a file; raise InputError if it is missing or its SHA-256 is not `digest`."""
     try:
         content = read_file(path)
     except FileNotFoundError:
@@ -177,6 +188,11 @@ def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> 
         raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
     if content_digest([content]) != digest:
         raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
+    return content
+
+
+def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
+    content = _intact(path, digest)
     try:
         return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])
     except ValueError as error:

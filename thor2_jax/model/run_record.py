@@ -8,10 +8,10 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file
 
-__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "run_directories"]
+__all__ = ["FORMAT_WITH_SURFACES", "RUN_FILE", "RUN_FORMAT", "read_description", "run_directories"]
 
-RUN_FORMAT = 2
-"""Version of the layout, see `run_directory`. Format 1, of versions before 0.2, cannot be read."""
+RUN_FORMAT, FORMAT_WITH_SURFACES = 2, 3
+"""Versions of the layout, see `run_directory`. Format 1, of versions before 0.2, cannot be read."""
 
 RUN_FILE = "run.json"
 
@@ -37,9 +37,10 @@ def read_description(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None
-    if not isinstance(description, dict) or description.get("format") != RUN_FORMAT:
+    if not isinstance(description, dict) or description.get("format") not in (RUN_FORMAT, FORMAT_WITH_SURFACES):
         value = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected {RUN_FORMAT}; train it again")
+        expected = f"{RUN_FORMAT} or {FORMAT_WITH_SURFACES}"
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected {expected}; train it again")
     if description.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
             f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "

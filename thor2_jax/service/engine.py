@@ -209,7 +209,7 @@ class InferenceEngine:
         aligned = aligned_looks(clouds, config, config.looks)
         cloud_strips = strips(aligned, network, config)
         oriented = describe_aligned_looks(aligned, cloud_strips, network, config, config.looks)
-        inference = infer(self.model, oriented, clouds if self._embeds else None)
+        inference = infer(self.model, oriented, clouds, embeds=self._embeds)
         first = slice(None, None, config.looks)
         images, embeddings = oriented.first.images, oriented.first.embeddings
         computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference

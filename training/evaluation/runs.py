@@ -99,8 +99,9 @@ class Run:
             inputs: inputs of the baselines; None if no run has any.
         """
         model = self.model
-        clouds = described.packed if GALLERY in self.predictors else None
-        inference = jax.tree.map(np.asarray, infer(model, described.oriented, clouds, tuple(model.classifiers)))
+        names, embeds = tuple(model.classifiers), GALLERY in self.predictors
+        inference = infer(model, described.oriented, described.packed, names, embeds=embeds)
+        inference = jax.tree.map(np.asarray, inference)
         default = {name: inference.probabilities[name] for name in model.chosen_classifiers()}
         values = dict(inference.probabilities)
         if EMBEDDING in default:

@@ -256,7 +256,7 @@ def sample_views(
 
     Returns:
         The samples, and the label and the cloud (in metres) of each view of the held-out set. The clouds have no rim
-        and no boundary.
+        and no boundary, and the camera is at the origin.
 
     Raises:
         InputError: the source is unreadable.
@@ -271,9 +271,9 @@ def sample_views(
         if clouds:
             label = np.full(len(clouds), shard.label, np.int32)
             chunks.append(sample_normalized(padded_batches(clouds), label, view, network, config, rng, form))
-        for xyz, rgb in itertools.compress(views.clouds(), is_kept):
+        for (xyz, rgb), camera in itertools.compress(zip(views.clouds(), views.camera, strict=True), is_kept):
             # The slice is copied, since it would keep all views of the shard in memory.
-            kept.append((shard.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
+            kept.append((shard.label, ((xyz - camera) / np.float32(config.sigma_s), rgb.copy())))
         done += len(views)
         progress(done, total)
     return Samples.concatenated(chunks), kept

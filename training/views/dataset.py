@@ -16,9 +16,13 @@ object:
     counts  [V] int64       number of points of each view
     view    [V] int32       index of the view among all views of the object
     copy    [V] int32       0 is the view as rendered, others are augmented copies
+    camera  [V, 3] float32  position of the camera, scaled units; missing in datasets of earlier versions
 
-The manifest contains the job, that is, everything that determines the views, and the finished shards with their
-checksums. It contains no time stamps, so the same job always gives the same bytes.
+`surfaces.safetensors` has the surfaces of the objects (`thor2_jax.model.surfaces`); datasets of earlier versions lack
+this file.
+
+The manifest contains the job, that is, everything that determines the views, and the finished shards and the surfaces
+with their checksums. It contains no time stamps, so the same job always gives the same bytes.
 
 Worker processes render the views. This process normalizes and writes the shards one by one, in a fixed order.
 Therefore, the bytes do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
@@ -45,7 +49,9 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import check_output_directory, content_digest, read_file, remove_written, write_text
+from thor2_jax.model.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
+from training.objects.surfaces import surfaces_of
 from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.crops import CROPS, ViewCrops, read_crops
@@ -61,14 +67,14 @@ def remove_views(directory: Path) -> None:
     """Remove a dataset of views and their crops; files that `thor2 render` did not write are kept."""
     with contextlib.suppress(OSError, InputError):
         Manifest.parse(read_file(directory / MANIFEST), directory / MANIFEST)
-        names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz))"
+        names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz)|surfaces\.safetensors)"
         remove_written(directory, rf"({CROPS}/)?{names}")
 
 
 def encode(views: NormalizedViews) -> bytes:
     """Return the bytes of a shard's file."""
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
-    others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy")}
+    others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy", "camera")}
     return safetensors.numpy.save({"xyz": steps, **others})
 
 
@@ -105,10 +111,12 @@ class Manifest:
         job: everything that determines the views, in JSON types. `objects` is a list of tables with `name` and `mesh`
             (the mesh's checksum); `shards` is the number of shards.
         shards: finished shards, in the order of the job.
+        surfaces: checksum of the file of the surfaces; None without this file.
     """
 
     job: Mapping[str, Any]
     shards: tuple[Shard, ...] = ()
+    surfaces: str | None = None
 
     @property
     def views(self) -> int:
@@ -132,6 +140,7 @@ class Manifest:
             "left_out": self.left_out,
             "job": self.job,
             "shards": [dataclasses.asdict(shard) for shard in self.shards],
+            **({} if self.surfaces is None else {"surfaces": self.surfaces}),
         }
         checksum = content_digest([_dump(table)])
         write_text(directory / MANIFEST, _dump({**table, "sha256": checksum}))
@@ -149,7 +158,8 @@ class Manifest:
                 checksum = table.pop("sha256")
                 if checksum != content_digest([_dump(table)]):
                     raise ValueError("its checksum differs")
-                return cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                shards = tuple(Shard(**shard) for shard in table["shards"])
+                return cls(table["job"], shards, table.get("surfaces"))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
@@ -223,6 +233,23 @@ class ViewDataset:
             "job": self.manifest.job,
         }
 
+    @property
+    def surfaces(self) -> Surfaces | None:
+        """Surfaces of the classes; None in datasets of earlier versions.
+
+        Raises:
+            InputError: their file is missing or damaged.
+        """
+        digest = self.manifest.surfaces
+        return None if digest is None else Surfaces.of_content(self._content(SURFACES_FILE, digest))
+
+    def _content(self, file: str, digest: str) -> bytes:
+        content = intact_content(self.directory, file, digest)
+        if content is None:
+            path = self.directory / file
+            raise InputError(f"dataset: {path} is missing or damaged; repeat `thor2 render` to restore it")
+        return content
+
     def read(self, index: int) -> NormalizedViews:
         """Read the views of a shard.
 
@@ -230,12 +257,9 @@ class ViewDataset:
             InputError: the shard's file is missing or damaged.
         """
         shard = self.shards[index]
-        content = intact_content(self.directory, shard.file, shard.sha256)
-        if content is None:
-            path = self.directory / shard.file
-            raise InputError(f"dataset: {path} is missing or damaged; repeat `thor2 render` to restore it")
-        arrays = safetensors.numpy.load(content)
+        arrays = safetensors.numpy.load(self._content(shard.file, shard.sha256))
         xyz = arrays.pop("xyz").astype(np.float32) * np.float32(COORDINATE_STEP)
+        arrays.setdefault("camera", np.zeros((len(arrays["counts"]), 3), np.float32))
         return NormalizedViews(xyz, label=shard.label, **arrays)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
@@ -264,7 +288,7 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
         check_same_job(directory, stored.job, job)
     shards = stored.shards if stored else ()
     is_intact = [intact_content(directory, shard.file, shard.sha256) is not None for shard in shards]
-    manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)))
+    manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)), stored.surfaces if stored else None)
     if manifest != stored:
         manifest.write(directory)
     return manifest
@@ -310,15 +334,23 @@ def render_dataset(
     record, labels = job.record(), {name: label for label, name in enumerate(job.meshes)}
     total = len(labels) * len(job.angles) * job.copies
     with locked(out):
-        done = {shard.file: shard for shard in _begin(out, record).shards}
+        manifest = _begin(out, record)
+        done = {shard.file: shard for shard in manifest.shards}
         progress(_clouds(done), total)
+        digest = manifest.surfaces
+        is_missing = digest is not None and intact_content(out, SURFACES_FILE, digest) is None
+        if is_missing or not (digest or done):  # a dataset of an earlier version has shards and no surfaces
+            digest = write_checked(out / SURFACES_FILE, surfaces_of(job.read_meshes()).content)
+            manifest = dataclasses.replace(manifest, surfaces=digest)
+            manifest.write(out)
         missing = [file for file in job.shards if file not in done]
         with contextlib.closing(pool(render_task, job.tasks(missing))) as results:
             for file, rendered in zip(missing, results, strict=True):
                 name, views = job.shards[file]
                 with with_context(f"object {name!r}"):
                     done[file] = _store(out / file, labels[name], job.copies * len(views), rendered)
-                Manifest(record, tuple(done[file] for file in job.shards if file in done)).write(out)
+                shards = tuple(done[file] for file in job.shards if file in done)
+                dataclasses.replace(manifest, shards=shards).write(out)
                 progress(_clouds(done), total)
     return ViewDataset.open(out)
 

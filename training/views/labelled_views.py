@@ -16,6 +16,7 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import augmented_view
+from thor2_jax.model.surfaces import Surfaces
 from thor2_jax.printable import check_name, normal_name
 from training.readers.frames import FrameFolder
 from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
@@ -158,6 +159,11 @@ class WithLabelledViews:
                 "skipped": list(self._instances.skipped),
             },
         }
+
+    @property
+    def surfaces(self) -> Surfaces | None:
+        """Surfaces of the rendered views; None if a class has labelled views only."""
+        return self._rendered.surfaces if self._rendered and self._rendered.classes == self.classes else None
 
     def read(self, index: int) -> NormalizedViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.

@@ -245,6 +245,10 @@ class RenderJob:
             "shards": len(self.shards),
         }
 
+    def read_meshes(self) -> Iterator[TexturedMesh]:
+        """Read the mesh of each object, one at a time."""
+        return map(_read_mesh, self.meshes.values())
+
     def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
         """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh."""
         angles = self.angles

@@ -26,6 +26,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
+from thor2_jax.model.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds, matmul
 from training.views.crops import ViewCrops
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH
@@ -83,6 +84,7 @@ class NormalizedViews:
         label: index of the object among the classes.
         view: [V] int32, index of the view among all views of the object.
         copy: [V] int32, 0 is the view as rendered, others are augmented copies.
+        camera: [V, 3] float32, position of the camera in the frame of each view, scaled units.
     """
 
     xyz: NDArray[np.float32]
@@ -91,6 +93,7 @@ class NormalizedViews:
     label: int
     view: NDArray[np.int32]
     copy: NDArray[np.int32]
+    camera: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -127,6 +130,10 @@ class ViewSource(Protocol):
     def shards(self) -> Sequence[Any]:
         """One entry per shard, with its `label` and its number of `views`."""
 
+    @property
+    def surfaces(self) -> Surfaces | None:
+        """Surfaces of the classes; None if a class has no mesh."""
+
     def read(self, index: int) -> NormalizedViews:
         """Read the views of a shard."""
 
@@ -159,13 +166,14 @@ def normalize_views(
     Raises:
         InputError: a cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
-    xyz = [np.zeros((0, 3), np.float32)]
+    xyz, camera = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
     # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory.
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         for count, batch in padded_batches(clouds, boundary):
             normal = view_normalize(batch, config)
             padded, mask = np.asarray(normal.points)[:count], np.asarray(normal.mask)[:count]
             xyz.append(np.rint(padded[mask] / np.float32(COORDINATE_STEP)) * np.float32(COORDINATE_STEP))
+            camera.append(np.asarray(normal.camera)[:count])
     points = np.concatenate(xyz)
     if not (points <= MAX_VIEW_LENGTH).all():
         raise InputError(
@@ -174,7 +182,8 @@ def normalize_views(
         )
     colors = np.concatenate([np.zeros((0, 3), np.uint8), *(rgb for _, rgb in clouds)])
     counts = np.array([len(xyz) for xyz, _ in clouds], np.int64)
-    return NormalizedViews(points, colors, counts, label, np.array(view, np.int32), np.array(copy, np.int32))
+    numbers = np.array(view, np.int32), np.array(copy, np.int32)
+    return NormalizedViews(points, colors, counts, label, *numbers, np.concatenate(camera))
 
 
 NEARLY_EQUAL = 0.85
@@ -238,6 +247,8 @@ def reorient(normal: PointClouds, rng: np.random.Generator) -> PointClouds:
 class MemoryViews:
     """Source of views from clouds in memory, one shard per class; `read` normalizes them."""
 
+    surfaces: Surfaces | None = None
+
     def __init__(self, views: Mapping[str, Sequence[Cloud]], config: DescriptorConfig) -> None:
         """Store the clouds; nothing is computed yet.
 
@@ -287,6 +298,7 @@ class WithoutClasses:
         kept = (source.shards[index] for index in self._kept)
         self.shards = tuple(SourceShard(new[shard.label], shard.views) for shard in kept)
         self._source, self._names = source, sorted(set(names))
+        self._rows = np.array(list(new))
 
     @functools.cached_property
     def digest(self) -> str:
@@ -298,6 +310,11 @@ class WithoutClasses:
         """Record of the source and the omitted classes."""
         views = sum(shard.views for shard in self.shards)
         return {**self._source.record, "digest": self.digest, "views": views, "classes_left_out": self._names}
+
+    @property
+    def surfaces(self) -> Surfaces | None:
+        """Surfaces of the classes; None if the source has none."""
+        return jax.tree.map(lambda a: a[self._rows], self._source.surfaces)
 
     def read(self, index: int) -> NormalizedViews:
         """Read the views of a shard; raise errors as the source does."""

@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import assert_refused
-from small_runs import class_probabilities, untrained_embedding_run, untrained_run
+from small_runs import class_probabilities, untrained_embedding_run, untrained_run, with_surfaces
 from written_files import files_of
 
 import colornet
@@ -20,6 +21,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.surfaces import SURFACES_FILE
 from thor2_jax.recognizer import Recognizer
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
@@ -108,7 +110,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
-    "other format": (edited(format=3), "run.json has format 3"),
+    "other format": (edited(format=4), "run.json has format 4"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
     "no record": (edited(record=[1]), "run.json: TypeError"),
     "empty classes": (edited(classes=[]), "classes is []"),
@@ -147,7 +149,7 @@ def test_a_damaged_run_directory_is_refused_in_one_line(name: str, saved: Path, 
     assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700
 
 
-def test_a_run_without_classifiers_needs_its_embedding(tmp_path: Path) -> None:
+def test_a_run_without_classifiers_needs_its_other_files(tmp_path: Path) -> None:
     run = untrained_embedding_run(("a", "b"))
     save_run(run, tmp_path / "run")
     loaded = load_run(tmp_path / "run")
@@ -160,6 +162,15 @@ def test_a_run_without_classifiers_needs_its_embedding(tmp_path: Path) -> None:
     (tmp_path / "run" / "embedding.safetensors").unlink()
     for name, expected in (("run", "is missing"), ("renamed", "does not recognize the classes")):
         assert_refused(rf"^model: .*embedding\.safetensors {expected}.*[^\n]*$", load_run, tmp_path / name)
+    run = with_surfaces(run)
+    save_run(run, tmp_path / "meshes")
+    assert json.loads((tmp_path / "meshes" / "run.json").read_text())["format"] == 3
+    jax.tree.map(np.testing.assert_array_equal, load_run(tmp_path / "meshes").surfaces, run.surfaces)
+    with (tmp_path / "meshes" / SURFACES_FILE).open("ab") as file:
+        file.write(b"0")
+    assert_refused(rf"^model: .*{SURFACES_FILE} is damaged: its SHA-256 [^\n]*$", load_run, tmp_path / "meshes")
+    (tmp_path / "meshes" / SURFACES_FILE).unlink()
+    assert_refused(rf"^model: .*{SURFACES_FILE} is missing; copy [^\n]*$", load_run, tmp_path / "meshes")
     views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
     save_run(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)), tmp_path / "own")
     (tmp_path / "own" / REFERENCES_FILE).unlink()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from slow_tier import slow
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run
+from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run, with_surfaces
 
 import thor2_jax as thor2
 from thor2_jax import capacity
@@ -69,7 +69,7 @@ def test_the_engine_answers_as_the_recognizer(
 def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor2.RGBDFrame, tmp_path: Path) -> None:
     record: dict[str, object] = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
     run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
-    save_run(run, tmp_path / "run")
+    save_run(with_surfaces(run) if calibration else run, tmp_path / "run")
     confidences = check_answers(tmp_path / "run", frame)
     assert all((given is None) == (calibration is None) for given in confidences)
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+import safetensors.numpy
 from commands import Command
 from failures import Interrupted, full_disk
 from refusals import assert_refused
@@ -23,15 +24,16 @@ from written_files import files_of
 
 import thor2_jax
 from thor2_jax.errors import InputError
+from thor2_jax.model.surfaces import SURFACES_FILE
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
-from training.storage.jobs import MANIFEST, locked
+from training.storage.jobs import MANIFEST, locked, write_checked
 from training.storage.workers import local_workers, ray_workers
 from training.views import mesh_views, normalized_views
-from training.views.dataset import Manifest, ViewDataset, encode, remove_views, render_dataset
+from training.views.dataset import Manifest, Shard, ViewDataset, encode, remove_views, render_dataset
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
 from training.views.normalized_views import NormalizedViews, normalize_views, padded_batches
 
@@ -74,7 +76,7 @@ def test_files_of_a_dataset(whole: Path) -> None:
     assert [shard.file for shard in dataset.shards] == names
     shards = [(shard.label, shard.views, shard.left_out) for shard in dataset.shards]
     assert shards == [(0, 4, 0), (0, 2, 0), (1, 4, 0), (1, 2, 0)]
-    assert set(files_of(whole)) == {MANIFEST, *names}
+    assert set(files_of(whole)) == {MANIFEST, SURFACES_FILE, *names}
     assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(6))
     assert "time" not in (whole / MANIFEST).read_text()
 
@@ -106,11 +108,13 @@ def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monke
     assert files_of(tmp_path / "views") == files_of(whole)
 
 
-@pytest.mark.parametrize("stops", [(1, 4, 18), pytest.param((2, 3, *range(5, 18)), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize(
+    "stops", [(1, 6, 22), pytest.param((*range(2, 6), *range(7, 22)), marks=pytest.mark.slow)], ids=str
+)
 def test_rendering_resumes(stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupts before and after each of the nine files of a job is moved to its name.
+    """Interrupts before and after each of the eleven files of a job is moved to its name.
 
-    The quick ones are those before the first manifest, after the first shard, and the last one.
+    The quick ones are those before the first manifest, after the second one, and the last one.
     """
     replace, left = os.replace, 0
 
@@ -129,16 +133,16 @@ def test_rendering_resumes(stops: Sequence[int], whole: Path, tmp_path: Path, mo
         out, left = tmp_path / str(stop), stop
         with pytest.raises(Interrupted):
             render_dataset(JOB, out)
-        with pytest.raises(InputError, match=MANIFEST) if stop < 18 else contextlib.nullcontext():
+        with pytest.raises(InputError, match=MANIFEST) if stop < 22 else contextlib.nullcontext():
             ViewDataset.open(out)
         left, before = 0, files_of(out)
         seen: list[tuple[int, int]] = []
         render_dataset(JOB, out, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
         assert files_of(out) == files_of(whole)
         # Shards that were listed are not rendered again.
-        listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
-        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= listed]
-        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
+        stored = json.loads(before.get(MANIFEST, '{"views": 0}'))
+        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= stored["views"]]
+        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before) + 2 * ("surfaces" not in stored))
 
 
 def changed(folder: Path) -> dict[str, int]:
@@ -146,11 +150,14 @@ def changed(folder: Path) -> dict[str, int]:
 
 
 def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
-    bad, missing = copied / "0000-0001.safetensors", copied / "0001-0000.safetensors"
-    content = bytearray(bad.read_bytes())
-    content[1000] ^= 1
-    bad.write_bytes(content)
+    missing = copied / "0001-0000.safetensors"
+    for bad in (copied / "0000-0001.safetensors", copied / SURFACES_FILE):
+        content = bytearray(bad.read_bytes())
+        content[1000] ^= 1
+        bad.write_bytes(content)
     missing.unlink()
+    with pytest.raises(InputError, match=f"{SURFACES_FILE} is missing or damaged; repeat `thor2 render`"):
+        _ = ViewDataset.open(copied).surfaces
     before = changed(copied)
     render_dataset(JOB, copied)
     assert files_of(copied) == files_of(whole)
@@ -161,6 +168,23 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
         assert_refused(str(copied), render_dataset, JOB, copied)
     assert len(render_dataset(JOB, copied)) == 12
     assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
+
+
+def test_a_dataset_of_an_earlier_version_stays_as_it_is(copied: Path) -> None:
+    """It has neither surfaces nor cameras."""
+    (copied / SURFACES_FILE).unlink()
+    manifest, shards = ViewDataset.open(copied).manifest, list[Shard]()
+    for shard in manifest.shards:
+        arrays = safetensors.numpy.load((copied / shard.file).read_bytes())
+        del arrays["camera"]
+        shards.append(
+            dataclasses.replace(shard, sha256=write_checked(copied / shard.file, safetensors.numpy.save(arrays)))
+        )
+    Manifest(manifest.job, tuple(shards)).write(copied)
+    before = files_of(copied)
+    dataset = render_dataset(JOB, copied)
+    assert files_of(copied) == before
+    assert dataset.surfaces is None and np.array_equal(dataset.read(1).camera, np.zeros((2, 3)))
 
 
 def test_another_job_is_refused(copied: Path) -> None:
@@ -288,13 +312,16 @@ def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CONFIG)
             assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= COORDINATE_STEP / 2 * 1.02
             assert np.array_equal(rgb, cloud[1])
+        for (xyz, _), camera, cloud in zip(views.clouds(), views.camera, clouds, strict=True):
+            distance = np.linalg.norm(xyz.astype(np.float64) - camera, axis=1)
+            np.testing.assert_allclose(distance, CONFIG.sigma_s * np.linalg.norm(cloud[0], axis=1), atol=1e-4)
         assert np.array_equal(views.xyz, views_of(clouds).xyz)
         assert np.array_equal(np.rint(views.xyz / COORDINATE_STEP), views.xyz / COORDINATE_STEP)
     record = json.loads(json.dumps(dataset.record))
     assert record["digest"] == dataset.digest == hashlib.sha256((tmp_path / MANIFEST).read_bytes()).hexdigest()
     assert record["views"] == 60 and record["left_out"] == 0 and record["job"]["variations"] is None
     assert [entry["name"] for entry in record["job"]["objects"]] == list(OBJECTS)
-    size = sum(path.stat().st_size for path in tmp_path.iterdir())
+    size = sum(path.stat().st_size for path in tmp_path.iterdir() if path.name != SURFACES_FILE)
     assert size < 9 * sum(shard.points for shard in dataset.shards) + 60 * 100  # bytes for a point and for a view
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from refusals import assert_refused
@@ -10,6 +11,8 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
 from training.views.mesh_views import COORDINATE_STEP
@@ -52,6 +55,19 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     assert only.classes == ("mug", "box") and only.record["views"] == 3 + 28 + 18
     assert only.record["digest"] == only.digest != WithoutClasses(source, ["bowl"]).digest
     assert [only.read(k).label for k in range(3)] == [0, 0, 1] and only.read(1).view.tolist() == mugs.view.tolist()
+
+
+def test_surfaces_need_a_mesh_of_every_class() -> None:
+    bowl_and_mug = rendered()
+    bowl_and_mug.surfaces = surfaces_of(builtin_objects()[name] for name in ("white_bowl", "mug_blue"))
+    views = {"mug": [instance(100)]}
+    for more, expected in (({}, bowl_and_mug.surfaces), ({"pen": [instance(101)]}, None)):
+        source = WithLabelledViews(LabelledInstances(views | more), CONFIG, bowl_and_mug)
+        jax.tree.map(np.testing.assert_array_equal, source.surfaces, expected)
+    assert WithLabelledViews(LabelledInstances(views), CONFIG).surfaces is None
+    mug = WithoutClasses(bowl_and_mug, ["bowl"]).surfaces
+    jax.tree.map(np.testing.assert_array_equal, mug, jax.tree.map(lambda a: a[1:], bowl_and_mug.surfaces))
+    assert WithoutClasses(rendered(), ["bowl"]).surfaces is None
 
 
 def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,277 @@
+"""Evidence of surfaces: how well the points of an instance fit the surface and the colours of a class.
+
+>>> surfaces = surfaces_of(meshes)                             # training.objects.surfaces  # doctest: +SKIP
+>>> with_evidence(embedding.class_probabilities(oriented), surfaces, clouds)                # doctest: +SKIP
+
+A rigid pose of the class is searched for. The candidates are view directions, turns about the line of sight and
+anchors: the centroid of the visible part, or a corner of its box, coincides with that of the instance. The search goes
+through stages: in each one, the best poses are kept, more points are compared, and steps that minimize distances to
+tangent planes (Chen and Medioni, 1992) refine what is kept. Nearest points are looked up in a grid. Nothing is random,
+and all shapes are static.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
+
+from thor2_jax.descriptor.slicing import to_lab
+from thor2_jax.files import pack_arrays, unpack_arrays
+from thor2_jax.types import PointClouds, matmul
+
+__all__ = [
+    "FAR",
+    "GRID",
+    "N_POINTS",
+    "RADIUS",
+    "SURFACES_FILE",
+    "Surfaces",
+    "evidence",
+    "rotations",
+    "with_evidence",
+]
+
+SURFACES_FILE = "surfaces.safetensors"
+"""File of the surfaces in a run directory and in a dataset of views."""
+
+DIRECTIONS, TURNS = 27, 8
+"""Numbers of view directions and of turns about each of them; R rotations = DIRECTIONS * TURNS."""
+
+N_POINTS, GRID = 4096, 48
+"""P, points of a surface, and cells of the grid along each axis."""
+
+SAMPLED = 256
+"""Points of an instance that are compared in the end; the first ones of them in all stages but the last."""
+
+STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6), (SAMPLED, 1, 0))
+"""Points that score the poses, poses that are kept, and steps of their refinement, for each stage of the search."""
+
+FAR, REACH, RADIUS = 0.02, 0.012, 0.01
+"""Metres: margin of the grid and largest distance of a match in the first step, largest distance of a match in scores
+and values, radius of smoothed colours and of the roughness."""
+
+RIVAL, NAME_WEIGHTS = 0.1, np.array([-7, 2.7, 1.5], np.float32)
+KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8], np.float32), np.float32(2.1)
+"""See `with_evidence`; the weights are of logistic regressions on rendered views of four runs."""
+
+
+@functools.cache
+def rotations() -> NDArray[np.float32]:
+    """Return the rotations [R, 3, 3] from a class to a camera that looks along z."""
+    k = np.arange(DIRECTIONS) + 0.5  # directions on a Fibonacci spiral
+    z, angle = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
+    towards = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    x = np.cross(towards, np.eye(3)[np.abs(towards).argmin(axis=1)])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    turn = np.arange(TURNS)[:, None] * 2 * np.pi / TURNS
+    right = np.cos(turn) * x[:, None] + np.sin(turn) * np.cross(towards, x)[:, None]
+    back = np.broadcast_to(towards[:, None], right.shape)
+    return np.stack([right, np.cross(right, back), -back], axis=2).reshape(-1, 3, 3).astype(np.float32)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The surfaces of C classes, metres, relative to the centres of their boxes.
+
+    Attributes:
+        table: [C, 9, P] float32, points, smoothed L*a*b* colours and outward unit normals.
+        nearest: [C, GRID ** 3] int16, index of the point that is nearest to the centre of each cell.
+        grid: [C, 2, 3] float32, lower corner of the grid and sides of a cell.
+        boxes: [C, R, 3, 3] float32, lower corner, centroid and upper corner of the part that is visible in a rotation.
+    """
+
+    table: jax.Array
+    nearest: jax.Array
+    grid: jax.Array
+    boxes: jax.Array
+
+    @functools.cached_property
+    def content(self) -> bytes:
+        """The arrays as the bytes of a file."""
+        return pack_arrays({field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)})
+
+    @classmethod
+    def of_content(cls, content: bytes) -> "Surfaces":
+        """Return the surfaces with this `content`."""
+        return cls(**jax.tree.map(jnp.asarray, unpack_arrays(content)[0]))
+
+
+def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
+    """Return how well each instance fits a class.
+
+    Args:
+        surfaces: surfaces of the classes.
+        clouds: [B, N] clouds in metres, in any frame.
+        class_index: [B] int.
+
+    Returns:
+        [B, 3] float32: logarithm of the mean distance to the tangent planes divided by the roughness of the instance,
+        correlations of chroma and of lightness; zeros for an empty cloud.
+    """
+    return _fitted(surfaces, _samples(clouds), class_index)
+
+
+def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
+    """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
+
+    If the second class has at least `RIVAL` times the probability of the first one, the two divide the sum of their
+    probabilities p in the ratio of p exp(`NAME_WEIGHTS` e). The odds of all classes against the distractors are then
+    multiplied by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is most probable now.
+    """
+    return _weighed(probabilities, surfaces, _samples(clouds))
+
+
+class _Sample(NamedTuple):
+    """Points of an instance: [SAMPLED, 3] metres, smoothed L*a*b* colours [3, SAMPLED], roughness in metres."""
+
+    points: jax.Array
+    lab: jax.Array
+    rough: jax.Array
+    is_empty: jax.Array
+
+
+@jax.jit
+def _samples(clouds: PointClouds) -> _Sample:
+    def sample(points: jax.Array, colors: jax.Array, mask: jax.Array, camera: jax.Array) -> _Sample:
+        points = points - camera
+        # The order of the points is spatial, so that multiples of the golden ratio spread any number of them evenly.
+        golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
+        chosen = points[(golden.astype(np.float32) * mask.sum()).astype(int)]
+        return _Sample(chosen, *_surroundings(chosen, points, to_lab(colors), mask), ~mask.any())
+
+    return jax.vmap(sample)(clouds.points, clouds.colors, clouds.mask, clouds.camera)
+
+
+@jax.jit
+def _fitted(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> jax.Array:
+    def fit(sample: _Sample, index: jax.Array) -> jax.Array:
+        surface = jax.tree.map(lambda field: field[index], surfaces)
+        plane, chroma, lightness = _fit(surface, sample.points, sample.lab)
+        return jnp.stack([jnp.log((plane + 3e-4) / (sample.rough + 3e-4)), chroma, lightness])
+
+    def of_row(row: tuple[_Sample, jax.Array]) -> jax.Array:
+        return jax.lax.cond(row[0].is_empty, lambda *_: jnp.zeros(3), fit, *row)
+
+    # One by one on CPUs, where padding can be skipped, else at once.
+    map_rows = functools.partial(jax.lax.map, of_row)
+    return jax.lax.platform_dependent((samples, class_index), cpu=map_rows, default=jax.vmap(of_row))
+
+
+@jax.jit
+def _weighed(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) -> jax.Array:
+    largest, index = jax.lax.top_k(probabilities, min(2, probabilities.shape[1]))  # [B, K]
+    is_compared = largest >= RIVAL * largest[:, :1]
+    rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
+    rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
+    values = _fitted(surfaces, rows, index.T.ravel()).reshape(*index.T.shape, 3).swapaxes(0, 1)  # [B, K, 3]
+    logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
+    share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
+    changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
+    probabilities = jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False)
+    best = jnp.take_along_axis(values, changed.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    total = probabilities.sum(axis=1)
+    known = total.clip(1e-4, 1 - 1e-4)
+    known = jax.nn.sigmoid(jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS)
+    return probabilities * (known / jnp.maximum(total, 1e-30))[:, None]
+
+
+def _surroundings(chosen: jax.Array, points: jax.Array, lab: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return smoothed colours [3, n] of chosen points [n, 3], and the roughness of the instance in metres.
+
+    The roughness is the median distance of neighbours from their plane; 1 mm where no point has eight of them.
+    """
+    here, every = chosen - chosen.mean(axis=0), jnp.where(mask[:, None], points - chosen.mean(axis=0), 10)
+    squared = jnp.square(here).sum(axis=1)[:, None] + jnp.square(every).sum(axis=1) - 2 * matmul(here, every.T)
+    products = (every[:, :, None] * every[:, None]).reshape(-1, 9)
+    columns = jnp.concatenate([jnp.ones((len(every), 1)), lab, every, products], axis=1)
+    sums = matmul((squared < RADIUS**2).astype(jnp.float32), columns)
+    count, means = sums[:, 0], sums[:, 1:] / sums[:, :1]
+    spread = means[:, 6:].reshape(-1, 3, 3) - means[:, 3:6, None] * means[:, None, 3:6]
+    cofactors = jnp.stack([jnp.cross(spread[:, k - 2], spread[:, k - 1]) for k in range(3)], axis=1)
+    # The smallest eigenvalue is close to one divided by the trace of the inverse.
+    variance = (spread[:, 0] * cofactors[:, 0]).sum(axis=1) / jnp.trace(cofactors, axis1=1, axis2=2)
+    deviation = jnp.where(count >= 8, jnp.sqrt(jnp.maximum(variance, 0)), jnp.nan)
+    return means[:, :3].T, jnp.nan_to_num(jnp.nanmedian(deviation), nan=1e-3)
+
+
+def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the mean distance to the tangent planes in metres and the correlations of chroma and of lightness.
+
+    The arguments are one row of the surfaces, points [n, 3] and their colours [3, n].
+    """
+    points = jnp.concatenate([chosen, jnp.ones((len(chosen), 1))], axis=1).T
+
+    def look_up(q: jax.Array, rows: Sequence[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return offsets [K, 3, n] and distances [K, n] of points [K, 3, n], and rows of the table."""
+        at = ((q - surface.grid[0, :, None]) / surface.grid[1, :, None]).clip(0, GRID - 1).astype(int)
+        nearest = jnp.take(surface.nearest, (at[:, 0] * GRID + at[:, 1]) * GRID + at[:, 2], mode="clip").astype(int)
+        # XLA gathers single numbers on CPUs ten times as fast as rows.
+        found = jnp.stack([jnp.take(surface.table[k], nearest, mode="clip") for k in (0, 1, 2, *rows)], axis=1)
+        offset = q - found[:, :3]
+        return offset, jnp.linalg.norm(offset, axis=1), found[:, 3:]
+
+    def energy(pose: jax.Array, n: int) -> jax.Array:
+        """Return the energies [K] of poses from distances and colours; a shift of all colours is tolerated."""
+        _, distance, color = look_up(matmul(pose, points[:, :n]), (3, 4, 5))
+        matched = distance < REACH
+        differ = lab[:, :n] - color
+        shift = (
+            matmul(differ, matched[..., None].astype(jnp.float32))[..., 0]
+            / jnp.maximum(matched.sum(axis=1), 1)[:, None]
+        )
+        limit = np.array([30, 18, 18], np.float32)  # larger differences of L*, a*, b* are not due to the illumination
+        rest = (differ - shift.clip(-limit, limit)[..., None]) * np.array([[0.4], [1], [1]], np.float32)
+        cost = jnp.minimum(jnp.sqrt(jnp.square(rest).sum(axis=1)) / 30, 1)
+        return (jnp.minimum(distance / REACH, 1) + 0.6 * jnp.where(matched, cost, 1)).mean(axis=1)
+
+    def refine(step: jax.Array, pose: jax.Array, n: int) -> jax.Array:
+        q = matmul(pose, points[:, :n])
+        offset, distance, normal = look_up(q, (6, 7, 8))
+        residual = (offset * normal).sum(axis=1, keepdims=True)
+        rows = jnp.concatenate([jnp.cross(q, normal, axis=1), normal, -residual], axis=1)
+        weight = (distance < jnp.maximum(FAR - 0.002 * step, 0.008))[:, None].astype(jnp.float32)
+        system = matmul(rows[:, :6] * weight, rows.mT) + 1e-3 * np.eye(6, 7, dtype=np.float32)
+        for k in range(6):  # Gauss-Jordan elimination; the matrix is positive definite
+            row = system[:, k] / system[:, k, k, None]
+            system = (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
+        turn = Rotation.from_rotvec(system[:, :3, 6]).as_matrix()
+        return matmul(turn, pose).at[..., 3].add(system[:, 3:, 6])
+
+    pose, done = _candidates(surface.boxes, chosen), 0
+    for n, kept, steps in STAGES:
+        pose = pose[jax.lax.top_k(-energy(pose, n), kept)[1]]
+        pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
+        done += steps
+    offset, distance, found = (each[0] for each in look_up(matmul(pose, points), range(3, 9)))
+    matched = distance < REACH
+    plane = jnp.where(matched, jnp.abs((offset * found[3:]).sum(axis=0)), REACH).mean()
+    return plane, _correlation(lab[1:], found[1:3], matched), _correlation(lab[:1], found[:1], matched)
+
+
+def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:
+    """Return poses [5 * R, 3, 4], rotations and shifts from the camera to a class, for its boxes and points [n, 3]."""
+    x, y, z = points.mean(axis=0) / jnp.maximum(jnp.linalg.norm(points.mean(axis=0)), 1e-6)
+    c = 1 / jnp.maximum(1 + z, 1e-6)
+    ahead = jnp.array([[1 - c * x * x, -c * x * y, -x], [-c * x * y, 1 - c * y * y, -y], [x, y, z]])  # to the z axis
+    seen = matmul(points, ahead.T)
+    low, high = jnp.quantile(seen, np.array([0.02, 0.98], np.float32), axis=0)
+    low, middle, high = low - boxes[:, 0], seen.mean(axis=0) - boxes[:, 1], high - boxes[:, 2]  # places of the class
+    corners = [jnp.stack([a[:, 0], b[:, 1], middle[:, 2]], axis=1) for a in (low, high) for b in (low, high)]
+    inverse = jnp.asarray(rotations().mT)
+    shifts = -matmul(inverse[:, None], jnp.stack([middle, *corners], axis=1)[..., None])  # [R, 5, 3, 1]
+    turns = jnp.broadcast_to(matmul(inverse, ahead)[:, None], (*shifts.shape[:2], 3, 3))
+    return jnp.concatenate([turns, shifts], axis=3).reshape(-1, 3, 4)
+
+
+def _correlation(first: jax.Array, second: jax.Array, matched: jax.Array) -> jax.Array:
+    """Return the correlation of colours [c, n] over matched points [n]; lower without contrast."""
+    count = jnp.maximum(matched.sum(), 1)
+    first, second = ((each - (each * matched).sum(axis=1, keepdims=True) / count) * matched for each in (first, second))
+    return (first * second).sum() / jnp.sqrt(jnp.square(first).sum() * jnp.square(second).sum() + 100 * count)
