@@ -184,7 +184,7 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
     attributions = attribute_points(scores, looks, instance, index)
     yield "attributions", attributions
     yield "left_out", leave_out(scores, looks, index, attributions.values)
-    # If classifiers and gallery answer together, the best score may belong to another name than the answer.
+    # If surfaces or classifiers and gallery together decide, another name than the answer may have the best score.
     kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)

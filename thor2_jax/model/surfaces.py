@@ -49,6 +49,9 @@ N_POINTS, GRID = 4096, 48
 SAMPLED = 256
 """Points of an instance that are compared in the end; the first ones of them in all stages but the last."""
 
+LARGEST = 1024
+"""Largest number of points of an instance that are used; they smooth its colours and determine its roughness."""
+
 STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6), (SAMPLED, 1, 0))
 """Points that score the poses, poses that are kept, and steps of their refinement, for each stage of the search."""
 
@@ -139,14 +142,17 @@ class _Sample(NamedTuple):
 
 @jax.jit
 def _samples(clouds: PointClouds) -> _Sample:
-    def sample(points: jax.Array, colors: jax.Array, mask: jax.Array, camera: jax.Array) -> _Sample:
-        points = points - camera
-        # The order of the points is spatial, so that multiples of the golden ratio spread any number of them evenly.
+    def sample(row: tuple[jax.Array, ...]) -> _Sample:
+        points, colors, mask, camera = row
+        number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
+        # The order of the points is spatial. Equal steps through it, and multiples of the golden ratio, spread evenly.
+        every = (number * jnp.maximum(count / len(number), 1)).astype(int)
+        points, lab = points[every] - camera, to_lab(colors[every])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
-        chosen = points[(golden.astype(np.float32) * mask.sum()).astype(int)]
-        return _Sample(chosen, *_surroundings(chosen, points, to_lab(colors), mask), ~mask.any())
+        chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
+        return _Sample(chosen, *_surroundings(chosen, points, lab, number < count), count == 0)
 
-    return jax.vmap(sample)(clouds.points, clouds.colors, clouds.mask, clouds.camera)
+    return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera), batch_size=16)
 
 
 @jax.jit
@@ -222,10 +228,8 @@ def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Arra
         _, distance, color = look_up(matmul(pose, points[:, :n]), (3, 4, 5))
         matched = distance < REACH
         differ = lab[:, :n] - color
-        shift = (
-            matmul(differ, matched[..., None].astype(jnp.float32))[..., 0]
-            / jnp.maximum(matched.sum(axis=1), 1)[:, None]
-        )
+        total = matmul(differ, matched[..., None].astype(jnp.float32))[..., 0]
+        shift = total / jnp.maximum(matched.sum(axis=1, keepdims=True), 1)
         limit = np.array([30, 18, 18], np.float32)  # larger differences of L*, a*, b* are not due to the illumination
         rest = (differ - shift.clip(-limit, limit)[..., None]) * np.array([[0.4], [1], [1]], np.float32)
         cost = jnp.minimum(jnp.sqrt(jnp.square(rest).sum(axis=1)) / 30, 1)

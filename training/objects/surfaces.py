@@ -31,7 +31,7 @@ def _row(mesh: TexturedMesh) -> tuple[NDArray[np.generic], ...]:
     centres = np.stack(np.meshgrid(*[np.arange(GRID) + 0.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * grid[1] + low
     seen = points @ rotations().mT
     facing = np.maximum(-normals @ rotations()[:, 2].T, 0)  # [P, R]; occlusion by the class itself is neglected
-    mean = np.einsum("pr,rpk->rk", facing / facing.sum(axis=0), seen)
+    mean = np.einsum("pr,rpk->rk", facing / np.maximum(facing.sum(axis=0), 1e-6), seen)
     boxes = np.stack([seen.min(axis=1), mean, seen.max(axis=1)], axis=1)
     table, nearest = np.concatenate([points, smoothed, normals], axis=1).T, tree.query(centres)[1]
     return table.astype(np.float32), nearest.astype(np.int16), grid.astype(np.float32), boxes.astype(np.float32)

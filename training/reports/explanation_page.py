@@ -148,6 +148,9 @@ def _advice(explanation: Explanation) -> str:
 
 
 def _changes_text(explanation: Explanation) -> str:
+    scores = explanation.scores.of_instances([explanation.instance])[0]
+    if explanation.scores.names[scores.argmax()] != explanation.name:
+        return f"Without the other evidence that decided, the answer would be {explanation.runner_up}."
     kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
     sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
     changed = {change.kind for change in explanation.changes}

@@ -65,8 +65,8 @@ def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views:
 
 
 def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
-    clouds = PointClouds.pack(random_clouds(0, (1, 3, 30, 500)))
-    assert np.isfinite(evidence(surfaces, clouds, np.array([0, 1, 2, 0]))).all()
+    clouds = PointClouds.pack(random_clouds(0, (1, 3, 30, 500, 3000)))
+    assert np.isfinite(evidence(surfaces, clouds, np.array([0, 1, 2, 0, 1]))).all()
 
 
 @pytest.mark.parametrize("n_classes", [3, 1])

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import Command, Texts, run_thor2
 from failures import full_disk
@@ -87,6 +88,17 @@ def test_advice_on_a_wrong_name() -> None:
         advice = explanation_page._advice(explanation)  # type: ignore[arg-type]
         assert "thor2 enroll NAME FRAME --instance 7" in advice
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
+
+
+def test_no_change_is_claimed_for_a_name_that_other_evidence_decided() -> None:
+    """Surfaces, or an enrolled object, may decide against the best score."""
+    for best, text in (
+        (0, "No shift of the colours"),
+        (1, "Without the other evidence that decided, the"),
+    ):
+        scores = SimpleNamespace(names=("mug", "bowl"), of_instances=lambda _, best=best: np.eye(2)[[best]])
+        explanation = SimpleNamespace(scores=scores, instance=None, name="mug", runner_up="bowl", changes=())
+        assert explanation_page._changes_text(explanation).startswith(text)  # type: ignore[arg-type]
 
 
 def test_options_of_recognition_hold_and_the_next_command_is_shown(
