@@ -174,6 +174,8 @@ def train_run(
             views = [source.read(index).view for index in range(len(source.shards))]
             label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
             view = np.concatenate(views)
+        if settings.distractors is not None:
+            _ = source.surfaces  # a damaged file is reported now rather than after the fit
         parts = settings.folds
         if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
             fewest = min(len(np.unique(view[label == index])) for index in range(len(source.classes)))

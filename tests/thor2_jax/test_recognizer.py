@@ -142,8 +142,11 @@ def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
 
 
 def test_instances_are_compared_with_surfaces() -> None:
-    run = untrained_embedding_run(CLASSES)
+    """Classifiers that are evaluated without the embedding are not."""
+    run = untrained_embedding_run(CLASSES, ("tops",))
     recognizer, compared = Recognizer(run), Recognizer(with_surfaces(run))
+    answers = [each.recognize(tilted(patches()), classifiers=("tops",)) for each in (recognizer, compared)]
+    assert answers[0] == answers[1]
     instances, before = recognizer.infer(recognizer.prepare(tilted(patches())))
     _, after = compared.infer(instances)
     usable = [each for each in instances if each.reason is None]

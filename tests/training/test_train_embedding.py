@@ -90,6 +90,8 @@ def test_a_run_without_classifiers(whole: Whole, cache: Path) -> None:
 def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
     """They are those of the views and of each tenth distractor, in metres."""
     _, run, _, views = whole
+    calibration, _ = fit_calibration(run, views)
+    assert run.record.get("calibration") == (None if calibration is None else dataclasses.asdict(calibration))
     assert run.embedding is not None and run.embedding.distractors == 9 and run.embedding.sizes.nearest
     assert sorted(label for label, _ in views) == [0, 1, 2, 2, 2, 2]
     expected = render_clouds({0: DISTRACTORS.sources[0]}, 4)

@@ -87,7 +87,7 @@ class Explanation:
     Attributes:
         recognition: the answer.
         name: the explained name, which is the most probable one, also for an unknown object.
-        runner_up: the name with the second best score; None if there is no other name.
+        runner_up: the other name with the best score; None if there is no other name.
         scores: the explained quantity.
         instance: the cloud, n points.
         described: descriptor of the cloud.

@@ -116,8 +116,7 @@ class Calibration:
         correct_factor: factor of the first feature, the fused log-odds of the answer; 0 in new runs.
         known_bias: log-odds of a known object where the second feature is 0.
         known_factor: factor of the second feature, the embedding's log-odds of all classes against the distractors.
-        unknown_below: confidence that 90 % of the correct held-out answers reach (95 or 97 % in runs of earlier
-            versions).
+        unknown_below: confidence that 95 % of the correct held-out answers reach (97 % in runs of earlier versions).
         score_bias: log-odds of a correct answer to a known object where the score is one half.
         score_factor: factor of the log-odds of the score.
 

@@ -122,10 +122,9 @@ def infer(
     Args:
         model: the model.
         oriented: descriptors of the looks at B clouds.
-        clouds: [B, N] the clouds in metres, which are compared with the surfaces of the classes; None if only the
-            ratios of the class probabilities are needed.
+        clouds: [B, N] the clouds in metres; None to leave out the comparison with the surfaces of the classes.
         classifiers: classifiers to evaluate, see `Model.chosen_classifiers`; empty if the gallery alone answers.
-        embeds: whether to embed the clouds for the gallery; False if the classifiers alone answer.
+        embeds: whether to embed the clouds, if they are given, for the gallery.
     """
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}

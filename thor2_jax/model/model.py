@@ -212,10 +212,10 @@ class Model:
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
         """Return the lowest confidence [n] of an answer with each of the `names`: `unknown_below`, if it is set.
 
-        For a class with an output of the classifiers, it is by default the confidence that 90 % of the correct answers
-        on held-out views reach (95 or 97 % in runs of earlier versions), which is stored in the run; 0 in runs without
-        it. For other objects, and for all names if the gallery alone answers, 95 % of the correct answers on frames
-        reach it, and it depends on the number of enrolled views, see `Gallery.unknown_below`.
+        By default it is the confidence that 95 % of the correct answers on held-out views or frames reach (97 % in runs
+        of earlier versions). For a class with an output of the classifiers, it is measured on held-out views and stored
+        in the run, or 0 in runs without it. For other objects, and for all names if the gallery alone answers, it
+        depends on the number of enrolled views, see `Gallery.unknown_below`.
 
         Args:
             answer_by: source of the answers, see `answers_by`.

@@ -69,7 +69,7 @@ class TrainedRun:
         classifiers: feature -> trained MLP.
         record: record of the training (options, counts, metrics) as JSON values.
         embedding: embedding of the run, which may recognize its classes, too; None for the packaged one.
-        surfaces: surfaces of the classes, with which the embedding rejects unknown objects; None for no such test.
+        surfaces: surfaces of the classes, with which instances are compared; None if a class has no mesh.
     """
 
     config: DescriptorConfig
@@ -164,8 +164,13 @@ def load_run(path: str | Path) -> TrainedRun:
     if embedding is not None and embedding.references is None and description.get("references"):
         raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
     surfaces = None
-    if "surfaces" in description:
-        surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description["surfaces"]))
+    if description["format"] == FORMAT_WITH_SURFACES:
+        surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description.get("surfaces", "")))
+        if len(surfaces.table) != len(classes):
+            raise InputError(
+                f"model: {path / SURFACES_FILE} has surfaces of {len(surfaces.table)} classes; expected "
+                f"{len(classes)}; copy the whole run directory"
+            )
     run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding, surfaces)
     if classes and not classifiers and run.embedding_classifier is None:
         state = "is missing" if embedding is None else "does not recognize the classes of run.json"

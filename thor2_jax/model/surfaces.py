@@ -5,8 +5,8 @@
 
 A rigid pose of the class is searched for. The candidates are view directions, turns about the line of sight and
 anchors: the centroid of the visible part, or a corner of its box, coincides with that of the instance. The search goes
-through stages: in each one, the best poses are kept, more points are compared, and steps that minimize distances to
-tangent planes (Chen and Medioni, 1992) refine what is kept. Nearest points are looked up in a grid. Nothing is random,
+through stages: in each one, the best poses are kept, more points are compared, and steps of the point-to-plane ICP
+algorithm (Chen and Medioni, 1992) refine what is kept. Nearest points are looked up in a grid. Nothing is random,
 and all shapes are static.
 """
 
@@ -55,13 +55,16 @@ LARGEST = 1024
 STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6), (SAMPLED, 1, 0))
 """Points that score the poses, poses that are kept, and steps of their refinement, for each stage of the search."""
 
-FAR, REACH, RADIUS = 0.02, 0.012, 0.01
-"""Metres: margin of the grid and largest distance of a match in the first step, largest distance of a match in scores
-and values, radius of smoothed colours and of the roughness."""
+FAR, REACH = 0.02, 0.012
+"""FAR: margin of the grid, and largest distance of a match in the first step of the refinement, metres. REACH: largest
+distance of a match in scores and values, metres."""
+
+RADIUS = 0.01
+"""Radius of the neighbourhoods for smoothed colours and for the roughness, metres."""
 
 RIVAL, NAME_WEIGHTS = 0.1, np.array([-7, 2.7, 1.5], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8], np.float32), np.float32(2.1)
-"""See `with_evidence`; the weights are of logistic regressions on rendered views of four runs."""
+"""See `with_evidence`; logistic regressions on rendered views of four runs give similar weights."""
 
 
 @functools.cache
@@ -111,24 +114,24 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
 
     Args:
         surfaces: surfaces of the classes.
-        clouds: [B, N] clouds in metres, in any frame.
+        clouds: [B, N] clouds in metres, in any frame; padding follows the points.
         class_index: [B] int.
 
     Returns:
-        [B, 3] float32: logarithm of the mean distance to the tangent planes divided by the roughness of the instance,
+        [B, 3] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
         correlations of chroma and of lightness; zeros for an empty cloud.
     """
-    return _fitted(surfaces, _samples(clouds), class_index)
+    return _fit_rows(surfaces, _sample_points(clouds), class_index)
 
 
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
-    If the second class has at least `RIVAL` times the probability of the first one, the two divide the sum of their
-    probabilities p in the ratio of p exp(`NAME_WEIGHTS` e). The odds of all classes against the distractors are then
-    multiplied by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is most probable now.
+    If the second class has at least `RIVAL` times the probability of the first one, the total probability of the two is
+    shared in proportion to p exp(`NAME_WEIGHTS` e). The odds of all classes against the distractors are then multiplied
+    by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is most probable after this step.
     """
-    return _weighed(probabilities, surfaces, _samples(clouds))
+    return _reweight(probabilities, surfaces, _sample_points(clouds))
 
 
 class _Sample(NamedTuple):
@@ -141,7 +144,7 @@ class _Sample(NamedTuple):
 
 
 @jax.jit
-def _samples(clouds: PointClouds) -> _Sample:
+def _sample_points(clouds: PointClouds) -> _Sample:
     def sample(row: tuple[jax.Array, ...]) -> _Sample:
         points, colors, mask, camera = row
         number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
@@ -150,20 +153,20 @@ def _samples(clouds: PointClouds) -> _Sample:
         points, lab = points[every] - camera, to_lab(colors[every])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
         chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
-        return _Sample(chosen, *_surroundings(chosen, points, lab, number < count), count == 0)
+        return _Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), count == 0)
 
     return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera), batch_size=16)
 
 
 @jax.jit
-def _fitted(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> jax.Array:
+def _fit_rows(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> jax.Array:
     def fit(sample: _Sample, index: jax.Array) -> jax.Array:
         surface = jax.tree.map(lambda field: field[index], surfaces)
         plane, chroma, lightness = _fit(surface, sample.points, sample.lab)
         return jnp.stack([jnp.log((plane + 3e-4) / (sample.rough + 3e-4)), chroma, lightness])
 
     def of_row(row: tuple[_Sample, jax.Array]) -> jax.Array:
-        return jax.lax.cond(row[0].is_empty, lambda *_: jnp.zeros(3), fit, *row)
+        return jax.lax.cond(row[0].is_empty, lambda *_: jnp.zeros(3, jnp.float32), fit, *row)
 
     # One by one on CPUs, where padding can be skipped, else at once.
     map_rows = functools.partial(jax.lax.map, of_row)
@@ -171,12 +174,12 @@ def _fitted(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> jax
 
 
 @jax.jit
-def _weighed(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) -> jax.Array:
+def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) -> jax.Array:
     largest, index = jax.lax.top_k(probabilities, min(2, probabilities.shape[1]))  # [B, K]
     is_compared = largest >= RIVAL * largest[:, :1]
     rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
     rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fitted(surfaces, rows, index.T.ravel()).reshape(*index.T.shape, 3).swapaxes(0, 1)  # [B, K, 3]
+    values = _fit_rows(surfaces, rows, index.T.ravel()).reshape(*index.T.shape, 3).swapaxes(0, 1)  # [B, K, 3]
     logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
     share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
     changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
@@ -188,7 +191,9 @@ def _weighed(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) -> 
     return probabilities * (known / jnp.maximum(total, 1e-30))[:, None]
 
 
-def _surroundings(chosen: jax.Array, points: jax.Array, lab: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _describe_neighbourhoods(
+    chosen: jax.Array, points: jax.Array, lab: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Return smoothed colours [3, n] of chosen points [n, 3], and the roughness of the instance in metres.
 
     The roughness is the median distance of neighbours from their plane; 1 mm where no point has eight of them.
@@ -196,9 +201,9 @@ def _surroundings(chosen: jax.Array, points: jax.Array, lab: jax.Array, mask: ja
     here, every = chosen - chosen.mean(axis=0), jnp.where(mask[:, None], points - chosen.mean(axis=0), 10)
     squared = jnp.square(here).sum(axis=1)[:, None] + jnp.square(every).sum(axis=1) - 2 * matmul(here, every.T)
     products = (every[:, :, None] * every[:, None]).reshape(-1, 9)
-    columns = jnp.concatenate([jnp.ones((len(every), 1)), lab, every, products], axis=1)
+    columns = jnp.concatenate([jnp.ones_like(lab[:, :1]), lab, every, products], axis=1)
     sums = matmul((squared < RADIUS**2).astype(jnp.float32), columns)
-    count, means = sums[:, 0], sums[:, 1:] / sums[:, :1]
+    count, means = sums[:, 0], sums[:, 1:] / jnp.maximum(sums[:, :1], 1)
     spread = means[:, 6:].reshape(-1, 3, 3) - means[:, 3:6, None] * means[:, None, 3:6]
     cofactors = jnp.stack([jnp.cross(spread[:, k - 2], spread[:, k - 1]) for k in range(3)], axis=1)
     # The smallest eigenvalue is close to one divided by the trace of the inverse.
@@ -208,11 +213,11 @@ def _surroundings(chosen: jax.Array, points: jax.Array, lab: jax.Array, mask: ja
 
 
 def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the mean distance to the tangent planes in metres and the correlations of chroma and of lightness.
+    """Return the mean point-to-plane distance in metres and the correlations of chroma and of lightness.
 
     The arguments are one row of the surfaces, points [n, 3] and their colours [3, n].
     """
-    points = jnp.concatenate([chosen, jnp.ones((len(chosen), 1))], axis=1).T
+    points = jnp.concatenate([chosen, jnp.ones_like(chosen[:, :1])], axis=1).T
 
     def look_up(q: jax.Array, rows: Sequence[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return offsets [K, 3, n] and distances [K, n] of points [K, 3, n], and rows of the table."""

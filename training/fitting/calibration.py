@@ -62,7 +62,7 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
     return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
 
 
-KEPT = 0.9
+KEPT = 0.95
 """Fraction of the correct held-out answers whose confidence must reach the threshold of a run."""
 
 

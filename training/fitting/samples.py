@@ -256,7 +256,8 @@ def sample_views(
 
     Returns:
         The samples, and the label and the cloud (in metres) of each view of the held-out set. The clouds have no rim
-        and no boundary, and the camera is at the origin.
+        and no boundary. The camera is at the origin, except in views of earlier
+        versions.
 
     Raises:
         InputError: the source is unreadable.

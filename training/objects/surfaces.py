@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,14 @@ Array = NDArray[np.float64]
 
 
 def surfaces_of(meshes: Iterable[TexturedMesh]) -> Surfaces:
-    """Return the surfaces of meshes, which are read one at a time."""
-    return Surfaces(*map(jnp.asarray, map(np.stack, zip(*map(_row, meshes), strict=True))))
+    """Return the surfaces of meshes, which are read one at a time; the normals of a mesh may all point inwards."""
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):  # accelerators round differently
+        return Surfaces(*map(jnp.asarray, map(np.stack, zip(*map(_surface, meshes), strict=True))))
 
 
-def _row(mesh: TexturedMesh) -> tuple[NDArray[np.generic], ...]:
+def _surface(mesh: TexturedMesh) -> tuple[NDArray[np.generic], ...]:
     """Return the fields of `Surfaces` for one class, without the first axis."""
-    points, colors, normals = _samples(mesh)
+    points, colors, normals = _sample_points(mesh)
     tree, lab = KDTree(points), np.asarray(to_lab(jnp.asarray(colors, jnp.float32)))
     smoothed = np.stack([lab[near].mean(axis=0) for near in tree.query_ball_point(points, RADIUS)])
     low, high = points.min(axis=0) - FAR, points.max(axis=0) + FAR
@@ -37,8 +39,8 @@ def _row(mesh: TexturedMesh) -> tuple[NDArray[np.generic], ...]:
     return table.astype(np.float32), nearest.astype(np.int16), grid.astype(np.float32), boxes.astype(np.float32)
 
 
-def _samples(mesh: TexturedMesh) -> tuple[Array, Array, Array]:
-    """Return points, sRGB colours in [0, 1] and normals [P, 3] at places of a mesh that are drawn by area."""
+def _sample_points(mesh: TexturedMesh) -> tuple[Array, Array, Array]:
+    """Return positions, sRGB colours in [0, 1] and outward normals [P, 3] of points sampled uniformly by area."""
     rng, corners = np.random.default_rng(0), mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
@@ -49,4 +51,5 @@ def _samples(mesh: TexturedMesh) -> tuple[Array, Array, Array]:
     a, b, c = np.moveaxis(corners[face], 1, 0)
     points = a + second * (b - a) + third * (c - a) - mesh.centre
     colors = mesh.colors_at(face, np.concatenate([second, third], axis=1))
-    return points, colors / 255, across[face] / area[face, None]
+    normals = across[face] / area[face, None]
+    return points, colors / 255, normals * np.copysign(1, (points * normals).sum())

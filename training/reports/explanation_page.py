@@ -108,7 +108,7 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         answer = f"{name} is {check.margin:.2f} more similar (in cosine) than any other enrolled object."
     answer += " The attributions below explain this number."
     if explanation.runner_up is not None:
-        answer += f" The next best name is {explanation.runner_up}."
+        answer += f" The best other name is {explanation.runner_up}."
     comparison = (
         f"Without the tenth of the points with the highest attributions, the answer loses {check.most_attributed:.2f} "
         f"of its {lost}; without a random tenth, {check.random:.2f} on average."
@@ -150,7 +150,8 @@ def _advice(explanation: Explanation) -> str:
 def _changes_text(explanation: Explanation) -> str:
     scores = explanation.scores.of_instances([explanation.instance])[0]
     if explanation.scores.names[scores.argmax()] != explanation.name:
-        return f"Without the other evidence that decided, the answer would be {explanation.runner_up}."
+        decided = "the surfaces of the classes, or classifiers and gallery together, decided"
+        return f"The explained scores alone would give {explanation.runner_up}; {decided}."
     kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
     sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
     changed = {change.kind for change in explanation.changes}

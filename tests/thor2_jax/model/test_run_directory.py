@@ -166,6 +166,11 @@ def test_a_run_without_classifiers_needs_its_other_files(tmp_path: Path) -> None
     save_run(run, tmp_path / "meshes")
     assert json.loads((tmp_path / "meshes" / "run.json").read_text())["format"] == 3
     jax.tree.map(np.testing.assert_array_equal, load_run(tmp_path / "meshes").surfaces, run.surfaces)
+    few = dataclasses.replace(run, surfaces=jax.tree.map(lambda field: field[:1], run.surfaces))
+    save_run(few, tmp_path / "few")
+    assert_refused(
+        rf"^model: .*{SURFACES_FILE} has surfaces of 1 classes; expected 2; copy [^\n]*$", load_run, tmp_path / "few"
+    )
     with (tmp_path / "meshes" / SURFACES_FILE).open("ab") as file:
         file.write(b"0")
     assert_refused(rf"^model: .*{SURFACES_FILE} is damaged: its SHA-256 [^\n]*$", load_run, tmp_path / "meshes")

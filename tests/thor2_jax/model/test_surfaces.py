@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from small_clouds import random_clouds
 
-from thor2_jax.model.surfaces import Surfaces, evidence, with_evidence
+from thor2_jax.model.surfaces import REACH, SAMPLED, Surfaces, _fit_rows, _sample_points, evidence, with_evidence
 from thor2_jax.types import Cloud, PointClouds
 from training.objects.builtin_objects import builtin_objects
+from training.objects.mesh import TexturedMesh
 from training.objects.surfaces import surfaces_of
 from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
@@ -52,7 +53,9 @@ def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> N
     """Cloud and camera are moved together; the search is not continuous."""
     position = np.array([0.3, -2, 5], np.float32)
     moved = PointClouds.pack([(xyz + position, rgb) for xyz, rgb in views], camera=np.tile(position, (9, 1)))
-    before, after = (np.asarray(evidence(surfaces, each, OWN)) for each in (PointClouds.pack(views), moved))
+    still = PointClouds.pack(views)
+    np.testing.assert_allclose(_sample_points(moved).points, _sample_points(still).points, atol=1e-5)
+    before, after = (np.asarray(evidence(surfaces, each, OWN)) for each in (still, moved))
     assert np.abs(after - before).max() < 0.3
 
 
@@ -65,8 +68,54 @@ def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views:
 
 
 def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
-    clouds = PointClouds.pack(random_clouds(0, (1, 3, 30, 500, 3000)))
-    assert np.isfinite(evidence(surfaces, clouds, np.array([0, 1, 2, 0, 1]))).all()
+    """Also points that are far apart, for example in millimetres."""
+    clouds = random_clouds(0, (1, 3, 30, 500, 3000))
+    clouds.append((clouds[-1][0] * np.float32(1000), clouds[-1][1]))
+    assert np.isfinite(evidence(surfaces, PointClouds.pack(clouds), np.array([0, 1, 2, 0, 1, 2]))).all()
+
+
+def test_points_beyond_the_surface_count_with_the_largest_distance(surfaces: Surfaces) -> None:
+    points = (np.random.default_rng(0).random((2000, 3)) * 3 + [0, 0, 2]).astype(np.float32)
+    clouds = PointClouds.pack([(points, np.zeros((2000, 3), np.uint8))])
+    expected = [np.log((REACH + 3e-4) / (1e-3 + 3e-4)), 0, 0]  # nothing is near, and no point has neighbours
+    np.testing.assert_allclose(evidence(surfaces, clouds, np.zeros(1, int))[0], expected, atol=0.01)
+
+
+def test_samples_spread_over_large_clouds() -> None:
+    x = np.linspace(0, 1, 3000, dtype=np.float32)
+    line = np.stack([x, np.zeros_like(x), np.full_like(x, 0.5)], axis=1)
+    chosen = _sample_points(PointClouds.pack([(line, np.zeros((3000, 3), np.uint8))])).points
+    np.testing.assert_allclose(np.sort(chosen[0, :, 0]), np.linspace(0, 1, SAMPLED), atol=0.02)
+
+
+@pytest.mark.parametrize("noise", [3e-4, 1e-3])
+def test_the_roughness_is_the_noise_of_a_plane(noise: float) -> None:
+    """The plane through some twenty neighbours takes a part of the noise."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(0, 0.08, (1000, 2)), 0.5 + rng.normal(0, noise, 1000)]).astype(np.float32)
+    rough = _sample_points(PointClouds.pack([(points, np.zeros((1000, 3), np.uint8))])).rough
+    assert 0.7 * noise < float(rough[0]) < 1.05 * noise
+
+
+def test_one_colour_has_no_correlation() -> None:
+    plate = builtin_objects()["white_plate"]
+    nearly = 200 + np.random.default_rng(0).integers(0, 4, (len(plate.faces), 3, 3), dtype=np.uint8)
+    plain = TexturedMesh(plate.vertices, plate.faces, corner_colors=nearly)
+    clouds = PointClouds.pack([view_cloud(plain, camera_pose(*angles, plain.centre)) for angles in POSES])
+    assert np.abs(evidence(surfaces_of([plain]), clouds, np.zeros(3, int))[:, 1:]).max() < 0.05
+
+
+def test_accelerators_compare_all_rows_at_once(
+    surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds = PointClouds.pack(views)
+    expected = np.asarray(evidence(surfaces, clouds, OWN))
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, default: default(*arguments))
+    _fit_rows.clear_cache()
+    try:
+        np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
+    finally:
+        _fit_rows.clear_cache()
 
 
 @pytest.mark.parametrize("n_classes", [3, 1])

@@ -94,7 +94,7 @@ def test_no_change_is_claimed_for_a_name_that_other_evidence_decided() -> None:
     """Surfaces, or an enrolled object, may decide against the best score."""
     for best, text in (
         (0, "No shift of the colours"),
-        (1, "Without the other evidence that decided, the"),
+        (1, "The explained scores alone would give bowl"),
     ):
         scores = SimpleNamespace(names=("mug", "bowl"), of_instances=lambda _, best=best: np.eye(2)[[best]])
         explanation = SimpleNamespace(scores=scores, instance=None, name="mug", runner_up="bowl", changes=())

@@ -8,14 +8,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from image_files import patches, tilted
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import untrained_run
+from small_runs import untrained_embedding_run, untrained_run, with_surfaces
 
 import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import save_run
+from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
@@ -74,6 +77,16 @@ def test_each_sequence_is_answered_by_its_run(tmp_path: Path) -> None:
             expected = np.zeros((3, 3))
             expected[:, columns] = alone.probabilities(frame, described, None)["ce"]  # type: ignore[arg-type]
             np.testing.assert_array_equal(values, expected.astype(np.float32))
+
+
+def test_confidences_are_those_of_recognition(tmp_path: Path) -> None:
+    """Instances are compared with surfaces, too."""
+    record: dict[str, object] = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))}
+    save_run(with_surfaces(untrained_embedding_run(("a", "b"), record=record)), tmp_path / "run")
+    (run,), recognizer, frame = load_runs([tmp_path / "run"]), Recognizer.load(tmp_path / "run"), tilted(patches())
+    values = run.probabilities("", recognizer.describe(frame), None)["embedding"]
+    expected = [answer.confidence for answer in recognizer.recognize(frame) if answer.confidence is not None]
+    assert len(expected) > 1 and values.max(axis=1)[: len(expected)] == pytest.approx(expected, rel=1e-5)
 
 
 def test_incompatible_sequence_runs_are_refused(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """Surfaces of meshes: samples, grids of nearest samples and visible parts, against analytic values and scipy."""
 
+import dataclasses
+
 import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
 from colornet.colors import MEAN_WHITE, to_lab
-from thor2_jax.model.surfaces import GRID, rotations
+from thor2_jax.model.surfaces import FAR, GRID, rotations
 from training.objects.mesh import TexturedMesh
 from training.objects.surfaces import surfaces_of
 
@@ -52,3 +54,21 @@ def test_rotations_are_proper_and_look_from_all_sides() -> None:
     anywhere = rng.standard_normal((1000, 3))
     anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
     assert np.degrees(np.arccos((anywhere @ matrices[:, 2].T).max(axis=1))).max() < 30
+
+
+def test_a_triangle() -> None:
+    """Points are spread evenly over it and have its colours; the faces of a mesh may all be inside out."""
+    vertices = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.1, 0]])
+    colors = np.array([[[0, 0, 0], [255, 0, 0], [0, 0, 255]]], np.uint8)
+    mesh = TexturedMesh(vertices, np.array([[0, 1, 2]], np.int32), corner_colors=colors)
+    surfaces = surfaces_of([mesh])
+    points, lab, _ = np.split(np.asarray(surfaces.table[0], np.float64).T, 3, axis=1)
+    weights = (points + mesh.centre)[:, :2] / [0.2, 0.1]  # of the second and third corner
+    assert (weights > -1e-6).all() and (weights.sum(axis=1) < 1 + 1e-6).all()
+    np.testing.assert_allclose(weights.mean(axis=0), 1 / 3, atol=0.01)
+    np.testing.assert_allclose(surfaces.grid[0, 0], points.min(axis=0) - FAR, atol=1e-6)
+    assert lab[weights[:, 0] > 0.8, 2].mean() > 20 > -20 > lab[weights[:, 1] > 0.8, 2].mean()  # red, blue
+    ball = sphere((10, 120, 60), (0, 0, 0))
+    inverted = dataclasses.replace(ball, faces=ball.faces[:, ::-1], corner_colors=ball.corner_colors[:, ::-1])
+    both = surfaces_of([ball, inverted])
+    np.testing.assert_allclose((both.table[:, :3] * both.table[:, 6:]).sum(axis=1), RADIUS, rtol=0.01)
