@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy.spatial.transform import Rotation
-from small_runs import untrained_embedding_run
+from small_runs import untrained_embedding_run, with_surfaces
 
 import colornet
 import thor2_jax as thor2
@@ -114,12 +114,12 @@ def products(traced: Any) -> Iterator[Any]:
 
 def test_products_of_recognition_are_float32_on_every_device(clouds: thor2.PointClouds) -> None:
     """TF32, the default of recent GPUs, changes confidences in the third digit."""
-    run = untrained_embedding_run("abc", FEATURES)
+    run = with_surfaces(untrained_embedding_run("abc", FEATURES))
     views = References(np.ones((3, run.embedding.size), np.float16), np.arange(3, dtype=np.int32), run.classes)
     model = Model.of_run(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)))
 
     def inferred(clouds: thor2.PointClouds) -> Any:
-        return infer(model, describe_looks(clouds, NETWORK, model.run.config, 4), clouds)
+        return infer(model, describe_looks(clouds, NETWORK, model.run.config, 4), clouds, embeds=True)
 
     few = jax.tree.map(lambda a: a[:4], clouds)
     precisions = set(products(jax.make_jaxpr(inferred)(few)))

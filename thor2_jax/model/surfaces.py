@@ -18,7 +18,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 from numpy.typing import NDArray
 
 from thor2_jax.descriptor.slicing import to_lab
@@ -250,7 +249,7 @@ def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Arra
         for k in range(6):  # Gauss-Jordan elimination; the matrix is positive definite
             row = system[:, k] / system[:, k, k, None]
             system = (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
-        turn = Rotation.from_rotvec(system[:, :3, 6]).as_matrix()
+        turn = _rotation(system[:, :3, 6])
         return matmul(turn, pose).at[..., 3].add(system[:, 3:, 6])
 
     pose, done = _candidates(surface.boxes, chosen), 0
@@ -277,6 +276,13 @@ def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:
     shifts = -matmul(inverse[:, None], jnp.stack([middle, *corners], axis=1)[..., None])  # [R, 5, 3, 1]
     turns = jnp.broadcast_to(matmul(inverse, ahead)[:, None], (*shifts.shape[:2], 3, 3))
     return jnp.concatenate([turns, shifts], axis=3).reshape(-1, 3, 4)
+
+
+def _rotation(vector: jax.Array) -> jax.Array:
+    """Return the rotations [K, 3, 3] of rotation vectors [K, 3]; JAX's own have products in TF32 on GPUs."""
+    angle = jnp.maximum(jnp.linalg.norm(vector, axis=-1), 1e-9)[:, None, None]
+    cross = jnp.cross(vector[:, None], jnp.eye(3, dtype=vector.dtype)).mT / angle
+    return jnp.eye(3, dtype=vector.dtype) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * matmul(cross, cross)
 
 
 def _correlation(first: jax.Array, second: jax.Array, matched: jax.Array) -> jax.Array:

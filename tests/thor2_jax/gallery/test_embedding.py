@@ -65,7 +65,7 @@ def test_a_gallery_beside_a_run_of_another_descriptor(embedding: Embedding, clou
     run = untrained_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, n_slices=3))
     model = Model.of_run(dataclasses.replace(run, embedding=embedding))
     oriented = describe_looks(clouds, run.network, run.config, LOOKS)
-    embeddings = infer(model, oriented, clouds).embeddings
+    embeddings = infer(model, oriented, clouds, embeds=True).embeddings
     np.testing.assert_allclose(embeddings[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
