@@ -195,7 +195,8 @@ def _describe_neighbourhoods(
 ) -> tuple[jax.Array, jax.Array]:
     """Return smoothed colours [3, n] of chosen points [n, 3], and the roughness of the instance in metres.
 
-    The roughness is the median distance of neighbours from their plane; 1 mm where no point has eight of them.
+    The roughness is the median distance of neighbours from their plane. Points with fewer than eight neighbours do not
+    count, nor do neighbours within 0.1 mm of their plane: depth in coarse steps is flat. Without any, it is 1 mm.
     """
     here, every = chosen - chosen.mean(axis=0), jnp.where(mask[:, None], points - chosen.mean(axis=0), 10)
     squared = jnp.square(here).sum(axis=1)[:, None] + jnp.square(every).sum(axis=1) - 2 * matmul(here, every.T)
@@ -207,7 +208,8 @@ def _describe_neighbourhoods(
     cofactors = jnp.stack([jnp.cross(spread[:, k - 2], spread[:, k - 1]) for k in range(3)], axis=1)
     # The smallest eigenvalue is close to one divided by the trace of the inverse.
     variance = (spread[:, 0] * cofactors[:, 0]).sum(axis=1) / jnp.trace(cofactors, axis1=1, axis2=2)
-    deviation = jnp.where(count >= 8, jnp.sqrt(jnp.maximum(variance, 0)), jnp.nan)
+    deviation = jnp.sqrt(jnp.maximum(variance, 0))
+    deviation = jnp.where((count >= 8) & (deviation > 1e-4), deviation, jnp.nan)
     return means[:, :3].T, jnp.nan_to_num(jnp.nanmedian(deviation), nan=1e-3)
 
 

@@ -93,8 +93,9 @@ def test_the_roughness_is_the_noise_of_a_plane(noise: float) -> None:
     """The plane through some twenty neighbours takes a part of the noise."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(0, 0.08, (1000, 2)), 0.5 + rng.normal(0, noise, 1000)]).astype(np.float32)
-    rough = _sample_points(PointClouds.pack([(points, np.zeros((1000, 3), np.uint8))])).rough
-    assert 0.7 * noise < float(rough[0]) < 1.05 * noise
+    flat = points * np.array([1, 1, 0], np.float32) + np.array([0, 0, 0.5], np.float32)  # as a coarse step of depth
+    rough = _sample_points(PointClouds.pack([(each, np.zeros((1000, 3), np.uint8)) for each in (points, flat)])).rough
+    assert 0.7 * noise < float(rough[0]) < 1.05 * noise and float(rough[1]) == pytest.approx(1e-3)
 
 
 def test_one_colour_has_no_correlation() -> None:
