@@ -225,9 +225,9 @@ def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Arra
         at = ((q - surface.grid[0, :, None]) / surface.grid[1, :, None]).clip(0, GRID - 1).astype(int)
         nearest = jnp.take(surface.nearest, (at[:, 0] * GRID + at[:, 1]) * GRID + at[:, 2], mode="clip").astype(int)
         # XLA gathers single numbers on CPUs ten times as fast as rows.
-        found = jnp.stack([jnp.take(surface.table[k], nearest, mode="clip") for k in (0, 1, 2, *rows)], axis=1)
-        offset = q - found[:, :3]
-        return offset, jnp.linalg.norm(offset, axis=1), found[:, 3:]
+        entries = jnp.stack([jnp.take(surface.table[k], nearest, mode="clip") for k in (0, 1, 2, *rows)], axis=1)
+        offset = q - entries[:, :3]
+        return offset, jnp.linalg.norm(offset, axis=1), entries[:, 3:]
 
     def energy(pose: jax.Array, n: int) -> jax.Array:
         """Return the energies [K] of poses from distances and colours; a shift of all colours is tolerated."""
@@ -259,10 +259,10 @@ def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Arra
         pose = pose[jax.lax.top_k(-energy(pose, n), kept)[1]]
         pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
         done += steps
-    offset, distance, found = (each[0] for each in look_up(matmul(pose, points), range(3, 9)))
+    offset, distance, entries = (each[0] for each in look_up(matmul(pose, points), range(3, 9)))
     matched = distance < REACH
-    plane = jnp.where(matched, jnp.abs((offset * found[3:]).sum(axis=0)), REACH).mean()
-    return plane, _correlation(lab[1:], found[1:3], matched), _correlation(lab[:1], found[:1], matched)
+    plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH).mean()
+    return plane, _correlation(lab[1:], entries[1:3], matched), _correlation(lab[:1], entries[:1], matched)
 
 
 def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:

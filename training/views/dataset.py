@@ -37,6 +37,7 @@ Image networks are trained on crops of the same views, which `render_crops` adds
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -233,7 +234,7 @@ class ViewDataset:
             "job": self.manifest.job,
         }
 
-    @property
+    @functools.cached_property
     def surfaces(self) -> Surfaces | None:
         """Surfaces of the classes; None in datasets of earlier versions.
 
