@@ -45,7 +45,8 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         mask [B, N], camera [B, 3], boundary [B, N], rim [B, N]) that returns a dictionary with the class probabilities
         [B, C] of each classifier and overflow [B]. An embedding that recognizes the classes is the classifier
         "embedding"; its probabilities sum to the probability that the object is one of the classes.
-        In a run with surfaces, they include the comparison, which needs the points of a cloud before its padding.
+        In a run with surfaces, they include the comparison, which needs the points of a cloud before its padding. What
+        the camera sees around an instance is not compared.
 
     Raises:
         InputError: `run` is of another type, a size is not a bucket, or a platform is unknown.

@@ -19,6 +19,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +39,14 @@ from thor2_jax.model.inference import Inference, answers, compute_by_chunks, inf
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.model.surfaces import fit_poses
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
+
+if TYPE_CHECKING:
+    from thor2_jax.segmentation.known_objects import Distances  # imports OpenCV
 
 __all__ = ["THOR2", "DescribedFrame", "Recognizer"]
 
@@ -323,13 +328,31 @@ class Recognizer:
             Labels [H, W]; 0 is background.
         """
         labels = segment(frame)
-        from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV
+        from thor2_jax.segmentation.known_objects import fit_masks, segment_known  # imports OpenCV
 
         def recognize(frames: Sequence[RGBDFrame]) -> list[tuple[str | None, float]]:
             instances = (each for frame in frames for each in self.prepare(frame, [1]))
             return [(each.name, each.confidence or 0.0) for each in answers(self.model, *self.infer(instances))]
 
-        return segment_known(frame, labels, recognize)
+        labels = segment_known(frame, labels, recognize)
+        return labels if self.run.surfaces is None else fit_masks(frame, labels, self._locate)
+
+    def _locate(self, frame: RGBDFrame) -> dict[int, "Distances"]:
+        """Return label -> distances from the surface of its class, for the recognized instances of a frame."""
+        surfaces, classes = self.run.surfaces, self.run.classes
+        instances, inference = self.infer(self.prepare(frame))
+        found = answers(self.model, instances, inference)
+        named = {each.label: classes.index(each.name) for each in found if each.name in classes}
+        instances = [each for each in instances if each.label in named]
+        if surfaces is None or not instances:
+            return {}
+        clouds = pack_instances(instances, padded_rows(len(instances), self.chunk))
+        index = [named[each.label] for each in instances] + [0] * (len(clouds.points) - len(instances))
+        poses = np.asarray(fit_poses(surfaces, clouds, index))
+        return {
+            each.label: functools.partial(surfaces.distances, named[each.label], pose)
+            for each, pose in zip(instances, poses, strict=False)
+        }
 
     def infer(
         self,

@@ -68,7 +68,7 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     ((points, colors),) = random_clouds(0, [300])
     packed = thor2.PointClouds.pack([(points, colors)], 512, rim=[points[:, 0] < 0.05])
     packed = jax.device_put(packed, jax.devices("cpu")[0])
-    outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
+    outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)[:6]))
     assert set(outputs) == {"tops", "overflow"}
     described = describe_looks(packed, run.network, run.config)
     expected = class_probabilities(thor2.Recognizer(run), described, ("tops",))["tops"]

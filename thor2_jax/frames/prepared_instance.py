@@ -14,6 +14,7 @@ normalization turns it so that the occluded end does not come first along x. `Re
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +65,7 @@ class PreparedInstance:
         reason: why the instance cannot be used; None if it can be used.
         rim: [n] bool, points of pixels within `RIM` of the contour of the mask; all False if more than half of the
             points are; None without a mask.
+        around: [AROUND, AROUND, 3] float32, see `PointClouds.around`; None without a frame.
     """
 
     label: int
@@ -74,6 +76,7 @@ class PreparedInstance:
     kept_by_fallback: bool = False
     reason: str | None = None
     rim: NDArray[np.bool_] | None = None
+    around: NDArray[np.float32] | None = None
 
 
 EMPTY_INSTANCE = PreparedInstance(0, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
@@ -271,7 +274,33 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
     if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object would lose most of its points
         rim[:] = False
     colors, boundary = channels[:, :3], channels[:, 3] > 0
-    return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim)
+    around = _around(frame, label)
+    return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim, around=around)
+
+
+AROUND = 24
+"""Number of rows and of columns of the pixels around an instance that are stored."""
+
+
+def _around(frame: RGBDFrame, label: int) -> NDArray[np.float32]:
+    """Return `PointClouds.around` for an instance: pixels in its box, which is enlarged by a quarter on each side."""
+    height, width = frame.depth.shape
+    row, column = np.divmod(frame.instance_pixels[label], width)
+
+    def spread(low: int, high: int, size: int) -> NDArray[np.intp]:
+        margin = (high - low) // 4 + 2 * RIM
+        low, high = max(low - margin, RIM), min(high + margin, size - 1 - RIM)
+        return low + (high - low) * np.arange(AROUND) // (AROUND - 1)
+
+    rows = spread(row[0], row[-1], height)  # pixels are in the order of rows
+    pixels = (rows[:, None] * width + spread(column.min(), column.max(), width)).ravel()
+    around = np.asarray(pixel_rays(pixels, width, frame.intrinsics), np.float32)
+    depth, labels = frame.depth_m.ravel().take(pixels, mode="clip"), frame.label_image.ravel()
+    seen = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
+    for step in itertools.product((-RIM, 0, RIM), repeat=2):  # masks may be too small
+        seen &= labels.take(pixels + (step[0] * width + step[1]), mode="clip") != label
+    around[:, 2] = np.where(seen, depth, 0)
+    return around.reshape(AROUND, AROUND, 3)
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
@@ -311,4 +340,7 @@ def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity:
     padded = [*instances, *[EMPTY_INSTANCE] * (n_rows - len(instances))]
     clouds = [(instance.points, instance.colors) for instance in padded]
     boundary, rim = [instance.boundary for instance in padded], [instance.rim for instance in padded]
-    return PointClouds.pack(clouds, capacity, boundary=boundary, rim=rim, on_host=True)
+    nothing = np.zeros((AROUND, AROUND, 3), np.float32)
+    around: Any = np.stack([nothing if instance.around is None else instance.around for instance in padded])
+    packed = PointClouds.pack(clouds, capacity, boundary=boundary, rim=rim, on_host=True)
+    return dataclasses.replace(packed, around=around)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.descriptor.slicing import to_lab
 from thor2_jax.files import pack_arrays, unpack_arrays
@@ -32,6 +32,7 @@ __all__ = [
     "SURFACES_FILE",
     "Surfaces",
     "evidence",
+    "fit_poses",
     "rotations",
     "with_evidence",
 ]
@@ -46,13 +47,17 @@ N_POINTS, GRID = 4096, 48
 """P, points of a surface, and cells of the grid along each axis."""
 
 SAMPLED = 256
-"""Points of an instance that are compared in the end; the first ones of them in all stages but the last."""
+"""Points of an instance that are compared in the end; the stages use the first ones of them."""
 
-LARGEST = 1024
+LARGEST = 512
 """Largest number of points of an instance that are used; they smooth its colours and determine its roughness."""
 
-STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6), (SAMPLED, 1, 0))
+STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6))
 """Points that score the poses, poses that are kept, and steps of their refinement, for each stage of the search."""
+
+PLACED, CLEAR = 512, 0.02
+"""PLACED: points of a surface that are compared with what the camera sees around the instance. CLEAR: a point is in
+free space if it is nearer to the camera by this distance, metres."""
 
 FAR, REACH = 0.02, 0.012
 """FAR: margin of the grid, and largest distance of a match in the first step of the refinement, metres. REACH: largest
@@ -61,8 +66,8 @@ distance of a match in scores and values, metres."""
 RADIUS = 0.01
 """Radius of the neighbourhoods for smoothed colours and for the roughness, metres."""
 
-RIVAL, NAME_WEIGHTS = 0.1, np.array([-7, 2.7, 1.5], np.float32)
-KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8], np.float32), np.float32(2.1)
+RIVAL, NAME_WEIGHTS = 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
+KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 """See `with_evidence`; logistic regressions on rendered views of four runs give similar weights."""
 
 
@@ -107,6 +112,27 @@ class Surfaces:
         """Return the surfaces with this `content`."""
         return cls(**jax.tree.map(jnp.asarray, unpack_arrays(content)[0]))
 
+    def distances(self, index: int, pose: NDArray[np.float32], points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return how far points are from the surface of a class: at least the point-to-plane distance.
+
+        Args:
+            index: the class.
+            pose: [3, 4], from `fit_poses`.
+            points: [n, 3], metres, relative to the camera.
+
+        Returns:
+            [n], metres; inf beyond the grid.
+        """
+        (low, cell), table = np.asarray(self.grid[index]), np.asarray(self.table[index]).T
+        moved = points @ pose[:, :3].T + pose[:, 3]
+        at = np.floor((moved - low) / cell)
+        x, y, z = at.clip(0, GRID - 1).astype(int).T
+        nearest = table[np.asarray(self.nearest[index])[(x * GRID + y) * GRID + z]]
+        offset = moved - nearest[:, :3]
+        plane = (offset * nearest[:, 6:]).sum(axis=1)
+        distance = np.hypot(plane, np.linalg.norm(offset, axis=1) / 3)  # nearest points are samples of the surface
+        return np.where(((at >= 0) & (at < GRID)).all(axis=1), distance, np.inf)
+
 
 def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
     """Return how well each instance fits a class.
@@ -117,10 +143,15 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
         class_index: [B] int.
 
     Returns:
-        [B, 3] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
-        correlations of chroma and of lightness; zeros for an empty cloud.
+        [B, 4] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
+        correlations of chroma and of lightness, fraction of the surface in free space; zeros for an empty cloud.
     """
-    return _fit_rows(surfaces, _sample_points(clouds), class_index)
+    return _fit_rows(surfaces, _sample_points(clouds), class_index)[0]
+
+
+def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
+    """Return the poses [B, 3, 4] of `evidence`: a rotation and a shift from the camera to the class, metres."""
+    return _fit_rows(surfaces, _sample_points(clouds), jnp.asarray(class_index))[1]
 
 
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
@@ -134,38 +165,38 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClo
 
 
 class _Sample(NamedTuple):
-    """Points of an instance: [SAMPLED, 3] metres, smoothed L*a*b* colours [3, SAMPLED], roughness in metres."""
+    """Points of an instance: [SAMPLED, 3] metres from the camera, smoothed L*a*b* colours [3, SAMPLED], roughness."""
 
     points: jax.Array
     lab: jax.Array
     rough: jax.Array
+    around: jax.Array
     is_empty: jax.Array
 
 
 @jax.jit
 def _sample_points(clouds: PointClouds) -> _Sample:
     def sample(row: tuple[jax.Array, ...]) -> _Sample:
-        points, colors, mask, camera = row
+        points, colors, mask, camera, around = row
         number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
         # The order of the points is spatial. Equal steps through it, and multiples of the golden ratio, spread evenly.
         every = (number * jnp.maximum(count / len(number), 1)).astype(int)
         points, lab = points[every] - camera, to_lab(colors[every])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
         chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
-        return _Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), count == 0)
+        return _Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), around, count == 0)
 
-    return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera), batch_size=16)
+    around = jnp.zeros((len(clouds.points), 1, 1, 3)) if clouds.around is None else clouds.around
+    return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera, around), batch_size=16)
 
 
 @jax.jit
-def _fit_rows(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> jax.Array:
-    def fit(sample: _Sample, index: jax.Array) -> jax.Array:
-        surface = jax.tree.map(lambda field: field[index], surfaces)
-        plane, chroma, lightness = _fit(surface, sample.points, sample.lab)
-        return jnp.stack([jnp.log((plane + 3e-4) / (sample.rough + 3e-4)), chroma, lightness])
+def _fit_rows(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def fit(sample: _Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)
 
-    def of_row(row: tuple[_Sample, jax.Array]) -> jax.Array:
-        return jax.lax.cond(row[0].is_empty, lambda *_: jnp.zeros(3, jnp.float32), fit, *row)
+    def of_row(row: tuple[_Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return jax.lax.cond(row[0].is_empty, lambda *_: (jnp.zeros(4), jnp.zeros((3, 4))), fit, *row)
 
     # One by one on CPUs, where padding can be skipped, else at once.
     map_rows = functools.partial(jax.lax.map, of_row)
@@ -178,7 +209,7 @@ def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) ->
     is_compared = largest >= RIVAL * largest[:, :1]
     rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
     rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fit_rows(surfaces, rows, index.T.ravel()).reshape(*index.T.shape, 3).swapaxes(0, 1)  # [B, K, 3]
+    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
     logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
     share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
     changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
@@ -213,12 +244,9 @@ def _describe_neighbourhoods(
     return means[:, :3].T, jnp.nan_to_num(jnp.nanmedian(deviation), nan=1e-3)
 
 
-def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the mean point-to-plane distance in metres and the correlations of chroma and of lightness.
-
-    The arguments are one row of the surfaces, points [n, 3] and their colours [3, n].
-    """
-    points = jnp.concatenate([chosen, jnp.ones_like(chosen[:, :1])], axis=1).T
+def _fit(surface: Surfaces, sample: _Sample) -> tuple[jax.Array, jax.Array]:
+    """Return the evidence [4] and the pose [3, 4] of one instance for one class."""
+    points, lab = jnp.concatenate([sample.points, jnp.ones_like(sample.points[:, :1])], axis=1).T, sample.lab
 
     def look_up(q: jax.Array, rows: Sequence[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return offsets [K, 3, n] and distances [K, n] of points [K, 3, n], and rows of the table."""
@@ -254,15 +282,29 @@ def _fit(surface: Surfaces, chosen: jax.Array, lab: jax.Array) -> tuple[jax.Arra
         turn = _rotation(system[:, :3, 6])
         return matmul(turn, pose).at[..., 3].add(system[:, 3:, 6])
 
-    pose, done = _candidates(surface.boxes, chosen), 0
+    def in_free_space(pose: jax.Array) -> jax.Array:
+        """Return the fraction [K] of the surface that poses place in front of what the camera sees."""
+        here = matmul(pose[..., :3].mT, surface.table[:3, :: N_POINTS // PLACED] - pose[..., 3:])  # [K, 3, PLACED]
+        low, high, last = sample.around[0, 0, :2], sample.around[-1, -1, :2], len(sample.around) - 1
+        at = (here[:, :2] / here[:, 2:] - low[:, None]) / jnp.maximum(high - low, 1e-9)[:, None] * last
+        column, row = jnp.moveaxis(jnp.rint(at).clip(-1, last + 1).astype(int), 1, 0)
+        is_inside = (column >= 0) & (column <= last) & (row >= 0) & (row <= last)
+        seen = jnp.take(sample.around[..., 2].ravel(), row * (last + 1) + column, mode="clip")
+        return (is_inside & (here[:, 2] < seen - CLEAR)).mean(axis=1)
+
+    pose, done = _candidates(surface.boxes, sample.points), 0
     for n, kept, steps in STAGES:
         pose = pose[jax.lax.top_k(-energy(pose, n), kept)[1]]
         pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
         done += steps
-    offset, distance, entries = (each[0] for each in look_up(matmul(pose, points), range(3, 9)))
+    free = in_free_space(pose)
+    best = (energy(pose, SAMPLED) + 2 * free).argmin()
+    offset, distance, entries = (each[0] for each in look_up(matmul(pose[best, None], points), range(3, 9)))
     matched = distance < REACH
     plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH).mean()
-    return plane, _correlation(lab[1:], entries[1:3], matched), _correlation(lab[:1], entries[:1], matched)
+    chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
+    fit = jnp.log((plane + 3e-4) / (sample.rough + 3e-4))
+    return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]
 
 
 def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:
@@ -271,7 +313,7 @@ def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:
     c = 1 / jnp.maximum(1 + z, 1e-6)
     ahead = jnp.array([[1 - c * x * x, -c * x * y, -x], [-c * x * y, 1 - c * y * y, -y], [x, y, z]])  # to the z axis
     seen = matmul(points, ahead.T)
-    low, high = jnp.quantile(seen, np.array([0.02, 0.98], np.float32), axis=0)
+    low, high = jnp.sort(seen.T, axis=1)[:, np.array([SAMPLED // 50, -SAMPLED // 50])].T  # without the outermost points
     low, middle, high = low - boxes[:, 0], seen.mean(axis=0) - boxes[:, 1], high - boxes[:, 2]  # places of the class
     corners = [jnp.stack([a[:, 0], b[:, 1], middle[:, 2]], axis=1) for a in (low, high) for b in (low, high)]
     inverse = jnp.asarray(rotations().mT)

@@ -1,16 +1,17 @@
 """Refinement of a segmentation by recognition, since objects in a pile touch without a visible edge.
 
 labels = segment_known(frame, labels, recognize)          # labels of any segmenter, [H, W]
+labels = fit_masks(frame, labels, locate)                 # if the surfaces of the objects are known
 
 Each piece of the segmentation is divided into parts of similar colour and place. The parts, unions of neighbouring
 parts and whole pieces are candidates for objects and are all recognized. A piece is divided if its best division
 contains objects of different names. Neighbours are then merged repeatedly if their union is recognized better than each
-of them.
+of them. In the end, pixels go to the object on whose surface their points lie.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -18,15 +19,18 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, nearest_known, window
+from thor2_jax.segmentation.pixels import Mask, components, nearest_known, renumbered, window
 
-__all__ = ["segment_known"]
+__all__ = ["Distances", "fit_masks", "segment_known"]
 
 Parts = frozenset[int]
 """Numbers of the parts of a candidate or of a whole piece."""
 
 Answer = tuple[str | None, float]
 """Name (None for an unknown object) and confidence."""
+
+Distances = Callable[[NDArray[np.floating]], NDArray[np.float64]]
+"""Function from points [n, 3] in the camera frame to their distances [n] from the surface of an object, metres."""
 
 LEAST_PART, MOST_PARTS = 1000, 6
 """Smallest average number of pixels of a part, and largest number of parts of a piece."""
@@ -90,6 +94,60 @@ def segment_known(
     for number, thing in enumerate(sorted(things, key=min), start=1):
         result[_mask(parts, thing)] = number
     return result
+
+
+ROUNDS = 2
+"""Number of times that masks are fitted to surfaces, and surfaces to the new masks."""
+
+ON_SURFACE, OFF_SURFACE = 0.008, 0.015
+"""A point within ON_SURFACE of another object can go to it; a point beyond OFF_SURFACE leaves its object; metres."""
+
+LEAST_PIXELS = 200
+"""Number of pixels of the smallest separate piece; smaller ones go to the nearest piece."""
+
+
+def fit_masks(
+    frame: RGBDFrame, labels: NDArray[np.int32], locate: Callable[[RGBDFrame], Mapping[int, Distances]]
+) -> NDArray[np.int32]:
+    """Return labels after each pixel of a piece goes to the known object whose surface is nearest to its point.
+
+    Args:
+        frame: colour, depth and intrinsics; its labels are not read.
+        labels: [H, W]; 0 is background.
+        locate: function from a frame with labels to label -> distances from the surface, for all known objects.
+
+    Returns:
+        Labels [H, W]: 0 is background as before, and the objects are numbered from 1.
+    """
+    points = backproject(frame.depth_m, frame.intrinsics)
+    for _ in range(ROUNDS):
+        surfaces = locate(dataclasses.replace(frame, labels=labels))
+        if not surfaces:
+            break
+        known, at = np.array(list(surfaces)), (labels > 0) & (frame.depth_m > 0)
+        distance = np.stack([distances(points[at]) for distances in surfaces.values()])  # [known, n]
+        own = np.where(known[:, None] == labels[at], distance, np.inf).min(axis=0)  # inf for an unknown piece
+        moves = (distance.min(axis=0) < ON_SURFACE) & (distance.min(axis=0) < own)
+        leaves = np.isfinite(own) & (own > OFF_SURFACE)
+        rest = int(labels.max()) + 1
+        fitted = labels.copy()
+        fitted[at] = np.select([moves, leaves], [known[distance.argmin(axis=0)], rest], labels[at])
+        labels = _tidied(fitted, known, rest)
+    return labels
+
+
+def _tidied(labels: NDArray[np.int32], known: NDArray[np.intp], rest: int) -> NDArray[np.int32]:
+    """Return labels without small pieces; the separate pieces of known objects keep one number each."""
+    tidied, last = np.zeros_like(labels), 0
+    for label in np.unique(labels[labels > 0]):
+        numbers, sizes = components(labels == label)
+        kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
+        numbers, end = renumbered(numbers, kept, last)
+        if label in known:
+            numbers, end = np.minimum(numbers, last + 1), last + 1
+        tidied, last = tidied + numbers, end
+    is_kept = tidied > 0
+    return np.where(labels > 0, tidied[is_kept].take(nearest_known(is_kept)), 0)
 
 
 class _Known:

@@ -229,3 +229,33 @@ def test_real_frames_have_a_cloud_for_every_object(shared: Path) -> None:
         for label in item.truth:
             assert clouds[label].reason is None and not clouds[label].kept_by_fallback
             assert np.ptp(clouds[label].points, axis=0).max() < 0.4  # none of these objects is longer
+
+
+# What the camera sees around an instance
+
+
+def test_around_an_instance_are_the_points_of_other_pixels() -> None:
+    """The box of an instance is enlarged by a quarter; the mask counts two pixels more on each side."""
+    labels, depth = patch((1, 100, 140, 100, 180), (2, 100, 140, 190, 200)), flat(1000)
+    depth[labels == 1], depth[:, 190:200], depth[:90] = 800, 850, 0
+    frame = frame_of(depth, labels)
+    instance = prepare_instance(frame, 1, 2.5)
+    around = instance.around
+    assert around is not None and around.dtype == np.float32
+    size = len(around)
+    x, y = (around[..., 0] * CAMERA.fx + CAMERA.cx), (around[..., 1] * CAMERA.fy + CAMERA.cy)
+    np.testing.assert_allclose(x, np.broadcast_to(np.linspace(77, 202, size), (size, size)), atol=1)
+    np.testing.assert_allclose(y.T, np.broadcast_to(np.linspace(87, 152, size), (size, size)), atol=1)
+    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+    is_own = ndimage.binary_dilation(labels == 1, np.ones((5, 5)))[row, column]
+    np.testing.assert_array_equal(around[..., 2], np.where(is_own, 0, depth[row, column] / np.float32(1000)))
+    packed = pack_instances([instance, dataclasses.replace(instance, around=None)], 4)
+    np.testing.assert_array_equal(packed.around, [around, *[np.zeros_like(around)] * 3])
+
+
+@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 3000), (3000, 1), (4, 1000)])
+def test_instances_that_fill_the_image_have_nothing_around(size: tuple[int, int]) -> None:
+    depth = np.full(size, 1000, np.uint16)
+    frame = RGBDFrame(np.zeros((*size, 3), np.uint8), depth, np.ones(size, np.uint8), CAMERA)
+    around = prepare_instance(frame, 1, 2.5).around
+    assert around is not None and np.isfinite(around).all() and not around[..., 2].any()

@@ -1,12 +1,23 @@
 """Surfaces of classes: the points of an object fit the surface and the colours of its class better than others."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_clouds import random_clouds
 
-from thor2_jax.model.surfaces import REACH, SAMPLED, Surfaces, _fit_rows, _sample_points, evidence, with_evidence
+from thor2_jax.model.surfaces import (
+    REACH,
+    SAMPLED,
+    Surfaces,
+    _fit_rows,
+    _sample_points,
+    evidence,
+    fit_poses,
+    with_evidence,
+)
 from thor2_jax.types import Cloud, PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
@@ -35,18 +46,55 @@ OWN = np.repeat(np.arange(3), 3)
 
 def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
     clouds = PointClouds.pack(views)
-    values = np.stack([evidence(surfaces, clouds, jnp.full(len(views), k)) for k in range(3)], axis=1)  # [9, 3, 3]
+    values = np.stack([evidence(surfaces, clouds, jnp.full(len(views), k)) for k in range(3)], axis=1)  # [9, 3, 4]
     own = values[np.arange(9), OWN]
-    assert (own[:, 0] < 0.5).all() and (own[:, 1:] > 0.5).all()
+    assert (own[:, 0] < 0.5).all() and (own[:, 1:3] > 0.5).all()
     others = values[np.arange(9)[:, None], (OWN[:, None] + [1, 2]) % 3]
     assert (others[..., 0] > own[:, None, 0] + 0.5).all()
-    assert (others[..., 1:].sum(axis=-1) < own[:, None, 1:].sum(axis=-1) - 0.3).all()
+    assert (others[..., 1:3].sum(axis=-1) < own[:, None, 1:3].sum(axis=-1) - 0.3).all()
+
+
+def with_background(views: list[Cloud], depths: list[float], whole: list[Cloud] | None = None) -> PointClouds:
+    """Return clouds with points at these depths around each view, or around the `whole` object."""
+    around = []
+    for (xyz, _), (seen, _), depth in zip(views, whole or views, depths, strict=True):
+        rays = xyz[:, :2] / xyz[:, 2:]
+        low, high = rays.min(axis=0) - 0.06, rays.max(axis=0) + 0.06
+        grid = np.stack(np.meshgrid(*np.linspace(low, high, 24).T), axis=-1)
+        is_free = np.linalg.norm(grid[:, :, None] - seen[:, :2] / seen[:, 2:], axis=3).min(axis=2) > 0.008
+        around.append(np.dstack([grid, np.where(is_free, depth, 0)]))
+    return dataclasses.replace(PointClouds.pack(views), around=jnp.asarray(np.array(around), jnp.float32))
+
+
+def test_the_surface_of_a_class_is_not_in_free_space(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """Half of a box that is not occluded is no box; another object may hide the other half."""
+    whole = views[3:6]
+    half = [tuple(a[xyz[:, 0] < np.median(xyz[:, 0])] for a in (xyz, rgb)) for xyz, rgb in whole]
+    classes = np.full(3, 1)
+    free = np.array(
+        [
+            evidence(surfaces, with_background(*each), classes)[:, 3]
+            for each in ((whole, [3.0] * 3), (half, [3.0] * 3), (half, [0.2] * 3), (half, [3.0] * 3, whole))
+        ]
+    )
+    assert (free[0] < 0.01).all() and (free[1] > 0.03).all() and (free[2] == 0).all() and (free[3] < 0.01).all()
+    np.testing.assert_array_equal(evidence(surfaces, PointClouds.pack(half), classes)[:, 3], 0)
+
+
+def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) -> None:
+    poses = np.asarray(fit_poses(surfaces, PointClouds.pack(views), OWN))
+    for (xyz, _), pose, index in zip(views, poses, OWN, strict=True):
+        np.testing.assert_allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-5)
+        assert np.quantile(surfaces.distances(index, pose, xyz), 0.95) < 0.004
+        nearer = xyz - 0.015 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+        assert 0.005 < np.median(surfaces.distances(index, pose, nearer)) < 0.0155
+        assert np.isinf(surfaces.distances(index, pose, xyz + 1)).all()
 
 
 def test_other_colours_do_not_fit(surfaces: Surfaces, views: list[Cloud]) -> None:
     inverted = [(xyz, 255 - rgb) for xyz, rgb in views]
     before, after = (np.asarray(evidence(surfaces, PointClouds.pack(each), OWN)) for each in (views, inverted))
-    assert (after[:, 1:].sum(axis=1) < before[:, 1:].sum(axis=1) - 0.3).all()
+    assert (after[:, 1:3].sum(axis=1) < before[:, 1:3].sum(axis=1) - 0.3).all()
 
 
 def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> None:
@@ -64,7 +112,7 @@ def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views:
     empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     padded = PointClouds.pack([views[4], empty, views[0]], 8192)
     values = np.asarray(evidence(surfaces, padded, np.array([1, 2, 0])))
-    assert np.array_equal(values, [whole[4], np.zeros(3), whole[0]])
+    assert np.array_equal(values, [whole[4], np.zeros(4), whole[0]])
 
 
 def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
@@ -77,7 +125,7 @@ def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
 def test_points_beyond_the_surface_count_with_the_largest_distance(surfaces: Surfaces) -> None:
     points = (np.random.default_rng(0).random((2000, 3)) * 3 + [0, 0, 2]).astype(np.float32)
     clouds = PointClouds.pack([(points, np.zeros((2000, 3), np.uint8))])
-    expected = [np.log((REACH + 3e-4) / (1e-3 + 3e-4)), 0, 0]  # nothing is near, and no point has neighbours
+    expected = [np.log((REACH + 3e-4) / (1e-3 + 3e-4)), 0, 0, 0]  # nothing is near, and no point has neighbours
     np.testing.assert_allclose(evidence(surfaces, clouds, np.zeros(1, int))[0], expected, atol=0.01)
 
 
@@ -123,7 +171,7 @@ def test_accelerators_compare_all_rows_at_once(
 def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
     """Against the two formulas in float64."""
     surfaces = jax.tree.map(lambda field: field[:n_classes], surfaces)
-    clouds, rng = PointClouds.pack(views), np.random.default_rng(0)
+    clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
     before = rng.dirichlet(np.full(n_classes + 1, 0.4), 9)[:, :n_classes].astype(np.float32)
     after = np.asarray(with_evidence(jnp.asarray(before), surfaces, clouds), np.float64)
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
@@ -131,11 +179,11 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
     for row, probabilities in enumerate(before.astype(np.float64)):
         best = np.argsort(-probabilities)[:2]
         if len(best) == 2 and probabilities[best[1]] > 0.1 * probabilities[best[0]]:
-            odds = probabilities[best] * np.exp([values[k][row] @ [-7, 2.7, 1.5] for k in best])
+            odds = probabilities[best] * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
             probabilities[best] = probabilities[best].sum() * odds / odds.sum()
             compared += 1
         known = probabilities.sum()
-        odds = known / (1 - known) * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8] + 2.1)
+        odds = known / (1 - known) * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     assert compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
     assert np.array_equal(with_evidence(jnp.zeros((9, n_classes)), surfaces, clouds), np.zeros((9, n_classes)))

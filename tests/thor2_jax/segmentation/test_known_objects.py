@@ -5,10 +5,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.known_objects import Answer, segment_known
+from thor2_jax.segmentation.known_objects import Answer, Distances, fit_masks, segment_known
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
 FRAME = render(
@@ -90,3 +91,47 @@ def test_candidates_are_shown_where_they_are() -> None:
     assert len(whole) == 1 and (whole[0].label_image > 1).any()
     seen = backproject(whole[0].depth_m, whole[0].intrinsics)[whole[0].label_image == 1]
     np.testing.assert_allclose(seen, points, atol=1e-5)
+
+
+def surface_of(mask: NDArray[np.bool_]) -> Distances:
+    """Return the distances from the points of a true mask."""
+    tree = KDTree(backproject(FRAME.depth_m, FRAME.intrinsics)[mask & (FRAME.depth_m > 0)])
+    return lambda points: np.asarray(tree.query(points)[0])
+
+
+@pytest.mark.parametrize("known", [(4, 7), (4,)], ids=["both known", "one known"])
+def test_pixels_go_to_the_object_on_whose_surface_they_lie(known: tuple[int, ...]) -> None:
+    """What lies on no known surface becomes a piece."""
+    border = np.quantile(np.nonzero(TRUTH == 2)[1], 0.6)
+    shifted = np.where(TRUTH > 0, np.where(np.arange(640) < border, 4, 7), 0).astype(np.int32)
+    surfaces = {4: surface_of(TRUTH == 1), 7: surface_of(TRUTH == 2)}
+    shown: list[NDArray[np.integer]] = []
+
+    def locate(frame: RGBDFrame) -> dict[int, Distances]:
+        shown.append(frame.label_image)
+        return {number if len(shown) == 1 else (4, 7).index(number) + 1: surfaces[number] for number in known}
+
+    labels = fit_masks(FRAME, shifted, locate)
+    np.testing.assert_array_equal(shown[0], shifted)
+    np.testing.assert_array_equal(labels > 0, TRUTH > 0)
+    assert len(shown) == 2
+    if len(known) == 2:
+        assert (best_overlaps(labels, TRUTH) > 0.99).all()
+    else:
+        far = surfaces[4](backproject(FRAME.depth_m, FRAME.intrinsics)[labels == 1]) > 0.015
+        assert far.mean() < 0.01 and (labels[TRUTH == 1] == 1).mean() > 0.99
+
+
+def test_small_pieces_go_to_the_nearest_one() -> None:
+    labels = TRUTH.copy()
+    rows, columns = np.nonzero(TRUTH == 1)
+    labels[rows[:150], columns[:150]] = 3
+    fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.01)})
+    assert fitted.max() == 3 and (fitted > 0).sum() == (TRUTH > 0).sum()  # the only piece of a label stays
+    far = fit_masks(FRAME, TRUTH, lambda frame: {1: lambda points: np.where(np.arange(len(points)) < 150, 1, 0.01)})
+    assert (far != TRUTH).sum() < 10
+
+
+def test_without_known_objects_labels_remain() -> None:
+    for labels in (TRUTH, np.zeros_like(TRUTH)):
+        np.testing.assert_array_equal(fit_masks(FRAME, labels, lambda frame: {}), labels)
