@@ -27,6 +27,7 @@ from thor2_jax.gallery.search import ExactSearch, IndexSearch
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
 from training.rendering.scenes import compose_scene
 from training.views.mesh_views import mesh_views
 
@@ -121,7 +122,7 @@ def measure_enrollment(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _enroll_mesh(objects: ObjectGallery, mesh: Any) -> None:
-    objects.enroll("new", mesh_views(mesh), "mesh")
+    objects.enroll("new", mesh_views(mesh), "mesh", surfaces_of([mesh]))
 
 
 def _seconds(function: Callable[[], object]) -> float:

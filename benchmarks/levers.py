@@ -43,7 +43,8 @@ from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
-from training.objects.meshes import find_meshes
+from training.objects.meshes import find_meshes, load_mesh
+from training.objects.surfaces import surfaces_of
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import begin_job
 from training.views.mesh_views import mesh_views
@@ -208,7 +209,8 @@ class Table:
                 recognizer.objects.open(self.out / "galleries" / recognizer.objects.embedding.fingerprint[:12])
                 for name, path in self.meshes.items():
                     if name in run.classes and name not in recognizer.gallery.objects:
-                        recognizer.objects.enroll(name, mesh_views(path), "mesh", extend=True)
+                        surface = surfaces_of([load_mesh(path)])
+                        recognizer.objects.enroll(name, mesh_views(path), "mesh", surface, extend=True)
         return runs
 
     def compute(self, levers: Sequence[Lever], seeds: Sequence[int]) -> None:

@@ -39,9 +39,9 @@ from thor2_jax.model.inference import Inference, answers, compute_by_chunks, inf
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from thor2_jax.model.surfaces import fit_poses
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
+from thor2_jax.surfaces import fit_poses
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 
@@ -334,25 +334,23 @@ class Recognizer:
             instances = (each for frame in frames for each in self.prepare(frame, [1]))
             return [(each.name, each.confidence or 0.0) for each in answers(self.model, *self.infer(instances))]
 
-        labels = segment_known(frame, labels, recognize)
-        return labels if self.run.surfaces is None else fit_masks(frame, labels, self._locate)
+        return fit_masks(frame, segment_known(frame, labels, recognize), self._locate)
 
     def _locate(self, frame: RGBDFrame) -> dict[int, "Distances"]:
-        """Return label -> distances from the surface of its class, for the recognized instances of a frame."""
-        surfaces, classes = self.run.surfaces, self.run.classes
+        """Return label -> distances from the surface of the object, for recognized instances whose surface is known."""
+        gallery, trained = self.gallery, self.run.surfaces
+        known = {} if trained is None else {name: (trained, k) for k, name in enumerate(self.run.classes)}
+        known |= {gallery.names[number]: (surface, 0) for number, surface in gallery.surfaces.items()}
+        located: dict[int, Distances] = {}
+        if not known:
+            return located
         instances, inference = self.infer(self.prepare(frame))
-        found = answers(self.model, instances, inference)
-        named = {each.label: classes.index(each.name) for each in found if each.name in classes}
-        instances = [each for each in instances if each.label in named]
-        if surfaces is None or not instances:
-            return {}
-        clouds = pack_instances(instances, padded_rows(len(instances), self.chunk))
-        index = [named[each.label] for each in instances] + [0] * (len(clouds.points) - len(instances))
-        poses = np.asarray(fit_poses(surfaces, clouds, index))
-        return {
-            each.label: functools.partial(surfaces.distances, named[each.label], pose)
-            for each, pose in zip(instances, poses, strict=False)
-        }
+        for instance, answer in zip(instances, answers(self.model, instances, inference), strict=True):
+            if answer.name in known:
+                surfaces, index = known[answer.name]
+                pose = np.asarray(fit_poses(surfaces, pack_instances([instance], 1), [index]))[0]
+                located[instance.label] = functools.partial(surfaces.distances, index, pose)
+        return located
 
     def infer(
         self,

@@ -1,12 +1,12 @@
 """Enroll objects in the gallery of a run directory.
 
 from training.views.mesh_views import mesh_views
-enroll_objects(Path("run"), (["mug"], iter([mesh_views(Path("mug.glb"))])))
+enroll_objects(Path("run"), ({"mug": Path("mug.glb")}, iter([mesh_views(Path("mug.glb"))])))
 enroll_objects(Path("run"), FrameFolder("labelled-frames"))
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
@@ -16,6 +16,9 @@ from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import load_mesh
+from training.objects.surfaces import surfaces_of
 from training.readers.frames import FrameFolder
 from training.storage.jobs import Progress
 from training.views.labelled_views import read_instances
@@ -25,7 +28,7 @@ __all__ = ["enroll_objects"]
 
 def enroll_objects(
     model: Path,
-    source: FrameFolder | tuple[Iterable[str], Iterator[Sequence[PreparedInstance]]],
+    source: FrameFolder | tuple[Mapping[str, Path | TexturedMesh], Iterator[Sequence[PreparedInstance]]],
     *,
     name: str | None = None,
     label_name: str | None = None,
@@ -39,7 +42,8 @@ def enroll_objects(
 
     Args:
         model: the run directory.
-        source: labelled frames, or names of objects and an iterator over their rendered views, in the same order.
+        source: labelled frames, or the meshes of objects by name and an iterator over their rendered views, in the same
+            order.
         name: the only object to enroll; its name is checked before anything is read. None enrolls all objects.
         label_name: name of this object in the frames; by default `name`.
         instance: number of this object in the frames, see `read_instances`.
@@ -76,15 +80,19 @@ def enroll_objects(
             labelled, skipped = instances.views, instances.skipped
             if name is not None:
                 labelled = {name: [view for each in labelled.values() for view in each]}
-            views, kind = ([recognizer.model.corrected(view) for view in each] for each in labelled.values()), "frames"
-            names = list(labelled)
+            views = ([recognizer.model.corrected(view) for view in each] for each in labelled.values())
+            names, meshes = list(labelled), None
         else:
-            (given, views), kind = source, "mesh"
-            names = list(given)
+            given, views = source
+            names, meshes = list(given), iter(given.values())
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)
-            added[each] = enrolled_views(objects.embedding, next(views), kind)
+            kind, surface = "frames", None
+            if meshes is not None:
+                mesh = next(meshes)
+                kind, surface = "mesh", surfaces_of([load_mesh(mesh) if isinstance(mesh, Path) else mesh])
+            added[each] = enrolled_views(objects.embedding, next(views), kind, surface)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):

@@ -24,9 +24,9 @@ from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.model.surfaces import with_evidence
 from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
+from thor2_jax.surfaces import with_evidence
 
 CLASSES = ("a", "b", "c", "d")
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

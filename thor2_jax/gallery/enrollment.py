@@ -25,6 +25,7 @@ from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pac
 from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.surfaces import Surfaces
 
 __all__ = [
     "LOOKS",
@@ -78,15 +79,19 @@ def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> ND
     return embed_looks(embedding, views)
 
 
-def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:
+def enrolled_object(
+    embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Surfaces | None = None
+) -> GalleryObject:
     """Return an object that is enrolled at this time; `embeddings` [..., D] are those of `views_to_embed`."""
     date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     flat = embeddings.reshape(-1, embeddings.shape[-1]).astype(np.float16)
-    return GalleryObject(flat, clouds, source, date)
+    return GalleryObject(flat, clouds, source, date, surface)
 
 
-def enrolled_views(embedding: Embedding, views: Sequence[PreparedInstance], source: str) -> GalleryObject:
-    """Return the views of an object as a gallery stores them; the arguments are those of `_embed_views`.
+def enrolled_views(
+    embedding: Embedding, views: Sequence[PreparedInstance], source: str, surface: Surfaces | None = None
+) -> GalleryObject:
+    """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
 
     Raises:
         InputError: there is no view, or a view has no points or is too large.
@@ -94,7 +99,7 @@ def enrolled_views(embedding: Embedding, views: Sequence[PreparedInstance], sour
     if not views:
         raise InputError("views is empty; expected at least one view of the object")
     clouds = CompactClouds.of(views)
-    return enrolled_object(_embed_views(embedding, clouds, source), clouds, source)
+    return enrolled_object(_embed_views(embedding, clouds, source), clouds, source, surface)
 
 
 MAX_COPIES = 8
@@ -245,7 +250,7 @@ class ObjectGallery:
         objects = {}
         for name, views in gallery.objects.items():
             embeddings = _embed_views(self.embedding, views.clouds, views.source)
-            again = enrolled_object(embeddings, views.clouds, views.source)
+            again = enrolled_object(embeddings, views.clouds, views.source, views.surface)
             objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
@@ -273,7 +278,14 @@ class ObjectGallery:
         )
 
     def enroll(
-        self, name: str, views: Sequence[PreparedInstance], source: str, *, extend: bool = False, replace: bool = False
+        self,
+        name: str,
+        views: Sequence[PreparedInstance],
+        source: str,
+        surface: Surfaces | None = None,
+        *,
+        extend: bool = False,
+        replace: bool = False,
     ) -> None:
         """Enroll an object from prepared views.
 
@@ -281,6 +293,7 @@ class ObjectGallery:
             name: name of the object.
             views: its views.
             source: "mesh" for views rendered from a mesh, or "frames".
+            surface: surface of the mesh, with which instances are compared (`training.objects.surfaces`).
             extend: add the views to an existing object with this name.
             replace: discard the views of an object with this name, and the classifiers' output for it.
 
@@ -290,7 +303,7 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
+        self.add({name: enrolled_views(self.embedding, views, source, surface)}, extend=extend, replace=replace)
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""

@@ -24,6 +24,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name, first_names
+from thor2_jax.surfaces import Sample, Surfaces, compared
 
 if TYPE_CHECKING:
     from thor2_jax.gallery.embedding import References
@@ -52,6 +53,9 @@ KEPT: tuple[tuple[dict[int, float], ...], ...] = (
 the default threshold. The entries of a version are for embeddings without reference views, with them, and with those of
 background objects only. Up to 10 views are from held-out frames, 120 from meshes."""
 
+KEPT_WITH_SURFACE = 0.64
+"""Score that 95 % of the correct answers for objects with a surface reach, in held-out frames."""
+
 TOYS = frozenset(
     ("apple banana cereal_box_blue cereal_box_yellow hammer mug_blue mug_white screwdriver soup_can_green soup_can_red "
      "sponge tennis_ball white_bowl white_cup white_plate wooden_spoon yellow_bottle yellow_box").split()
@@ -63,6 +67,9 @@ MAX_LISTED = 6
 
 EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
+
+TINY = 1e-6
+"""Smallest probability that an object is unknown."""
 
 STEP = 5e-5
 """Resolution of the coordinates, metres."""
@@ -144,6 +151,7 @@ class GalleryObject:
         clouds: the views as they were enrolled.
         source: source of the views: "mesh", "frames" or "mesh and frames".
         date: date of the last enrollment, ISO 8601.
+        surface: surface of its mesh, as the only class of `Surfaces`; None without a mesh.
         file: name of its file in the gallery on disk; None until it is written.
     """
 
@@ -151,6 +159,7 @@ class GalleryObject:
     clouds: CompactClouds
     source: str
     date: str
+    surface: Surfaces | None = None
     file: str | None = None
 
     def __add__(self, other: "GalleryObject") -> "GalleryObject":
@@ -159,6 +168,7 @@ class GalleryObject:
             self.clouds + other.clouds,
             self.source if self.source == other.source else "mesh and frames",
             other.date,
+            other.surface or self.surface,
         )
 
 
@@ -285,12 +295,15 @@ class Gallery:
     def unknown_below(self) -> NDArray[np.float64]:
         """Default thresholds [n_objects]: the lowest confidence of an answer with the name of each object.
 
-        They follow from scores that are interpolated in `KEPT`, linearly in the logarithm of the number of views.
+        They follow from `KEPT_WITH_SURFACE`. For objects without a surface, they follow from scores that are
+        interpolated in `KEPT`, linearly in the logarithm of the number of views.
         """
         views = [len(views.clouds) for views in self.objects.values()]
         entries = KEPT[self.version]
         kept = entries[0] if self.references is None else entries[1 if self.references.classes else -1]
-        odds = _score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
+        scores = np.interp(np.log(views), np.log(list(kept)), list(kept.values()))
+        scores[list(self.surfaces)] = KEPT_WITH_SURFACE
+        odds = _score_odds(scores)
         return (odds / (1 + odds)).round(3)
 
     @functools.cached_property
@@ -325,6 +338,26 @@ class Gallery:
         if trained.shape[1]:
             scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)
         return scores.astype(np.float32)
+
+    @functools.cached_property
+    def surfaces(self) -> dict[int, Surfaces]:
+        """The surfaces of those objects that were enrolled with a mesh, by the number of the object."""
+        surfaces = {number: views.surface for number, views in enumerate(self.objects.values())}
+        return {number: surface for number, surface in surfaces.items() if surface is not None}
+
+    def compared(self, scores: NDArray[np.float32], samples: Sample) -> NDArray[np.float32]:
+        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `thor2_jax.surfaces.compared`.
+
+        Objects without a surface keep their scores.
+        """
+        number = list(self.surfaces)
+        odds = _score_odds(scores[:, number].astype(np.float64))
+        known = compared(odds / (1 + odds.sum(axis=1, keepdims=True)), list(self.surfaces.values()), samples)
+        odds = known / np.maximum(1 - known.sum(axis=1, keepdims=True), TINY)
+        changed = EVEN * odds ** (1 / STEEPNESS)
+        result = scores.copy()
+        result[:, number] = changed / np.maximum(changed.max(axis=1, keepdims=True), 1)
+        return result
 
     @functools.cached_property
     def _outputs(self) -> tuple[str | None, ...]:

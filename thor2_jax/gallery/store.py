@@ -3,7 +3,8 @@
 GALLERY/index.json                      format, generation, fingerprint of the embedding, hidden classes, and for each
                                         object its name, file, number of views, source and date
 GALLERY/previous.json                   index.json before the last change, which can thus be undone
-GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object, with its name, source and date
+GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object, with its name, source and date,
+                                        and the surface of its mesh
 
 A writer holds the lock, writes the files of new objects and then replaces index.json, so the gallery on disk is always
 in the state before or after a change. The next writer removes object files that index.json does not name; all other
@@ -33,6 +34,7 @@ from thor2_jax.files import (
     write_text,
 )
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.surfaces import Surfaces
 
 __all__ = [
     "GALLERY_DIRECTORY",
@@ -54,6 +56,9 @@ GALLERY_DIRECTORY = "gallery"
 """Name of the gallery in a run directory."""
 
 INDEX_FILE = "index.json"
+
+SURFACE = "surface_"
+"""Prefix of the names of a surface's arrays in the file of an object."""
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 
@@ -180,6 +185,8 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 
 def _object_content(name: str, views: GalleryObject) -> bytes:
     arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
+    if views.surface is not None:
+        arrays |= {SURFACE + field: np.asarray(array) for field, array in views.surface.arrays.items()}
     return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
 
 
@@ -196,7 +203,9 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     try:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
-        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", file=path.stem)
+        of_surface = {name.removeprefix(SURFACE): arrays.pop(name) for name in list(arrays) if name.startswith(SURFACE)}
+        surface = Surfaces.of_arrays(of_surface) if of_surface else None
+        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", surface, path.stem)
         return about.get("name"), _with_origin(views, about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None

@@ -24,8 +24,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
-from thor2_jax.model.surfaces import with_evidence
 from thor2_jax.networks import EMBEDDING
+from thor2_jax.surfaces import Sample, sample_points, with_evidence
 from thor2_jax.types import PointClouds
 
 __all__ = [
@@ -101,12 +101,14 @@ class Inference(NamedTuple):
             answers. The embedding's probabilities sum to the probability that the object is one of the classes.
         embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
         scores: [B, n_objects] scores of the gallery, which replace the embeddings after fusion over frames.
+        samples: points of the clouds that are compared with the surfaces of enrolled objects; None without any.
     """
 
     overflow: Any
     probabilities: Mapping[str, Any]
     embeddings: Any = None
     scores: Any = None
+    samples: Sample | None = None
 
 
 def infer(
@@ -138,7 +140,8 @@ def infer(
     if not is_ours or oriented.shape[1] < LOOKS:
         first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
     first = jax.tree.map(lambda a: a[:, :LOOKS], first)
-    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds))
+    samples = sample_points(clouds) if model.gallery.surfaces else None
+    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), samples=samples)
 
 
 def infer_clouds(
@@ -167,7 +170,9 @@ def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | N
     """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
     if inference.embeddings is None:
         return inference.scores
-    return model.gallery.scores(inference.embeddings)
+    gallery, samples = model.gallery, inference.samples
+    scores = gallery.scores(inference.embeddings)
+    return gallery.compared(scores, samples) if gallery.surfaces and samples is not None else scores
 
 
 def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:

@@ -41,7 +41,6 @@ from thor2_jax.files import (
 )
 from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.model.run_record import FORMAT_WITH_SURFACES, RUN_FILE, RUN_FORMAT, read_description
-from thor2_jax.model.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.networks import (
     MLP,
     Classifier,
@@ -51,6 +50,7 @@ from thor2_jax.networks import (
     model_arrays,
     model_from_arrays,
 )
+from thor2_jax.surfaces import SURFACES_FILE, Surfaces
 
 __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file"]
 

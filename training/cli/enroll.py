@@ -64,7 +64,7 @@ def enroll(
     options.check_belongs("frames", has_frames, label_name=label_name, instance=instance)
     scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
-    from training.objects.meshes import find_object_meshes, load_mesh
+    from training.objects.meshes import find_object_meshes, load_mesh, scaled_meshes
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
@@ -78,7 +78,7 @@ def enroll(
         with show_progress(quiet) as progress:
             counts, known, skipped = enroll_objects(
                 model,
-                (meshes, views_of_meshes) if frames is None else frames,
+                (scaled_meshes(meshes, mesh_scale), views_of_meshes) if frames is None else frames,
                 name=name,
                 label_name=label_name,
                 instance=instance,

@@ -16,8 +16,8 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import augmented_view
-from thor2_jax.model.surfaces import Surfaces
 from thor2_jax.printable import check_name, normal_name
+from thor2_jax.surfaces import Surfaces
 from training.readers.frames import FrameFolder
 from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
 from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views

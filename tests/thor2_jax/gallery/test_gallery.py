@@ -17,6 +17,12 @@ from thor2_jax.gallery import search
 from thor2_jax.gallery.embedding import BACKGROUND, References
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
+from thor2_jax.surfaces import evidence, sample_points
+from thor2_jax.types import PointClouds
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
+from training.rendering.camera import camera_pose
+from training.views.mesh_views import view_cloud
 
 
 def unit(values: np.ndarray) -> np.ndarray:
@@ -55,6 +61,23 @@ def test_the_nearest_object_scores_highest(gallery: Gallery) -> None:
     assert unknown.max() < scores.max(axis=1).min() / 2
     assert gallery.scores(np.zeros((0, 4, 16), np.float32)).shape == (0, 3)
     assert Gallery("").scores(np.zeros((2, 16), np.float32)).shape == (2, 0)
+
+
+def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> None:
+    """Against `evidence` of the single object with a surface, in float64; all points of a view of a can fit it."""
+    mesh = builtin_objects()["soup_can_red"]
+    surface = surfaces_of([mesh])
+    bowl = dataclasses.replace(gallery.objects["bowl"], surface=surface)
+    with_surface = dataclasses.replace(gallery, objects={**gallery.objects, "bowl": bowl})
+    clouds = PointClouds.pack([view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre)), *random_clouds(0, [500, 0])])
+    scores = np.random.default_rng(0).uniform(0.1, 0.3, (3, 3)).astype(np.float32)
+    changed = with_surface.compared(scores, sample_points(clouds))
+    np.testing.assert_array_equal(changed[:, [0, 2]], scores[:, [0, 2]])
+    weights = np.asarray(evidence(surface, clouds, np.zeros(3, int)), np.float64) @ [-2.8, 1.5, 1.8, -15] + 2.1
+    expected = 0.2 * ((scores[:, 1].astype(np.float64) / 0.2) ** 3 * np.exp(weights)) ** (1 / 3)
+    np.testing.assert_allclose(changed[:, 1], expected.clip(max=1), rtol=1e-3)
+    assert changed[0, 1] > 2 * scores[0, 1]
+    assert with_surface.unknown_below[1] > 0.95 > with_surface.unknown_below[2] == gallery.unknown_below[2]
 
 
 def test_thresholds_grow_with_the_views_of_each_object() -> None:

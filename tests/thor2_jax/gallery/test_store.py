@@ -24,6 +24,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
 from thor2_jax.gallery.store import GalleryError, check_index, gallery_stamp, load_gallery, update_gallery
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
 
 FINGERPRINT = "f" * 64
 
@@ -63,6 +65,20 @@ def directory(tmp_path: Path) -> Path:
     for seed, name in enumerate(("mug", "bowl")):
         update_gallery(path, add(name, seed), FINGERPRINT)
     return path
+
+
+def test_surfaces_are_stored_with_their_object(directory: Path) -> None:
+    meshes = builtin_objects()
+    can, box = (surfaces_of([meshes[name]]) for name in ("soup_can_red", "yellow_box"))
+    for name, seed, surface in (("mug", 2, can), ("bowl", 3, None), ("mug", 4, None), ("bowl", 5, box)):
+        views = dataclasses.replace(enrolled(seed), surface=surface)
+        update_gallery(directory, lambda g, name=name, views=views: g.with_object(name, views, extend=True))
+    loaded = load_gallery(directory, FINGERPRINT)
+    assert list(loaded.surfaces) == [0, 1]
+    for surface, expected in zip(loaded.surfaces.values(), (can, box), strict=True):
+        assert surface.content == expected.content
+    update_gallery(directory, add("mug", 6, replace=True), FINGERPRINT)
+    assert list(load_gallery(directory, FINGERPRINT).surfaces) == [1]
 
 
 def test_what_is_loaded_is_what_was_stored(directory: Path) -> None:

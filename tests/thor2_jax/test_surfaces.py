@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from small_clouds import random_clouds
 
-from thor2_jax.model.surfaces import (
+from thor2_jax.surfaces import (
     REACH,
     SAMPLED,
     Surfaces,
     _fit_rows,
-    _sample_points,
+    compared,
     evidence,
     fit_poses,
+    sample_points,
     with_evidence,
 )
 from thor2_jax.types import Cloud, PointClouds
@@ -57,8 +58,8 @@ def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: lis
 def with_background(views: list[Cloud], depths: list[float], whole: list[Cloud] | None = None) -> PointClouds:
     """Return clouds with points at these depths around each view, or around the `whole` object."""
     around = []
-    for (xyz, _), (seen, _), depth in zip(views, whole or views, depths, strict=True):
-        rays = xyz[:, :2] / xyz[:, 2:]
+    for (seen, _), depth in zip(whole or views, depths, strict=True):
+        rays = seen[:, :2] / seen[:, 2:]
         low, high = rays.min(axis=0) - 0.06, rays.max(axis=0) + 0.06
         grid = np.stack(np.meshgrid(*np.linspace(low, high, 24).T), axis=-1)
         is_free = np.linalg.norm(grid[:, :, None] - seen[:, :2] / seen[:, 2:], axis=3).min(axis=2) > 0.008
@@ -102,7 +103,7 @@ def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> N
     position = np.array([0.3, -2, 5], np.float32)
     moved = PointClouds.pack([(xyz + position, rgb) for xyz, rgb in views], camera=np.tile(position, (9, 1)))
     still = PointClouds.pack(views)
-    np.testing.assert_allclose(_sample_points(moved).points, _sample_points(still).points, atol=1e-5)
+    np.testing.assert_allclose(sample_points(moved).points, sample_points(still).points, atol=1e-5)
     before, after = (np.asarray(evidence(surfaces, each, OWN)) for each in (still, moved))
     assert np.abs(after - before).max() < 0.3
 
@@ -132,7 +133,7 @@ def test_points_beyond_the_surface_count_with_the_largest_distance(surfaces: Sur
 def test_samples_spread_over_large_clouds() -> None:
     x = np.linspace(0, 1, 3000, dtype=np.float32)
     line = np.stack([x, np.zeros_like(x), np.full_like(x, 0.5)], axis=1)
-    chosen = _sample_points(PointClouds.pack([(line, np.zeros((3000, 3), np.uint8))])).points
+    chosen = sample_points(PointClouds.pack([(line, np.zeros((3000, 3), np.uint8))])).points
     np.testing.assert_allclose(np.sort(chosen[0, :, 0]), np.linspace(0, 1, SAMPLED), atol=0.02)
 
 
@@ -142,7 +143,7 @@ def test_the_roughness_is_the_noise_of_a_plane(noise: float) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(0, 0.08, (1000, 2)), 0.5 + rng.normal(0, noise, 1000)]).astype(np.float32)
     flat = points * np.array([1, 1, 0], np.float32) + np.array([0, 0, 0.5], np.float32)  # as a coarse step of depth
-    rough = _sample_points(PointClouds.pack([(each, np.zeros((1000, 3), np.uint8)) for each in (points, flat)])).rough
+    rough = sample_points(PointClouds.pack([(each, np.zeros((1000, 3), np.uint8)) for each in (points, flat)])).rough
     assert 0.7 * noise < float(rough[0]) < 1.05 * noise and float(rough[1]) == pytest.approx(1e-3)
 
 
@@ -187,6 +188,18 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     assert compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
     assert np.array_equal(with_evidence(jnp.zeros((9, n_classes)), surfaces, clouds), np.zeros((9, n_classes)))
+
+
+def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
+    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    clouds = with_background([*views, empty], [3.0] * 10, [*views, views[0]])
+    each = [jax.tree.map(lambda field, k=k: field[k : k + 1], surfaces) for k in range(3)]
+    for n in (3, 1):
+        p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 10)[:, :n].astype(np.float32)
+        p[2] = 0
+        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), clouds)
+        np.testing.assert_allclose(compared(p, each[:n], sample_points(clouds)), expected, atol=1e-5)
+    assert compared(p[:0], each[:1], jax.tree.map(lambda a: a[:0], sample_points(clouds))).shape == (0, 1)
 
 
 def test_surfaces_decide_between_the_two_best_names(views: list[Cloud]) -> None:

@@ -12,7 +12,7 @@ and all shapes are static.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -30,10 +30,13 @@ __all__ = [
     "N_POINTS",
     "RADIUS",
     "SURFACES_FILE",
+    "Sample",
     "Surfaces",
+    "compared",
     "evidence",
     "fit_poses",
     "rotations",
+    "sample_points",
     "with_evidence",
 ]
 
@@ -102,15 +105,25 @@ class Surfaces:
     grid: jax.Array
     boxes: jax.Array
 
+    @property
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays on the host, by the names of their fields."""
+        return {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
+
     @functools.cached_property
     def content(self) -> bytes:
         """The arrays as the bytes of a file."""
-        return pack_arrays({field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)})
+        return pack_arrays(self.arrays)
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "Surfaces":
+        """Return the surfaces with these `arrays`."""
+        return cls(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
     @classmethod
     def of_content(cls, content: bytes) -> "Surfaces":
         """Return the surfaces with this `content`."""
-        return cls(**jax.tree.map(jnp.asarray, unpack_arrays(content)[0]))
+        return cls.of_arrays(unpack_arrays(content)[0])
 
     def distances(self, index: int, pose: NDArray[np.float32], points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return how far points are from the surface of a class: at least the point-to-plane distance.
@@ -146,12 +159,12 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
         [B, 4] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
         correlations of chroma and of lightness, fraction of the surface in free space; zeros for an empty cloud.
     """
-    return _fit_rows(surfaces, _sample_points(clouds), class_index)[0]
+    return _fit_rows(surfaces, sample_points(clouds), class_index)[0]
 
 
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
     """Return the poses [B, 3, 4] of `evidence`: a rotation and a shift from the camera to the class, metres."""
-    return _fit_rows(surfaces, _sample_points(clouds), jnp.asarray(class_index))[1]
+    return _fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
 
 
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
@@ -161,11 +174,19 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClo
     shared in proportion to p exp(`NAME_WEIGHTS` e). The odds of all classes against the distractors are then multiplied
     by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is most probable after this step.
     """
-    return _reweight(probabilities, surfaces, _sample_points(clouds))
+    return _reweight(probabilities, surfaces, sample_points(clouds))
 
 
-class _Sample(NamedTuple):
-    """Points of an instance: [SAMPLED, 3] metres from the camera, smoothed L*a*b* colours [3, SAMPLED], roughness."""
+class Sample(NamedTuple):
+    """What is compared of instances, from `sample_points`.
+
+    Attributes:
+        points: [B, SAMPLED, 3], metres, relative to the camera.
+        lab: [B, 3, SAMPLED], smoothed L*a*b* colours.
+        rough: [B], roughness, metres.
+        around: [B, G, G, 3], see `PointClouds.around`.
+        is_empty: [B] bool.
+    """
 
     points: jax.Array
     lab: jax.Array
@@ -175,8 +196,10 @@ class _Sample(NamedTuple):
 
 
 @jax.jit
-def _sample_points(clouds: PointClouds) -> _Sample:
-    def sample(row: tuple[jax.Array, ...]) -> _Sample:
+def sample_points(clouds: PointClouds) -> Sample:
+    """Return what `evidence` compares of clouds [B, N] in metres."""
+
+    def sample(row: tuple[jax.Array, ...]) -> Sample:
         points, colors, mask, camera, around = row
         number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
         # The order of the points is spatial. Equal steps through it, and multiples of the golden ratio, spread evenly.
@@ -184,18 +207,18 @@ def _sample_points(clouds: PointClouds) -> _Sample:
         points, lab = points[every] - camera, to_lab(colors[every])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
         chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
-        return _Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), around, count == 0)
+        return Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), around, count == 0)
 
     around = jnp.zeros((len(clouds.points), 1, 1, 3)) if clouds.around is None else clouds.around
     return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera, around), batch_size=16)
 
 
 @jax.jit
-def _fit_rows(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    def fit(sample: _Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)
 
-    def of_row(row: tuple[_Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def of_row(row: tuple[Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return jax.lax.cond(row[0].is_empty, lambda *_: (jnp.zeros(4), jnp.zeros((3, 4))), fit, *row)
 
     # One by one on CPUs, where padding can be skipped, else at once.
@@ -203,13 +226,42 @@ def _fit_rows(surfaces: Surfaces, samples: _Sample, class_index: jax.Array) -> t
     return jax.lax.platform_dependent((samples, class_index), cpu=map_rows, default=jax.vmap(of_row))
 
 
+def compared(
+    probabilities: NDArray[np.floating], surfaces: Sequence[Surfaces], samples: Sample
+) -> NDArray[np.floating]:
+    """Return probabilities [B, n] on the host, changed as by `with_evidence`.
+
+    The n names have a surface each. Pairs of an instance and a name are compared one by one, so that another number of
+    names compiles nothing that takes long.
+    """
+    index, is_compared = jax.tree.map(np.array, _to_compare(jnp.asarray(probabilities)))
+    is_compared &= ~np.asarray(samples.is_empty)[:, None] & (probabilities.max(axis=1, keepdims=True) > 0)
+    values = np.zeros((*index.shape, 4), np.float32)
+    for row, k in zip(*np.nonzero(is_compared), strict=True):
+        sample = jax.tree.map(lambda a, row=row: a[row : row + 1], samples)
+        values[row, k] = _fit_rows(surfaces[index[row, k]], sample, np.zeros(1, int))[0][0]
+    return np.asarray(_changed(jnp.asarray(probabilities), index, is_compared, values))
+
+
 @jax.jit
-def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: _Sample) -> jax.Array:
-    largest, index = jax.lax.top_k(probabilities, min(2, probabilities.shape[1]))  # [B, K]
-    is_compared = largest >= RIVAL * largest[:, :1]
+def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
+    index, is_compared = _to_compare(probabilities)
     rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
     rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
+    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)
+    return _changed(probabilities, index, is_compared, values)
+
+
+def _to_compare(probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the indices [B, K] of the most probable names, and which of them are compared."""
+    largest, index = jax.lax.top_k(probabilities, min(2, probabilities.shape[1]))
+    return index, largest >= RIVAL * largest[:, :1]
+
+
+@jax.jit
+def _changed(probabilities: jax.Array, index: jax.Array, is_compared: jax.Array, values: jax.Array) -> jax.Array:
+    """Return probabilities [B, C] changed by the evidence [B, K, 4] of the names with these indices [B, K]."""
+    largest = jnp.take_along_axis(probabilities, index, axis=1)
     logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
     share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
     changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
@@ -244,7 +296,7 @@ def _describe_neighbourhoods(
     return means[:, :3].T, jnp.nan_to_num(jnp.nanmedian(deviation), nan=1e-3)
 
 
-def _fit(surface: Surfaces, sample: _Sample) -> tuple[jax.Array, jax.Array]:
+def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     """Return the evidence [4] and the pose [3, 4] of one instance for one class."""
     points, lab = jnp.concatenate([sample.points, jnp.ones_like(sample.points[:, :1])], axis=1).T, sample.lab
 
