@@ -236,10 +236,16 @@ def compared(
     """
     index, is_compared = jax.tree.map(np.array, _to_compare(jnp.asarray(probabilities)))
     is_compared &= ~np.asarray(samples.is_empty)[:, None] & (probabilities.max(axis=1, keepdims=True) > 0)
+    pairs = np.argwhere(is_compared)
+    # All are dispatched before the first result is awaited.
+    rows = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row, _ in pairs]
+    fits = [
+        _fit_rows(surfaces[index[row, k]], each, np.zeros(1, int))[0]
+        for (row, k), each in zip(pairs, rows, strict=True)
+    ]
     values = np.zeros((*index.shape, 4), np.float32)
-    for row, k in zip(*np.nonzero(is_compared), strict=True):
-        sample = jax.tree.map(lambda a, row=row: a[row : row + 1], samples)
-        values[row, k] = _fit_rows(surfaces[index[row, k]], sample, np.zeros(1, int))[0][0]
+    for (row, k), fit in zip(pairs, fits, strict=True):
+        values[row, k] = fit[0]
     return np.asarray(_changed(jnp.asarray(probabilities), index, is_compared, values))
 
 
