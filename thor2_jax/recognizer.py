@@ -41,7 +41,7 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
-from thor2_jax.surfaces import fit_poses
+from thor2_jax.surfaces import Surfaces, fit_poses
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 
@@ -320,7 +320,8 @@ class Recognizer:
     def segment(self, frame: RGBDFrame) -> NDArray[np.int32]:
         """Segment a frame with the segmenter "table"; split and merge its pieces where the results are known objects.
 
-        This separates objects in a pile, which touch without a visible edge; see `segmentation.known_objects`. The
+        This separates objects in a pile, which touch without a visible edge; see `segmentation.known_objects`. Masks
+        are fitted to the surfaces of objects with a mesh. The
         method is a segmenter, so `segmented(frame, recognizer.segment)` returns the frame with labels. It needs OpenCV
         (extra `segment`).
 
@@ -339,7 +340,9 @@ class Recognizer:
     def _locate(self, frame: RGBDFrame) -> dict[int, "Distances"]:
         """Return label -> distances from the surface of the object, for recognized instances whose surface is known."""
         gallery, trained = self.gallery, self.run.surfaces
-        known = {} if trained is None else {name: (trained, k) for k, name in enumerate(self.run.classes)}
+        known: dict[str, tuple[Surfaces, int]] = {}
+        if trained is not None:
+            known = {name: (trained, k) for k, name in enumerate(self.run.classes) if name not in gallery.hidden}
         known |= {gallery.names[number]: (surface, 0) for number, surface in gallery.surfaces.items()}
         located: dict[int, Distances] = {}
         if not known:

@@ -58,9 +58,10 @@ LARGEST = 512
 STAGES = ((16, 96, 0), (64, 32, 3), (64, 8, 6))
 """Points that score the poses, poses that are kept, and steps of their refinement, for each stage of the search."""
 
-PLACED, CLEAR = 512, 0.02
+PLACED, CLEAR, FREE_COST = 512, 0.02, 2.0
 """PLACED: points of a surface that are compared with what the camera sees around the instance. CLEAR: a point is in
-free space if it is nearer to the camera by this distance, metres."""
+free space if it is nearer to the camera by this distance, metres. FREE_COST: energy of a pose whose surface is wholly
+in free space."""
 
 FAR, REACH = 0.02, 0.012
 """FAR: margin of the grid, and largest distance of a match in the first step of the refinement, metres. REACH: largest
@@ -69,7 +70,7 @@ distance of a match in scores and values, metres."""
 RADIUS = 0.01
 """Radius of the neighbourhoods for smoothed colours and for the roughness, metres."""
 
-RIVAL, NAME_WEIGHTS = 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
+N_COMPARED, RIVAL, NAME_WEIGHTS = 3, 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 """See `with_evidence`; logistic regressions on rendered views of four runs give similar weights."""
 
@@ -136,11 +137,11 @@ class Surfaces:
         Returns:
             [n], metres; inf beyond the grid.
         """
-        (low, cell), table = np.asarray(self.grid[index]), np.asarray(self.table[index]).T
+        (low, cell), table = np.asarray(self.grid)[index], np.asarray(self.table)[index].T
         moved = points @ pose[:, :3].T + pose[:, 3]
         at = np.floor((moved - low) / cell)
         x, y, z = at.clip(0, GRID - 1).astype(int).T
-        nearest = table[np.asarray(self.nearest[index])[(x * GRID + y) * GRID + z]]
+        nearest = table[np.asarray(self.nearest)[index][(x * GRID + y) * GRID + z]]
         offset = moved - nearest[:, :3]
         plane = (offset * nearest[:, 6:]).sum(axis=1)
         distance = np.hypot(plane, np.linalg.norm(offset, axis=1) / 3)  # nearest points are samples of the surface
@@ -152,7 +153,7 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
 
     Args:
         surfaces: surfaces of the classes.
-        clouds: [B, N] clouds in metres, in any frame; padding follows the points.
+        clouds: [B, N] clouds in metres, in any frame (with `around`: in the camera frame); padding follows the points.
         class_index: [B] int.
 
     Returns:
@@ -170,9 +171,10 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
-    If the second class has at least `RIVAL` times the probability of the first one, the total probability of the two is
-    shared in proportion to p exp(`NAME_WEIGHTS` e). The odds of all classes against the distractors are then multiplied
-    by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is most probable after this step.
+    Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
+    total probability is shared among them in proportion to p exp(`NAME_WEIGHTS` e). The odds of all classes against the
+    distractors are then multiplied by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is
+    most probable after this step.
     """
     return _reweight(probabilities, surfaces, sample_points(clouds))
 
@@ -209,7 +211,7 @@ def sample_points(clouds: PointClouds) -> Sample:
         chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
         return Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), around, count == 0)
 
-    around = jnp.zeros((len(clouds.points), 1, 1, 3)) if clouds.around is None else clouds.around
+    around = jnp.zeros((len(clouds.points), 1, 1, 3), jnp.float32) if clouds.around is None else clouds.around
     return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera, around), batch_size=16)
 
 
@@ -218,8 +220,10 @@ def _fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tu
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)
 
+    nothing = jnp.zeros(4, jnp.float32), jnp.zeros((3, 4), jnp.float32)
+
     def of_row(row: tuple[Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return jax.lax.cond(row[0].is_empty, lambda *_: (jnp.zeros(4), jnp.zeros((3, 4))), fit, *row)
+        return jax.lax.cond(row[0].is_empty, lambda *_: nothing, fit, *row)
 
     # One by one on CPUs, where padding can be skipped, else at once.
     map_rows = functools.partial(jax.lax.map, of_row)
@@ -260,7 +264,7 @@ def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> 
 
 def _to_compare(probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the indices [B, K] of the most probable names, and which of them are compared."""
-    largest, index = jax.lax.top_k(probabilities, min(2, probabilities.shape[1]))
+    largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))
     return index, largest >= RIVAL * largest[:, :1]
 
 
@@ -348,7 +352,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
         column, row = jnp.moveaxis(jnp.rint(at).clip(-1, last + 1).astype(int), 1, 0)
         is_inside = (column >= 0) & (column <= last) & (row >= 0) & (row <= last)
         seen = jnp.take(sample.around[..., 2].ravel(), row * (last + 1) + column, mode="clip")
-        return (is_inside & (here[:, 2] < seen - CLEAR)).mean(axis=1)
+        is_free = is_inside & (here[:, 2] > 0) & (here[:, 2] < seen - CLEAR)
+        return is_free.mean(axis=1, dtype=jnp.float32)
 
     pose, done = _candidates(surface.boxes, sample.points), 0
     for n, kept, steps in STAGES:
@@ -356,7 +361,7 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
         pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
         done += steps
     free = in_free_space(pose)
-    best = (energy(pose, SAMPLED) + 2 * free).argmin()
+    best = (energy(pose, SAMPLED) + FREE_COST * free).argmin()
     offset, distance, entries = (each[0] for each in look_up(matmul(pose[best, None], points), range(3, 9)))
     matched = distance < REACH
     plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH).mean()
@@ -371,7 +376,7 @@ def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:
     c = 1 / jnp.maximum(1 + z, 1e-6)
     ahead = jnp.array([[1 - c * x * x, -c * x * y, -x], [-c * x * y, 1 - c * y * y, -y], [x, y, z]])  # to the z axis
     seen = matmul(points, ahead.T)
-    low, high = jnp.sort(seen.T, axis=1)[:, np.array([SAMPLED // 50, -SAMPLED // 50])].T  # without the outermost points
+    low, high = jnp.sort(seen.T, axis=1)[:, np.array([5, -6])].T  # without the outermost points
     low, middle, high = low - boxes[:, 0], seen.mean(axis=0) - boxes[:, 1], high - boxes[:, 2]  # places of the class
     corners = [jnp.stack([a[:, 0], b[:, 1], middle[:, 2]], axis=1) for a in (low, high) for b in (low, high)]
     inverse = jnp.asarray(rotations().mT)

@@ -23,10 +23,11 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.inference import Inference, answers, infer
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
-from thor2_jax.surfaces import with_evidence
+from thor2_jax.surfaces import fit_poses, with_evidence
 
 CLASSES = ("a", "b", "c", "d")
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -179,3 +180,25 @@ def test_nothing_compiles_after_warm_up(max_points: int, sizes: int) -> None:
         assert compiled == []
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_known_instances_are_located(monkeypatch: pytest.MonkeyPatch) -> None:
+    recognizer = Recognizer(with_surfaces(untrained_embedding_run(CLASSES, ("tops",))))
+    surfaces, names, frame = recognizer.run.surfaces, {3: "b", 200: "d"}, tilted(patches())
+    monkeypatch.setattr(
+        "thor2_jax.recognizer.answers",
+        lambda model, instances, inference: [Recognition(each.label, names.get(each.label)) for each in instances],
+    )
+    found = recognizer._locate(frame)
+    assert list(found) == [3, 200]
+    for label, index in ((3, 1), (200, 3)):
+        (instance,) = recognizer.prepare(frame, [label])
+        pose = np.asarray(fit_poses(surfaces, pack_instances([instance], 1), [index])[0])
+        expected = surfaces.distances(index, pose, instance.points)
+        assert np.isfinite(expected).any()
+        np.testing.assert_allclose(found[label](instance.points), expected, atol=1e-4)
+    names.clear()
+    assert recognizer._locate(frame) == {}
+    names[3] = "b"
+    recognizer.objects.enroll("b", list(recognizer.prepare(frame, [7])), "frames", replace=True)
+    assert recognizer._locate(frame) == {}  # "b" is now another object

@@ -176,17 +176,18 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
     before = rng.dirichlet(np.full(n_classes + 1, 0.4), 9)[:, :n_classes].astype(np.float32)
     after = np.asarray(with_evidence(jnp.asarray(before), surfaces, clouds), np.float64)
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
-    compared = 0
+    n_compared = 0
     for row, probabilities in enumerate(before.astype(np.float64)):
-        best = np.argsort(-probabilities)[:2]
-        if len(best) == 2 and probabilities[best[1]] > 0.1 * probabilities[best[0]]:
+        best = np.argsort(-probabilities)[:3]
+        best = best[probabilities[best] > 0.1 * probabilities[best[0]]]
+        if len(best) > 1:
             odds = probabilities[best] * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
             probabilities[best] = probabilities[best].sum() * odds / odds.sum()
-            compared += 1
+            n_compared += 1
         known = probabilities.sum()
         odds = known / (1 - known) * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
-    assert compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
+    assert n_compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
     assert np.array_equal(with_evidence(jnp.zeros((9, n_classes)), surfaces, clouds), np.zeros((9, n_classes)))
 
 
@@ -215,3 +216,43 @@ def test_content(surfaces: Surfaces) -> None:
     again = Surfaces.of_content(surfaces.content)
     jax.tree.map(np.testing.assert_array_equal, again, surfaces)
     assert again.content == surfaces.content
+
+
+def test_only_points_well_in_front_of_what_is_seen_are_in_free_space(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """The middle of the view is that of the object; what lies beside the grid is unknown."""
+    box = views[3]
+    clouds = with_background([box], [3.0])
+    middle = float(box[0][:, 2].min())
+    for depth, is_free in ((middle + 0.018, False), (3.0, True)):
+        seen = np.asarray(clouds.around).copy()
+        seen[..., 2] = depth
+        free = evidence(surfaces, dataclasses.replace(clouds, around=jnp.asarray(seen)), np.array([1]))[0, 3]
+        assert (free == 0) != is_free, free
+    for shift, expected in ((0, 1), (2, 0)):  # everything, nothing
+        seen[..., :2] += shift
+        assert (
+            evidence(surfaces, dataclasses.replace(clouds, around=jnp.asarray(seen)), np.array([1]))[0, 3] == expected
+        )
+
+
+def test_without_what_the_camera_sees_the_axes_do_not_matter(surfaces: Surfaces, views: list[Cloud]) -> None:
+    turned = PointClouds.pack([(xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in views])
+    assert not evidence(surfaces, turned, OWN)[:, 3].any()
+
+
+@pytest.mark.usefixtures("x64")
+def test_evidence_is_float32_in_float64_mode(surfaces: Surfaces, views: list[Cloud]) -> None:
+    clouds = PointClouds.pack(views)
+    assert evidence(surfaces, clouds, jnp.asarray(OWN)).dtype == np.float32
+    assert fit_poses(surfaces, clouds, OWN).dtype == np.float32
+
+
+def test_distances_from_a_surface_of_one_point() -> None:
+    """Beside the point, a third of the distance counts."""
+    table = np.zeros((1, 9, 1), np.float32)
+    table[0, 8] = 1
+    grid = np.array([[[-0.1] * 3, [0.2 / 48] * 3]], np.float32)
+    one = Surfaces(table, np.zeros((1, 48**3), np.int16), grid, np.zeros((1, 216, 3, 3), np.float32))
+    points = np.array([[0.009, 0, 0], [0, 0, 0.004], [0, 0.03, 0.01], [0.11, 0, 0], [-0.11, 0, 0]])
+    expected = [0.003, 0.004 * 10**0.5 / 3, np.hypot(0.01, np.hypot(0.03, 0.01) / 3), np.inf, np.inf]
+    np.testing.assert_allclose(one.distances(0, np.eye(3, 4, dtype=np.float32), points), expected, rtol=1e-5)

@@ -136,7 +136,7 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
         warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
         looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
     # All masks are one batch, since tracing takes a fourth longer with a further `vmap` over the masks.
-    masked = [dataclasses.replace(clouds, mask=mask, rim=None) for mask in masks]
+    masked = [dataclasses.replace(clouds, mask=mask, rim=None, around=None) for mask in masks]
     batch = jax.tree.map(lambda *a: jnp.concatenate(a), *masked)
     n_clouds, n_points = clouds.mask.shape
     points, cameras = (a.reshape(len(masks), n_clouds, *a.shape[1:]) for a in jax.vmap(placed)(batch))

@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, check_frame, pixel_rays
+from thor2_jax.frames.intrinsics import distort
 from thor2_jax.frames.outliers import downsample_to_fit, flying_pixels, remove_outliers, voxel_downsample
 from thor2_jax.printable import first_names
 
@@ -65,7 +66,7 @@ class PreparedInstance:
         reason: why the instance cannot be used; None if it can be used.
         rim: [n] bool, points of pixels within `RIM` of the contour of the mask; all False if more than half of the
             points are; None without a mask.
-        around: [AROUND, AROUND, 3] float32, see `PointClouds.around`; None without a frame.
+        around: [AROUND, AROUND, 3] float32, see `PointClouds.around`; None if it is unknown.
     """
 
     label: int
@@ -279,28 +280,36 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: boo
 
 
 AROUND = 24
-"""Number of rows and of columns of the pixels around an instance that are stored."""
+"""Number of rows and of columns of the rays around an instance."""
+
+FARTHEST = 10.0
+"""Largest depth of a background, metres; larger values are errors of the camera."""
 
 
 def _around(frame: RGBDFrame, label: int) -> NDArray[np.float32]:
-    """Return `PointClouds.around` for an instance: pixels in its box, which is enlarged by a quarter on each side."""
-    height, width = frame.depth.shape
+    """Return `PointClouds.around` for an instance: rays in its box, which is enlarged by a quarter on each side."""
+    (height, width), camera = frame.depth.shape, frame.intrinsics
     row, column = np.divmod(frame.instance_pixels[label], width)
 
-    def spread(low: int, high: int, size: int) -> NDArray[np.intp]:
+    def enlarged(low: int, high: int, size: int) -> NDArray[np.intp]:
         margin = (high - low) // 4 + 2 * RIM
-        low, high = max(low - margin, RIM), min(high + margin, size - 1 - RIM)
-        return low + (high - low) * np.arange(AROUND) // (AROUND - 1)
+        return np.array([max(low - margin, RIM), min(high + margin, size - 1 - RIM)])
 
-    rows = spread(row[0], row[-1], height)  # pixels are in the order of rows
-    pixels = (rows[:, None] * width + spread(column.min(), column.max(), width)).ravel()
-    around = np.asarray(pixel_rays(pixels, width, frame.intrinsics), np.float32)
-    depth, labels = frame.depth_m.ravel().take(pixels, mode="clip"), frame.label_image.ravel()
-    seen = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
+    corners = enlarged(row[0], row[-1], height) * width + enlarged(column.min(), column.max(), width)
+    low, high = pixel_rays(corners, width, camera)
+    x, y, _ = np.linspace(low, high, AROUND).T
+    around = np.stack([*np.meshgrid(x, y), np.zeros((AROUND, AROUND))], axis=-1).astype(np.float32)
+    u, v = around[..., 0], around[..., 1]
+    if camera.distortion:
+        u, v = distort(u, v, camera.distortion)
+    columns, rows = np.rint(u * camera.fx + camera.cx), np.rint(v * camera.fy + camera.cy)
+    pixels = (rows.clip(0, height - 1) * width + columns.clip(0, width - 1)).astype(np.intp)
+    depth, labels = frame.depth_m.ravel().take(pixels), frame.label_image.ravel()
+    seen = (depth >= MIN_DEPTH) & (depth <= FARTHEST)
     for step in itertools.product((-RIM, 0, RIM), repeat=2):  # masks may be too small
         seen &= labels.take(pixels + (step[0] * width + step[1]), mode="clip") != label
-    around[:, 2] = np.where(seen, depth, 0)
-    return around.reshape(AROUND, AROUND, 3)
+    around[..., 2] = np.where(seen, depth, 0)
+    return around
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:

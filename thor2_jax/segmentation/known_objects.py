@@ -97,7 +97,7 @@ def segment_known(
 
 
 ROUNDS = 2
-"""Number of times that masks are fitted to surfaces, and surfaces to the new masks."""
+"""Number of times that surfaces are fitted to masks, and masks to surfaces."""
 
 ON_SURFACE, OFF_SURFACE = 0.008, 0.015
 """A point within ON_SURFACE of another object can go to it; a point beyond OFF_SURFACE leaves its object; metres."""
@@ -109,11 +109,14 @@ LEAST_PIXELS = 200
 def fit_masks(
     frame: RGBDFrame, labels: NDArray[np.int32], locate: Callable[[RGBDFrame], Mapping[int, Distances]]
 ) -> NDArray[np.int32]:
-    """Return labels after each pixel of a piece goes to the known object whose surface is nearest to its point.
+    """Return labels that fit the surfaces of known objects.
+
+    A pixel goes to the known object whose surface is nearest to its point, if it is near. What is far from the surface
+    of its object becomes a piece of its own. Other pieces of unknown objects do not change.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W]; 0 is background.
+        labels: [H, W]; 0 is background, and the objects are numbered from 1.
         locate: function from a frame with labels to label -> distances from the surface, for all known objects.
 
     Returns:
@@ -126,27 +129,32 @@ def fit_masks(
             break
         known, at = np.array(list(surfaces)), (labels > 0) & (frame.depth_m > 0)
         distance = np.stack([distances(points[at]) for distances in surfaces.values()])  # [known, n]
-        own = np.where(known[:, None] == labels[at], distance, np.inf).min(axis=0)  # inf for an unknown piece
-        moves = (distance.min(axis=0) < ON_SURFACE) & (distance.min(axis=0) < own)
-        leaves = np.isfinite(own) & (own > OFF_SURFACE)
+        is_own = known[:, None] == labels[at]
+        own, nearest = np.where(is_own, distance, np.inf).min(axis=0), distance.min(axis=0)
+        moves, leaves = (nearest < ON_SURFACE) & (nearest < own), is_own.any(axis=0) & (own > OFF_SURFACE)
         rest = int(labels.max()) + 1
-        fitted = labels.copy()
+        fitted = np.where(np.isin(labels, known), 0, labels)  # pixels of known objects without depth follow later
         fitted[at] = np.select([moves, leaves], [known[distance.argmin(axis=0)], rest], labels[at])
-        labels = _tidied(fitted, known, rest)
+        labels = _tidied(fitted, labels, rest)
     return labels
 
 
-def _tidied(labels: NDArray[np.int32], known: NDArray[np.intp], rest: int) -> NDArray[np.int32]:
-    """Return labels without small pieces; the separate pieces of known objects keep one number each."""
-    tidied, last = np.zeros_like(labels), 0
-    for label in np.unique(labels[labels > 0]):
-        numbers, sizes = components(labels == label)
+def _tidied(fitted: NDArray[np.int32], labels: NDArray[np.int32], rest: int) -> NDArray[np.int32]:
+    """Return fitted labels without small pieces of changed objects; the separate pieces of `rest` get numbers each."""
+    tidied, last = np.zeros_like(fitted), 0
+    for label in np.unique(fitted[fitted > 0]):
+        mask = fitted == label
+        numbers, sizes = mask.astype(np.int32), np.array([0, mask.sum()])
+        if (mask != (labels == label)).any():
+            numbers, sizes = components(mask)
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
         numbers, end = renumbered(numbers, kept, last)
-        if label in known:
+        if label != rest:
             numbers, end = np.minimum(numbers, last + 1), last + 1
         tidied, last = tidied + numbers, end
     is_kept = tidied > 0
+    if not is_kept.any():
+        return labels
     return np.where(labels > 0, tidied[is_kept].take(nearest_known(is_kept)), 0)
 
 

@@ -259,3 +259,28 @@ def test_instances_that_fill_the_image_have_nothing_around(size: tuple[int, int]
     frame = RGBDFrame(np.zeros((*size, 3), np.uint8), depth, np.ones(size, np.uint8), CAMERA)
     around = prepare_instance(frame, 1, 2.5).around
     assert around is not None and np.isfinite(around).all() and not around[..., 2].any()
+
+
+def test_around_at_the_image_border() -> None:
+    """Pixels within the width of the rim of the border are left out; only trusted depth is kept."""
+    labels, depth = patch((1, 0, 60, 0, 60), (2, 200, 240, 260, 320)), flat(1000)
+    depth[:, 62:66], depth[63:66] = 200, 10100
+    for label, x, y in ((1, (2, 77), (2, 77)), (2, (242, 317), (187, 237))):
+        around = prepare_instance(frame_of(depth, labels), label, 2.5).around
+        columns, rows = around[0, :, 0] * CAMERA.fx + CAMERA.cx, around[:, 0, 1] * CAMERA.fy + CAMERA.cy
+        np.testing.assert_allclose([*columns[[0, -1]], *rows[[0, -1]]], [*x, *y], atol=0.01)
+        assert set(np.unique(around[..., 2])) <= {np.float32(0), np.float32(1)}
+        assert (around[..., 2] == 1).any()
+
+
+def test_nothing_is_seen_beside_narrow_parts() -> None:
+    """A part of the mask as wide as a pixel, and what is two pixels beside it, is not around the instance."""
+    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 70, 71))
+    frame = frame_of(flat(1000), labels)
+    around = prepare_instance(frame, 1, 2.5).around
+    x, y = (
+        np.rint(around[..., k] * f + c).astype(int)
+        for k, f, c in ((0, CAMERA.fx, CAMERA.cx), (1, CAMERA.fy, CAMERA.cy))
+    )
+    near = ndimage.binary_dilation(labels == 1, [[1]])[y, x]
+    assert near.any() and not around[near, 2].any()

@@ -135,3 +135,49 @@ def test_small_pieces_go_to_the_nearest_one() -> None:
 def test_without_known_objects_labels_remain() -> None:
     for labels in (TRUTH, np.zeros_like(TRUTH)):
         np.testing.assert_array_equal(fit_masks(FRAME, labels, lambda frame: {}), labels)
+
+
+def test_points_beyond_the_reach_of_a_surface_leave() -> None:
+    near = surface_of(TRUTH == 1)
+
+    def cut(points: NDArray[np.floating]) -> NDArray[np.float64]:
+        distance = near(points)
+        return np.where(distance > 0.02, np.inf, distance)
+
+    labels = fit_masks(FRAME, ONE_PIECE, lambda frame: {1: cut})
+    np.testing.assert_array_equal(labels, fit_masks(FRAME, ONE_PIECE, lambda frame: {1: near}))
+    assert (labels[TRUTH == 2] != 1).mean() > 0.6
+
+
+def test_a_small_object_may_leave_completely() -> None:
+    rows, columns = np.nonzero(TRUTH == 1)
+    labels = np.zeros_like(TRUTH)
+    labels[rows[1000:1150], columns[1000:1150]] = 1
+    fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
+    np.testing.assert_array_equal(fitted, labels)
+
+
+def test_separate_pieces_of_an_object_keep_its_number() -> None:
+    """Those of an unknown object, too; what leaves an object is separate."""
+    columns = np.arange(640)
+    middle = round(np.nonzero(TRUTH)[1].mean())
+    gap = np.where((TRUTH > 0) & (abs(columns - middle) > 8), 1, 0).astype(np.int32)
+    rows, columns = np.nonzero((TRUTH == 0) & (FRAME.depth > 0))
+    gap[rows[:400], columns[:400]] = 2
+    for known, far in ((1, 0.01), (2, 0.01), (1, 0.02)):
+        labels = fit_masks(FRAME, gap, lambda frame, known=known, far=far: {known: lambda p: np.full(len(p), far)})
+        assert labels.max() == (3 if far > 0.015 else 2)
+
+
+def test_points_stay_on_the_nearest_of_two_near_surfaces() -> None:
+    """A pixel without depth keeps its label."""
+    depth = FRAME.depth.copy()
+    depth[TRUTH == 2] *= np.arange(640)[None].repeat(480, 0)[TRUTH == 2] % 7 > 0
+    frame = RGBDFrame(FRAME.color, depth, None, FRAME.intrinsics)
+
+    def distances(points: NDArray[np.floating]) -> NDArray[np.float64]:
+        assert (points[:, 2] > 0).all()
+        return np.full(len(points), 0.004)
+
+    fitted = fit_masks(frame, TRUTH, lambda frame: {1: distances, 2: distances})
+    assert (fitted != TRUTH).sum() < 20
