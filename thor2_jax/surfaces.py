@@ -72,7 +72,9 @@ RADIUS = 0.01
 
 N_COMPARED, RIVAL, NAME_WEIGHTS = 3, 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
-"""See `with_evidence`; logistic regressions on rendered views of four runs give similar weights."""
+ODDS_EXPONENT = np.float32(0.5)
+"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights. Those of free space
+and of the odds are from real frames with classes left out; the odds of networks depend more on the camera."""
 
 
 @functools.cache
@@ -172,9 +174,9 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClo
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
     Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
-    total probability is shared among them in proportion to p exp(`NAME_WEIGHTS` e). The odds of all classes against the
-    distractors are then multiplied by exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class that is
-    most probable after this step.
+    total probability is shared among them in proportion to p exp(`NAME_WEIGHTS` e). The odds o of all classes against
+    the distractors then become o^`ODDS_EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class
+    that is most probable after this step.
     """
     return _reweight(probabilities, surfaces, sample_points(clouds))
 
@@ -279,7 +281,8 @@ def _changed(probabilities: jax.Array, index: jax.Array, is_compared: jax.Array,
     best = jnp.take_along_axis(values, changed.argmax(axis=1)[:, None, None], axis=1)[:, 0]
     total = probabilities.sum(axis=1)
     known = total.clip(1e-4, 1 - 1e-4)
-    known = jax.nn.sigmoid(jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS)
+    logit = ODDS_EXPONENT * jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS
+    known = jax.nn.sigmoid(logit)
     return probabilities * (known / jnp.maximum(total, 1e-30))[:, None]
 
 

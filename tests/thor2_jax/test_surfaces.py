@@ -185,7 +185,7 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
             probabilities[best] = probabilities[best].sum() * odds / odds.sum()
             n_compared += 1
         known = probabilities.sum()
-        odds = known / (1 - known) * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
+        odds = (known / (1 - known)) ** 0.5 * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     assert n_compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
     assert np.array_equal(with_evidence(jnp.zeros((9, n_classes)), surfaces, clouds), np.zeros((9, n_classes)))
