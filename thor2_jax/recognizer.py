@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,7 +36,7 @@ from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
-from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows
+from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, object_scores, padded_rows
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -284,7 +285,7 @@ class Recognizer:
         rows = sorted({padded_rows(n, self.chunk) for n in range(1, min(max_instances, self.chunk) + 1)})
         shapes = [(b, n) for n in points for b in rows]
         for b, n in shapes:
-            infer_clouds(self.model, pack_instances([], b, n))
+            object_scores(self.model, jax.tree.map(np.asarray, infer_clouds(self.model, pack_instances([], b, n))))
         return len(shapes)
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:

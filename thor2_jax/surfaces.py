@@ -237,11 +237,13 @@ def compared(
 ) -> NDArray[np.floating]:
     """Return probabilities [B, n] on the host, changed as by `with_evidence`.
 
-    The n names have a surface each. Pairs of an instance and a name are compared one by one, so that another number of
-    names compiles nothing that takes long.
+    The n names have a surface each. Every instance and name is compared on its own, so that other numbers of instances
+    compile nothing. Rows of zeros are not compared, except for empty clouds, with which the programs are compiled.
     """
-    index, is_compared = jax.tree.map(np.array, _to_compare(jnp.asarray(probabilities)))
-    is_compared &= ~np.asarray(samples.is_empty)[:, None] & (probabilities.max(axis=1, keepdims=True) > 0)
+    index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
+    largest = np.take_along_axis(probabilities, index, axis=1)
+    is_compared = (largest >= RIVAL * largest[:, :1]) & ((largest[:, :1] > 0) | np.asarray(samples.is_empty)[:, None])
+    values = np.zeros((*index.shape, 4), np.float32)
     pairs = np.argwhere(is_compared)
     # All are dispatched before the first result is awaited.
     rows = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row, _ in pairs]
@@ -249,25 +251,23 @@ def compared(
         _fit_rows(surfaces[index[row, k]], each, np.zeros(1, int))[0]
         for (row, k), each in zip(pairs, rows, strict=True)
     ]
-    values = np.zeros((*index.shape, 4), np.float32)
     for (row, k), fit in zip(pairs, fits, strict=True):
         values[row, k] = fit[0]
-    return np.asarray(_changed(jnp.asarray(probabilities), index, is_compared, values))
+    changed = np.array(probabilities)
+    for row in range(len(changed)):
+        here = slice(row, row + 1)
+        changed[here] = _changed(*(jnp.asarray(a[here]) for a in (probabilities, index, is_compared, values)))
+    return changed
 
 
 @jax.jit
 def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
-    index, is_compared = _to_compare(probabilities)
+    largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
+    is_compared = largest >= RIVAL * largest[:, :1]
     rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
     rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
     values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)
     return _changed(probabilities, index, is_compared, values)
-
-
-def _to_compare(probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the indices [B, K] of the most probable names, and which of them are compared."""
-    largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))
-    return index, largest >= RIVAL * largest[:, :1]
 
 
 @jax.jit

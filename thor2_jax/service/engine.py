@@ -23,7 +23,7 @@ from thor2_jax.explanation.explain import explained_by_classifiers
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists
-from thor2_jax.model.inference import Inference, answers, infer
+from thor2_jax.model.inference import Inference, answers, infer, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
@@ -214,6 +214,8 @@ class InferenceEngine:
         images, embeddings = oriented.first.images, oriented.first.embeddings
         computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
         batch = CloudResult(*jax.tree.map(np.asarray, computed))
+        if not instances:
+            object_scores(self.model, batch.inference)  # compiles the comparison with the surfaces of enrolled objects
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
