@@ -122,7 +122,7 @@ def measure_enrollment(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _enroll_mesh(objects: ObjectGallery, mesh: Any) -> None:
-    objects.enroll("new", mesh_views(mesh), "mesh", surfaces_of([mesh]))
+    objects.enroll("new", mesh_views(mesh), "mesh", surfaces_of([mesh]).arrays)
 
 
 def _seconds(function: Callable[[], object]) -> float:

@@ -206,10 +206,12 @@ class Table:
                 changed = dataclasses.replace(recognizer.run, config=config)
                 recognizer.model = dataclasses.replace(recognizer.model, run=changed)
             if lever.enrolls:
-                recognizer.objects.open(self.out / "galleries" / recognizer.objects.embedding.fingerprint[:12])
+                recognizer.objects.open(
+                    self.out / "galleries" / f"{recognizer.objects.embedding.fingerprint[:12]}-surfaces"
+                )
                 for name, path in self.meshes.items():
                     if name in run.classes and name not in recognizer.gallery.objects:
-                        surface = surfaces_of([load_mesh(path)])
+                        surface = surfaces_of([load_mesh(path)]).arrays
                         recognizer.objects.enroll(name, mesh_views(path), "mesh", surface, extend=True)
         return runs
 

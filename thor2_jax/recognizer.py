@@ -36,13 +36,13 @@ from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
-from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, object_scores, padded_rows
+from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
-from thor2_jax.surfaces import Surfaces, fit_poses
+from thor2_jax.surfaces import Surfaces, compared, fit_poses
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 
@@ -285,7 +285,9 @@ class Recognizer:
         rows = sorted({padded_rows(n, self.chunk) for n in range(1, min(max_instances, self.chunk) + 1)})
         shapes = [(b, n) for n in points for b in rows]
         for b, n in shapes:
-            object_scores(self.model, jax.tree.map(np.asarray, infer_clouds(self.model, pack_instances([], b, n))))
+            samples = infer_clouds(self.model, pack_instances([], b, n)).samples
+            if samples is not None:
+                compared(np.zeros((1, 1)), [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
         return len(shapes)
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
@@ -322,9 +324,8 @@ class Recognizer:
         """Segment a frame with the segmenter "table"; split and merge its pieces where the results are known objects.
 
         This separates objects in a pile, which touch without a visible edge; see `segmentation.known_objects`. Masks
-        are fitted to the surfaces of objects with a mesh. The
-        method is a segmenter, so `segmented(frame, recognizer.segment)` returns the frame with labels. It needs OpenCV
-        (extra `segment`).
+        are fitted to the surfaces of objects with a mesh. The method is a segmenter, so `segmented(frame,
+        recognizer.segment)` returns the frame with labels. It needs OpenCV (extra `segment`).
 
         Returns:
             Labels [H, W]; 0 is background.

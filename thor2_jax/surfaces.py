@@ -1,7 +1,7 @@
 """Evidence of surfaces: how well the points of an instance fit the surface and the colours of a class.
 
 >>> surfaces = surfaces_of(meshes)                             # training.objects.surfaces  # doctest: +SKIP
->>> with_evidence(embedding.class_probabilities(oriented), surfaces, clouds)                # doctest: +SKIP
+>>> with_evidence(embedding.class_probabilities(oriented), surfaces, sample_points(clouds))  # doctest: +SKIP
 
 A rigid pose of the class is searched for. The candidates are view directions, turns about the line of sight and
 anchors: the centroid of the visible part, or a corner of its box, coincides with that of the instance. The search goes
@@ -73,8 +73,9 @@ RADIUS = 0.01
 N_COMPARED, RIVAL, NAME_WEIGHTS = 3, 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 ODDS_EXPONENT = np.float32(0.5)
-"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights. Those of free space
-and of the odds are from real frames with classes left out; the odds of networks depend more on the camera."""
+"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights for all but the last
+weight, of free space, and the exponent. These two are from real frames with classes left out; the odds of the networks
+depend more on the camera than those of surfaces."""
 
 
 @functools.cache
@@ -121,12 +122,22 @@ class Surfaces:
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "Surfaces":
         """Return the surfaces with these `arrays`."""
-        return cls(**{name: jnp.asarray(array) for name, array in arrays.items()})
+        return cls(**jax.device_put(dict(arrays)))
 
     @classmethod
     def of_content(cls, content: bytes) -> "Surfaces":
         """Return the surfaces with this `content`."""
         return cls.of_arrays(unpack_arrays(content)[0])
+
+    @classmethod
+    def empty(cls) -> "Surfaces":
+        """Return a surface without extent, with which programs are compiled."""
+        return cls(
+            jnp.zeros((1, 9, N_POINTS), jnp.float32),
+            jnp.zeros((1, GRID**3), jnp.int16),
+            jnp.ones((1, 2, 3), jnp.float32),
+            jnp.zeros((1, len(rotations()), 3, 3), jnp.float32),
+        )
 
     def distances(self, index: int, pose: NDArray[np.float32], points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return how far points are from the surface of a class: at least the point-to-plane distance.
@@ -150,6 +161,24 @@ class Surfaces:
         return np.where(((at >= 0) & (at < GRID)).all(axis=1), distance, np.inf)
 
 
+class Sample(NamedTuple):
+    """What is compared of instances, from `sample_points`.
+
+    Attributes:
+        points: [B, SAMPLED, 3], metres, relative to the camera.
+        lab: [B, 3, SAMPLED], smoothed L*a*b* colours.
+        rough: [B], roughness, metres.
+        around: [B, G, G, 3], see `PointClouds.around`.
+        is_empty: [B] bool.
+    """
+
+    points: jax.Array
+    lab: jax.Array
+    rough: jax.Array
+    around: jax.Array
+    is_empty: jax.Array
+
+
 def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
     """Return how well each instance fits a class.
 
@@ -170,7 +199,7 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
     return _fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
 
 
-def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClouds) -> jax.Array:
+def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
     Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
@@ -178,25 +207,7 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, clouds: PointClo
     the distractors then become o^`ODDS_EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class
     that is most probable after this step.
     """
-    return _reweight(probabilities, surfaces, sample_points(clouds))
-
-
-class Sample(NamedTuple):
-    """What is compared of instances, from `sample_points`.
-
-    Attributes:
-        points: [B, SAMPLED, 3], metres, relative to the camera.
-        lab: [B, 3, SAMPLED], smoothed L*a*b* colours.
-        rough: [B], roughness, metres.
-        around: [B, G, G, 3], see `PointClouds.around`.
-        is_empty: [B] bool.
-    """
-
-    points: jax.Array
-    lab: jax.Array
-    rough: jax.Array
-    around: jax.Array
-    is_empty: jax.Array
+    return _reweight(probabilities, surfaces, samples)
 
 
 @jax.jit
@@ -235,28 +246,29 @@ def _fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tu
 def compared(
     probabilities: NDArray[np.floating], surfaces: Sequence[Surfaces], samples: Sample
 ) -> NDArray[np.floating]:
-    """Return probabilities [B, n] on the host, changed as by `with_evidence`.
+    """Return probabilities [B, n] on the host, changed as by `with_evidence`, for n surfaces of one class each.
 
-    The n names have a surface each. Every instance and name is compared on its own, so that other numbers of instances
-    compile nothing. Rows of zeros are not compared, except for empty clouds, with which the programs are compiled.
+    Every instance and name is compared on its own, so that other numbers of instances and names compile nothing. Rows
+    of zeros are not compared. Empty clouds are, so that they compile the programs in advance.
     """
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)
     is_compared = (largest >= RIVAL * largest[:, :1]) & ((largest[:, :1] > 0) | np.asarray(samples.is_empty)[:, None])
-    values = np.zeros((*index.shape, 4), np.float32)
     pairs = np.argwhere(is_compared)
-    # All are dispatched before the first result is awaited.
-    rows = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row, _ in pairs]
-    fits = [
-        _fit_rows(surfaces[index[row, k]], each, np.zeros(1, int))[0]
-        for (row, k), each in zip(pairs, rows, strict=True)
+    fits = [  # all are dispatched before the first result is awaited
+        _fit_rows(surfaces[index[row, k]], jax.tree.map(lambda a, row=row: a[row : row + 1], samples), np.zeros(1, int))
+        for row, k in pairs
     ]
-    for (row, k), fit in zip(pairs, fits, strict=True):
-        values[row, k] = fit[0]
+    values = np.zeros((len(index), N_COMPARED, 4), np.float32)
+    for (row, k), (value, _) in zip(pairs, fits, strict=True):
+        values[row, k] = np.asarray(value)[0]
+    missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
+    arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
     changed = np.array(probabilities)
     for row in range(len(changed)):
-        here = slice(row, row + 1)
-        changed[here] = _changed(*(jnp.asarray(a[here]) for a in (probabilities, index, is_compared, values)))
+        shares, factor = map(np.asarray, _changed(*(jnp.asarray(each[row : row + 1]) for each in arguments)))
+        changed[row, index[row]] = shares[0, : index.shape[1]]
+        changed[row] *= factor[0]
     return changed
 
 
@@ -266,24 +278,30 @@ def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> 
     is_compared = largest >= RIVAL * largest[:, :1]
     rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
     rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)
-    return _changed(probabilities, index, is_compared, values)
+    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
+    changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
+    return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
 
 
 @jax.jit
-def _changed(probabilities: jax.Array, index: jax.Array, is_compared: jax.Array, values: jax.Array) -> jax.Array:
-    """Return probabilities [B, C] changed by the evidence [B, K, 4] of the names with these indices [B, K]."""
-    largest = jnp.take_along_axis(probabilities, index, axis=1)
+def _changed(
+    largest: jax.Array, total: jax.Array, is_compared: jax.Array, values: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the changed probabilities [B, K] of names that share theirs, and a factor [B] of all probabilities.
+
+    Args:
+        largest: [B, K], the largest probabilities.
+        total: [B], sums of all probabilities.
+        is_compared: [B, K] bool.
+        values: [B, K, 4], their evidence.
+    """
     logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
     share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
     changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
-    probabilities = jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False)
     best = jnp.take_along_axis(values, changed.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-    total = probabilities.sum(axis=1)
     known = total.clip(1e-4, 1 - 1e-4)
     logit = ODDS_EXPONENT * jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS
-    known = jax.nn.sigmoid(logit)
-    return probabilities * (known / jnp.maximum(total, 1e-30))[:, None]
+    return changed, jax.nn.sigmoid(logit) / jnp.maximum(total, 1e-30)
 
 
 def _describe_neighbourhoods(

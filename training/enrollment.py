@@ -16,7 +16,6 @@ from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
-from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.objects.surfaces import surfaces_of
 from training.readers.frames import FrameFolder
@@ -28,7 +27,7 @@ __all__ = ["enroll_objects"]
 
 def enroll_objects(
     model: Path,
-    source: FrameFolder | tuple[Mapping[str, Path | TexturedMesh], Iterator[Sequence[PreparedInstance]]],
+    source: FrameFolder | tuple[Mapping[str, Path], Iterator[Sequence[PreparedInstance]]],
     *,
     name: str | None = None,
     label_name: str | None = None,
@@ -36,6 +35,7 @@ def enroll_objects(
     extend: bool = False,
     replace: bool = False,
     gallery: Path | None = None,
+    mesh_scale: float = 1.0,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> tuple[dict[str, int], ObjectGallery, Sequence[str]]:
     """Enroll objects in the gallery of a run directory, all or none; a missing run directory is created.
@@ -50,6 +50,7 @@ def enroll_objects(
         extend: add the views to existing objects.
         replace: replace the views of existing objects.
         gallery: directory of the gallery, for an existing run directory; by default `gallery` in the run directory.
+        mesh_scale: factor that converts the unit of the meshes to metres.
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
@@ -81,17 +82,14 @@ def enroll_objects(
             if name is not None:
                 labelled = {name: [view for each in labelled.values() for view in each]}
             views = ([recognizer.model.corrected(view) for view in each] for each in labelled.values())
-            names, meshes = list(labelled), None
+            names, kind, meshes = list(labelled), "frames", None
         else:
             given, views = source
-            names, meshes = list(given), iter(given.values())
+            names, kind, meshes = list(given), "mesh", iter(given.values())
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)
-            kind, surface = "frames", None
-            if meshes is not None:
-                mesh = next(meshes)
-                kind, surface = "mesh", surfaces_of([load_mesh(mesh) if isinstance(mesh, Path) else mesh])
+            surface = None if meshes is None else surfaces_of([load_mesh(next(meshes), mesh_scale)]).arrays
             added[each] = enrolled_views(objects.embedding, next(views), kind, surface)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)

@@ -27,7 +27,7 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
-from thor2_jax.surfaces import fit_poses, with_evidence
+from thor2_jax.surfaces import fit_poses, sample_points, with_evidence
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 
@@ -154,7 +154,9 @@ def test_instances_are_compared_with_surfaces() -> None:
     _, after = compared.infer(instances)
     usable = [each for each in instances if each.reason is None]
     clouds = pack_instances(usable, len(after.overflow))
-    expected = with_evidence(before.probabilities["embedding"], compared.run.surfaces, clouds)[: len(usable)]
+    expected = with_evidence(before.probabilities["embedding"], compared.run.surfaces, sample_points(clouds))[
+        : len(usable)
+    ]
     np.testing.assert_allclose(after.probabilities["embedding"][: len(usable)], expected, rtol=1e-4)
     assert len(usable) > 1 and np.abs(before.probabilities["embedding"][: len(usable)] - expected).max() > 0.01
 
@@ -174,7 +176,8 @@ def test_nothing_compiles_after_warm_up(max_points: int, sizes: int) -> None:
     two = frame_of_squares({1: (10, 10, (200, 30, 30)), 2: (60, 100, (30, 30, 200))})
     if sizes == 1:  # one of the enrolled objects has a surface
         fresh.enroll("toy", [one])
-        fresh.objects.enroll("mesh", list(fresh.prepare(one)), "mesh", surfaces_of([builtin_objects()["banana"]]))
+        surface = surfaces_of([builtin_objects()["banana"]]).arrays
+        fresh.objects.enroll("mesh", list(fresh.prepare(one)), "mesh", surface)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes

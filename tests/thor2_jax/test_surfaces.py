@@ -174,7 +174,7 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
     surfaces = jax.tree.map(lambda field: field[:n_classes], surfaces)
     clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
     before = rng.dirichlet(np.full(n_classes + 1, 0.4), 9)[:, :n_classes].astype(np.float32)
-    after = np.asarray(with_evidence(jnp.asarray(before), surfaces, clouds), np.float64)
+    after = np.asarray(with_evidence(jnp.asarray(before), surfaces, sample_points(clouds)), np.float64)
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
     n_compared = 0
     for row, probabilities in enumerate(before.astype(np.float64)):
@@ -188,19 +188,21 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
         odds = (known / (1 - known)) ** 0.5 * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     assert n_compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
-    assert np.array_equal(with_evidence(jnp.zeros((9, n_classes)), surfaces, clouds), np.zeros((9, n_classes)))
+    nothing = np.zeros((9, n_classes), np.float32)
+    assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
 
 
 def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
     empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     clouds = with_background([*views, empty], [3.0] * 10, [*views, views[0]])
+    samples = sample_points(clouds)
     each = [jax.tree.map(lambda field, k=k: field[k : k + 1], surfaces) for k in range(3)]
     for n in (3, 1):
         p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 10)[:, :n].astype(np.float32)
         p[2] = 0
-        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), clouds)
-        np.testing.assert_allclose(compared(p, each[:n], sample_points(clouds)), expected, atol=1e-5)
-    assert compared(p[:0], each[:1], jax.tree.map(lambda a: a[:0], sample_points(clouds))).shape == (0, 1)
+        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), samples)
+        np.testing.assert_allclose(compared(p, each[:n], samples), expected, atol=1e-5)
+    assert compared(p[:0], each[:1], jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
 
 
 def test_surfaces_decide_between_the_two_best_names(views: list[Cloud]) -> None:
@@ -209,7 +211,7 @@ def test_surfaces_decide_between_the_two_best_names(views: list[Cloud]) -> None:
     clouds = PointClouds.pack(views[:3])
     for red, is_named in ((0.2, True), (0.03, False)):
         probabilities = jnp.tile(jnp.array([0.4, red]), (3, 1))
-        assert (np.asarray(with_evidence(probabilities, cans, clouds)).argmax(axis=1) == is_named).all()
+        assert (np.asarray(with_evidence(probabilities, cans, sample_points(clouds))).argmax(axis=1) == is_named).all()
 
 
 def test_content(surfaces: Surfaces) -> None:

@@ -303,9 +303,10 @@ def _around(frame: RGBDFrame, label: int) -> NDArray[np.float32]:
     if camera.distortion:
         u, v = distort(u, v, camera.distortion)
     columns, rows = np.rint(u * camera.fx + camera.cx), np.rint(v * camera.fy + camera.cy)
-    pixels = (rows.clip(0, height - 1) * width + columns.clip(0, width - 1)).astype(np.intp)
+    inside = (rows >= RIM) & (rows < height - RIM) & (columns >= RIM) & (columns < width - RIM)
+    pixels = np.where(inside, rows * width + columns, 0).astype(np.intp)
     depth, labels = frame.depth_m.ravel().take(pixels), frame.label_image.ravel()
-    seen = (depth >= MIN_DEPTH) & (depth <= FARTHEST)
+    seen = inside & (depth >= MIN_DEPTH) & (depth <= FARTHEST)
     for step in itertools.product((-RIM, 0, RIM), repeat=2):  # masks may be too small
         seen &= labels.take(pixels + (step[0] * width + step[1]), mode="clip") != label
     around[..., 2] = np.where(seen, depth, 0)

@@ -25,7 +25,6 @@ from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pac
 from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
-from thor2_jax.surfaces import Surfaces
 
 __all__ = [
     "LOOKS",
@@ -80,7 +79,7 @@ def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> ND
 
 
 def enrolled_object(
-    embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Surfaces | None = None
+    embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
     """Return an object that is enrolled at this time; `embeddings` [..., D] are those of `views_to_embed`."""
     date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
@@ -89,7 +88,10 @@ def enrolled_object(
 
 
 def enrolled_views(
-    embedding: Embedding, views: Sequence[PreparedInstance], source: str, surface: Surfaces | None = None
+    embedding: Embedding,
+    views: Sequence[PreparedInstance],
+    source: str,
+    surface: Mapping[str, NDArray[Any]] | None = None,
 ) -> GalleryObject:
     """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
 
@@ -231,7 +233,8 @@ class ObjectGallery:
         few = sum(len(views.clouds) < FEW for views in objects)
         if few:
             return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
-        if objects and references is None and not self.gallery.trained and len(objects) < FEW:
+        has_surfaces = all(views.surface is not None for views in objects)
+        if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
             return f"{len(objects)} objects are enrolled in a run without reference views; enroll more of them"
         return ""
 
@@ -282,7 +285,7 @@ class ObjectGallery:
         name: str,
         views: Sequence[PreparedInstance],
         source: str,
-        surface: Surfaces | None = None,
+        surface: Mapping[str, NDArray[Any]] | None = None,
         *,
         extend: bool = False,
         replace: bool = False,
@@ -293,7 +296,7 @@ class ObjectGallery:
             name: name of the object.
             views: its views.
             source: "mesh" for views rendered from a mesh, or "frames".
-            surface: surface of the mesh, with which instances are compared (`training.objects.surfaces`).
+            surface: `Surfaces.arrays` of the mesh, with which instances are compared (`training.objects.surfaces`).
             extend: add the views to an existing object with this name.
             replace: discard the views of an object with this name, and the classifiers' output for it.
 

@@ -24,10 +24,10 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name, first_names
-from thor2_jax.surfaces import Sample, Surfaces, compared
 
 if TYPE_CHECKING:
     from thor2_jax.gallery.embedding import References
+    from thor2_jax.surfaces import Sample, Surfaces
 
 __all__ = ["CompactClouds", "Gallery", "GalleryObject"]
 
@@ -69,7 +69,7 @@ EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
 
 TINY = 1e-6
-"""Smallest probability that an object is unknown."""
+"""Probabilities that an object is unknown are clipped to at least this value."""
 
 STEP = 5e-5
 """Resolution of the coordinates, metres."""
@@ -151,7 +151,7 @@ class GalleryObject:
         clouds: the views as they were enrolled.
         source: source of the views: "mesh", "frames" or "mesh and frames".
         date: date of the last enrollment, ISO 8601.
-        surface: surface of its mesh, as the only class of `Surfaces`; None without a mesh.
+        surface: `Surfaces.arrays` of its mesh; None without a mesh, and for objects of version 0.2 and before.
         file: name of its file in the gallery on disk; None until it is written.
     """
 
@@ -159,7 +159,7 @@ class GalleryObject:
     clouds: CompactClouds
     source: str
     date: str
-    surface: Surfaces | None = None
+    surface: Mapping[str, NDArray[Any]] | None = None
     file: str | None = None
 
     def __add__(self, other: "GalleryObject") -> "GalleryObject":
@@ -302,7 +302,7 @@ class Gallery:
         entries = KEPT[self.version]
         kept = entries[0] if self.references is None else entries[1 if self.references.classes else -1]
         scores = np.interp(np.log(views), np.log(list(kept)), list(kept.values()))
-        scores[list(self.surfaces)] = KEPT_WITH_SURFACE
+        scores[[each.surface is not None for each in self.objects.values()]] = KEPT_WITH_SURFACE
         odds = _score_odds(scores)
         return (odds / (1 + odds)).round(3)
 
@@ -340,16 +340,21 @@ class Gallery:
         return scores.astype(np.float32)
 
     @functools.cached_property
-    def surfaces(self) -> dict[int, Surfaces]:
+    def surfaces(self) -> "dict[int, Surfaces]":
         """The surfaces of those objects that were enrolled with a mesh, by the number of the object."""
-        surfaces = {number: views.surface for number, views in enumerate(self.objects.values())}
-        return {number: surface for number, surface in surfaces.items() if surface is not None}
+        from thor2_jax.surfaces import Surfaces  # imports JAX, which a list of the objects does not need
 
-    def compared(self, scores: NDArray[np.float32], samples: Sample) -> NDArray[np.float32]:
+        arrays = {number: views.surface for number, views in enumerate(self.objects.values())}
+        return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
+
+    def compared(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
         """Return scores [B, n_objects], changed by the evidence of the surfaces, see `thor2_jax.surfaces.compared`.
 
-        Objects without a surface keep their scores.
+        The probability of an object is its share of the odds of all objects with a surface and of 1. If a changed score
+        exceeds 1, those of all objects with a surface are divided by it. Other objects keep their scores.
         """
+        from thor2_jax.surfaces import compared
+
         number = list(self.surfaces)
         odds = _score_odds(scores[:, number].astype(np.float64))
         known = compared(odds / (1 + odds.sum(axis=1, keepdims=True)), list(self.surfaces.values()), samples)

@@ -34,7 +34,6 @@ from thor2_jax.files import (
     write_text,
 )
 from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
-from thor2_jax.surfaces import Surfaces
 
 __all__ = [
     "GALLERY_DIRECTORY",
@@ -49,8 +48,8 @@ __all__ = [
     "update_gallery",
 ]
 
-GALLERY_FORMAT = 1
-"""Version of the layout above."""
+GALLERY_FORMAT, FORMAT_WITH_SURFACES = 1, 2
+"""Versions of the layout above; the second one is written if an object has a surface, which version 0.2 cannot read."""
 
 GALLERY_DIRECTORY = "gallery"
 """Name of the gallery in a run directory."""
@@ -154,8 +153,8 @@ def _read_index(path: Path) -> dict[str, Any] | None:
             f"gallery: {path} is damaged ({reason_of(error)}); restore it from a copy, or delete this file and rebuild "
             f"it: thor2 objects --reembed --model RUN --gallery {path.parent}"
         ) from None
-    if index["format"] != GALLERY_FORMAT:
-        raise GalleryError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")
+    if index["format"] not in (GALLERY_FORMAT, FORMAT_WITH_SURFACES):
+        raise GalleryError(f"gallery: {path} has format {index['format']}; expected {FORMAT_WITH_SURFACES} or less")
     return dict(index)
 
 
@@ -186,7 +185,7 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 def _object_content(name: str, views: GalleryObject) -> bytes:
     arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
     if views.surface is not None:
-        arrays |= {SURFACE + field: np.asarray(array) for field, array in views.surface.arrays.items()}
+        arrays |= {SURFACE + field: array for field, array in views.surface.items()}
     return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
 
 
@@ -204,8 +203,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
         of_surface = {name.removeprefix(SURFACE): arrays.pop(name) for name in list(arrays) if name.startswith(SURFACE)}
-        surface = Surfaces.of_arrays(of_surface) if of_surface else None
-        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", surface, path.stem)
+        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", of_surface or None, path.stem)
         return about.get("name"), _with_origin(views, about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
@@ -319,8 +317,9 @@ def _write_durably(path: Path, content: bytes) -> None:
 
 
 def _index_content(gallery: Gallery) -> str:
+    has_surface = any(views.surface is not None for views in gallery.objects.values())
     index = {
-        "format": GALLERY_FORMAT,
+        "format": FORMAT_WITH_SURFACES if has_surface else GALLERY_FORMAT,
         "generation": gallery.generation,
         "embedding": gallery.embedding,
         "objects": [

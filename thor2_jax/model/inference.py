@@ -101,7 +101,7 @@ class Inference(NamedTuple):
             answers. The embedding's probabilities sum to the probability that the object is one of the classes.
         embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
         scores: [B, n_objects] scores of the gallery, which replace the embeddings after fusion over frames.
-        samples: points of the clouds that are compared with the surfaces of enrolled objects; None without any.
+        samples: what is compared with the surfaces of enrolled objects; None without embeddings.
     """
 
     overflow: Any
@@ -124,15 +124,19 @@ def infer(
     Args:
         model: the model.
         oriented: descriptors of the looks at B clouds.
-        clouds: [B, N] the clouds in metres; None to leave out the comparison with the surfaces of the classes.
+        clouds: [B, N] the clouds in metres; None to leave out the comparison with surfaces.
         classifiers: classifiers to evaluate, see `Model.chosen_classifiers`; empty if the gallery alone answers.
         embeds: whether to embed the clouds, if they are given, for the gallery.
     """
     names = model.chosen_classifiers() if classifiers is None else classifiers
     probabilities = {name: model.classifiers[name](oriented) for name in names}
-    if clouds is not None and model.run.surfaces is not None and EMBEDDING in probabilities:
-        probabilities[EMBEDDING] = with_evidence(probabilities[EMBEDDING], model.run.surfaces, clouds)
-    if clouds is None or not embeds:
+    surfaces = model.run.surfaces if EMBEDDING in probabilities else None
+    if clouds is None or not (embeds or surfaces):
+        return Inference(oriented.overflow, probabilities)
+    samples = sample_points(clouds)
+    if surfaces is not None:
+        probabilities[EMBEDDING] = with_evidence(probabilities[EMBEDDING], surfaces, samples)
+    if not embeds:
         return Inference(oriented.overflow, probabilities)
     ours, config = model.embedding.config, model.run.config
     is_ours = dataclasses.replace(config, homology=ours.homology, looks=ours.looks) == ours
@@ -140,7 +144,6 @@ def infer(
     if not is_ours or oriented.shape[1] < LOOKS:
         first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
     first = jax.tree.map(lambda a: a[:, :LOOKS], first)
-    samples = sample_points(clouds) if model.gallery.surfaces else None
     return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), samples=samples)
 
 

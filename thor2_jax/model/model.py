@@ -215,7 +215,8 @@ class Model:
         By default it is the confidence that 95 % of the correct answers on held-out views or frames reach (97 % in runs
         of earlier versions). For a class with an output of the classifiers, it is measured on held-out views and stored
         in the run, or 0 in runs without it. For other objects, and for all names if the gallery alone answers, it
-        depends on the number of enrolled views, see `Gallery.unknown_below`.
+        depends on the number of enrolled views or has one value for objects with a surface, see
+        `Gallery.unknown_below`.
 
         Args:
             answer_by: source of the answers, see `answers_by`.

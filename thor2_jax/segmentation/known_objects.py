@@ -111,8 +111,9 @@ def fit_masks(
 ) -> NDArray[np.int32]:
     """Return labels that fit the surfaces of known objects.
 
-    A pixel goes to the known object whose surface is nearest to its point, if it is near. What is far from the surface
-    of its object becomes a piece of its own. Other pieces of unknown objects do not change.
+    A pixel goes to the known object whose surface is nearest to its point, if that is within `ON_SURFACE`. What is
+    farther than `OFF_SURFACE` from the surface of its known object becomes a piece of its own. Otherwise, pieces of
+    unknown objects do not change.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.

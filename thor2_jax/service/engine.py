@@ -23,11 +23,12 @@ from thor2_jax.explanation.explain import explained_by_classifiers
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists
-from thor2_jax.model.inference import Inference, answers, infer, object_scores
+from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
+from thor2_jax.surfaces import Surfaces, compared
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 
@@ -110,7 +111,7 @@ class Batcher:
 
 
 class InferenceEngine:
-    """A trained run on the device. Not thread-safe.
+    """A trained run on the device. Not thread-safe, except for `recognize`.
 
     Attributes:
         run: the run, whose descriptors are computed without a host callback.
@@ -214,8 +215,8 @@ class InferenceEngine:
         images, embeddings = oriented.first.images, oriented.first.embeddings
         computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
         batch = CloudResult(*jax.tree.map(np.asarray, computed))
-        if not instances:
-            object_scores(self.model, batch.inference)  # compiles the comparison with the surfaces of enrolled objects
+        if not instances and batch.inference.samples is not None:  # a mesh may be enrolled later
+            compared(np.zeros((1, 1)), [Surfaces.empty()], jax.tree.map(lambda a: a[:1], batch.inference.samples))
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:

@@ -229,7 +229,8 @@ class Service:
         corrected = self.engine.correct(prepared.instances, observe=True)
         results = await self._infer(corrected, request)
         self.engine.refresh()
-        recognitions = self.engine.recognize(corrected, results)
+        # Comparing the instances with the surfaces of enrolled objects takes milliseconds.
+        recognitions = await asyncio.to_thread(self.engine.recognize, corrected, results)
         return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
     async def why(self, fields: dict[str, Any], request: AdmittedRequest) -> WhyAnswer:

@@ -50,7 +50,8 @@ def enroll(
     Without NAME, every object that is named in the labels.json of the frames, or every object in the folder of --mesh,
     is enrolled. With NAME, frames without labels.json need --instance, unless the object is their only instance. A
     frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which
-    an answer is "unknown" depends on the object's number of views; see --unknown-below of `thor2 recognize`.
+    an answer is "unknown" depends on the object's number of views, or has one value for objects with a mesh; see
+    --unknown-below of `thor2 recognize`.
     """
     name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
@@ -64,7 +65,7 @@ def enroll(
     options.check_belongs("frames", has_frames, label_name=label_name, instance=instance)
     scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
-    from training.objects.meshes import find_object_meshes, load_mesh, scaled_meshes
+    from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
@@ -78,13 +79,14 @@ def enroll(
         with show_progress(quiet) as progress:
             counts, known, skipped = enroll_objects(
                 model,
-                (scaled_meshes(meshes, mesh_scale), views_of_meshes) if frames is None else frames,
+                (meshes, views_of_meshes) if frames is None else frames,
                 name=name,
                 label_name=label_name,
                 instance=instance,
                 extend=extend,
                 replace=replace,
                 gallery=gallery,
+                mesh_scale=mesh_scale,
                 progress=progress,
             )
     for reason in skipped:

@@ -49,7 +49,7 @@ UnknownOption = Annotated[
     float | None,
     typer.Option(
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own threshold for "
-        "trained classes; for enrolled objects, a threshold that depends on their number of views.",
+        "trained classes; for enrolled objects, a threshold that depends on their number of views or on having a mesh.",
     ),
 ]
 AnswerByOption = Annotated[

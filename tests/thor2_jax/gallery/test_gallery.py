@@ -67,7 +67,7 @@ def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> N
     """Against `evidence` of the single object with a surface, in float64; all points of a view of a can fit it."""
     mesh = builtin_objects()["soup_can_red"]
     surface = surfaces_of([mesh])
-    bowl = dataclasses.replace(gallery.objects["bowl"], surface=surface)
+    bowl = dataclasses.replace(gallery.objects["bowl"], surface=surface.arrays)
     with_surface = dataclasses.replace(gallery, objects={**gallery.objects, "bowl": bowl})
     clouds = PointClouds.pack([view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre)), *random_clouds(0, [500, 0])])
     scores = np.random.default_rng(0).uniform(0.1, 0.3, (3, 3)).astype(np.float32)

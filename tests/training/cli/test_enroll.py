@@ -130,7 +130,7 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     for views in Recognizer.load(model).gallery.objects.values():
         if views.source == "mesh":
             assert views.surface is not None
-            np.testing.assert_allclose(np.ptp(views.surface.table[0, :3], axis=1), BOX, rtol=0.05)
+            np.testing.assert_allclose(np.ptp(views.surface["table"][0, :3], axis=1), BOX, rtol=0.05)
 
 
 def test_a_folder_of_meshes(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_folder_of_meshes(tmp_path: Path) -> None:
             view = next(iter(objects[each].clouds.views()))
             assert view.colors.mean(axis=0).argmax() == {"can": 1, "caf\u00e9": 2}.get(each, 0)
             surface = objects[each].surface
-            assert surface is not None and (float(surface.table[0, 4].mean()) < 0) == (each == "can")  # a*
+            assert surface is not None and (float(surface["table"][0, 4].mean()) < 0) == (each == "can")  # a*
 
 
 def test_arguments_are_checked_before_anything_is_loaded(
