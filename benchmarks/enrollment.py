@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import LOOKS, augmented_view, embed_looks
-from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from training.readers.frames import FrameFolder
 
 FOLDS = 4

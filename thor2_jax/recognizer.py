@@ -42,7 +42,8 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
-from thor2_jax.surfaces import Surfaces, compared, fit_poses
+from thor2_jax.surface_evidence import compared, fit_poses
+from thor2_jax.surfaces import Surfaces
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 

@@ -27,7 +27,7 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
-from thor2_jax.surfaces import fit_poses, sample_points, with_evidence
+from thor2_jax.surface_evidence import fit_poses, sample_points, with_evidence
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 

@@ -23,8 +23,9 @@ from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances
 from thor2_jax.gallery import store
+from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 
 __all__ = [
     "LOOKS",

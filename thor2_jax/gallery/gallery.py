@@ -14,22 +14,23 @@ forgotten. `Gallery.combine` combines the scores with the confidences of the cla
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name, first_names
 
 if TYPE_CHECKING:
     from thor2_jax.gallery.embedding import References
-    from thor2_jax.surfaces import Sample, Surfaces
+    from thor2_jax.surface_evidence import Sample
+    from thor2_jax.surfaces import Surfaces
 
-__all__ = ["CompactClouds", "Gallery", "GalleryObject"]
+__all__ = ["Gallery", "GalleryObject"]
 
 NEAREST = 128
 """Number of views in the regression of a query; using all views gives the same accuracy on held-out frames."""
@@ -70,76 +71,6 @@ EVEN, STEEPNESS = 0.2, 3
 
 TINY = 1e-6
 """Probabilities that an object is unknown are clipped to at least this value."""
-
-STEP = 5e-5
-"""Resolution of the coordinates, metres."""
-
-MAX_DISTANCE = STEP * np.iinfo(np.int16).max
-"""Largest distance of a point from the centre of its cloud along an axis, metres (1.6)."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class CompactClouds:
-    """The clouds of V views, one after the other.
-
-    Attributes:
-        points: [n, 3] int16, multiples of `STEP`, relative to `centre`.
-        colors: [n, 3] uint8, sRGB.
-        boundary: [n] bool, points on the occlusion boundary.
-        counts: [V] int32, number of points of each view.
-        centre: [V, 3] float32, metres, camera frame.
-    """
-
-    points: NDArray[np.int16]
-    colors: NDArray[np.uint8]
-    boundary: NDArray[np.bool_]
-    counts: NDArray[np.int32]
-    centre: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, views: Sequence[PreparedInstance]) -> "CompactClouds":
-        """Round prepared instances to compact clouds.
-
-        Raises:
-            InputError: an instance has no points or is larger than 2 `MAX_DISTANCE`.
-        """
-        points = [np.zeros((0, 3), np.int16)]
-        centres = []
-        for number, view in enumerate(views):
-            if not len(view.points):
-                raise InputError(f"views[{number}] has no points ({view.reason}); leave it out")
-            centre = ((view.points.min(axis=0) + view.points.max(axis=0)) / 2).astype(np.float32)
-            relative = view.points - centre
-            if np.abs(relative).max() > MAX_DISTANCE:
-                raise InputError(
-                    f"views[{number}] is {2 * np.abs(relative).max():.2g} m long; expected at most "
-                    f"{2 * MAX_DISTANCE:.2g} m: check its mask and the depth scale"
-                )
-            points.append(np.rint(relative / STEP).astype(np.int16))
-            centres.append(centre)
-        return cls(
-            np.concatenate(points),
-            np.concatenate([np.zeros((0, 3), np.uint8), *(view.colors for view in views)]),
-            np.concatenate([np.zeros(0, bool), *(view.boundary for view in views)]),
-            np.array([len(view.points) for view in views], np.int32),
-            np.array(centres, np.float32).reshape(-1, 3),
-        )
-
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    def __add__(self, other: "CompactClouds") -> "CompactClouds":
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return CompactClouds(*(np.concatenate(pair) for pair in pairs))
-
-    def views(self) -> Iterator[PreparedInstance]:
-        """Yield each view as a prepared instance, in metres."""
-        ends = np.cumsum(self.counts)
-        for number, (count, end, centre) in enumerate(zip(self.counts, ends, self.centre, strict=True)):
-            rows = slice(end - count, end)
-            points = self.points[rows] * np.float32(STEP) + centre
-            boundary = self.boundary[rows]
-            yield PreparedInstance(number, points, self.colors[rows], boundary, bool(boundary.any()))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -348,12 +279,12 @@ class Gallery:
         return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
 
     def compared(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
-        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `thor2_jax.surfaces.compared`.
+        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surface_evidence.compared`.
 
         The probability of an object is its share of the odds of all objects with a surface and of 1. If a changed score
         exceeds 1, those of all objects with a surface are divided by it. Other objects keep their scores.
         """
-        from thor2_jax.surfaces import compared
+        from thor2_jax.surface_evidence import compared
 
         number = list(self.surfaces)
         odds = _score_odds(scores[:, number].astype(np.float64))

@@ -33,7 +33,8 @@ from thor2_jax.files import (
     unpack_arrays,
     write_text,
 )
-from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.gallery.compact_clouds import CompactClouds
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 
 __all__ = [
     "GALLERY_DIRECTORY",

@@ -28,7 +28,8 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
-from thor2_jax.surfaces import Surfaces, compared
+from thor2_jax.surface_evidence import compared
+from thor2_jax.surfaces import Surfaces
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 

@@ -18,8 +18,8 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import compile_explanations, explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, ObjectGallery, enrolled_object, views_to_embed
-from thor2_jax.gallery.gallery import CompactClouds
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.answers import why_answer

@@ -1,4 +1,4 @@
-"""Surfaces of meshes, with which recognition compares the points of instances (`thor2_jax.surfaces`)."""
+"""Surfaces of meshes, with which recognition compares the points of instances (`thor2_jax.surface_evidence`)."""
 
 from collections.abc import Iterable
 

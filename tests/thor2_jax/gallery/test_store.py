@@ -22,7 +22,8 @@ from written_files import files_of
 from thor2_jax.files import temporary_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
-from thor2_jax.gallery.gallery import CompactClouds, Gallery, GalleryObject
+from thor2_jax.gallery.compact_clouds import CompactClouds
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from thor2_jax.gallery.store import GalleryError, check_index, gallery_stamp, load_gallery, update_gallery
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of

@@ -1,0 +1,243 @@
+"""Surfaces of classes: the points of an object fit the surface and the colours of its class better than others."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_clouds import random_clouds
+
+from thor2_jax.surface_evidence import (
+    REACH,
+    SAMPLED,
+    _fit_rows,
+    compared,
+    evidence,
+    fit_poses,
+    sample_points,
+    with_evidence,
+)
+from thor2_jax.surfaces import Surfaces
+from thor2_jax.types import Cloud, PointClouds
+from training.objects.builtin_objects import builtin_objects
+from training.objects.mesh import TexturedMesh
+from training.objects.surfaces import surfaces_of
+from training.rendering.camera import camera_pose
+from training.views.mesh_views import view_cloud
+
+OBJECTS = {name: builtin_objects()[name] for name in ("soup_can_red", "yellow_box", "banana")}
+POSES = [(0.4, 1.1), (2.5, 0.7), (4.4, 1.4)]
+
+
+@pytest.fixture(scope="module")
+def surfaces() -> Surfaces:
+    return surfaces_of(OBJECTS.values())
+
+
+@pytest.fixture(scope="module")
+def views() -> list[Cloud]:
+    """Three views of each object."""
+    return [view_cloud(mesh, camera_pose(*angles, mesh.centre)) for mesh in OBJECTS.values() for angles in POSES]
+
+
+OWN = np.repeat(np.arange(3), 3)
+"""Class of each view."""
+
+
+def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
+    clouds = PointClouds.pack(views)
+    values = np.stack([evidence(surfaces, clouds, jnp.full(len(views), k)) for k in range(3)], axis=1)  # [9, 3, 4]
+    own = values[np.arange(9), OWN]
+    assert (own[:, 0] < 0.5).all() and (own[:, 1:3] > 0.5).all()
+    others = values[np.arange(9)[:, None], (OWN[:, None] + [1, 2]) % 3]
+    assert (others[..., 0] > own[:, None, 0] + 0.5).all()
+    assert (others[..., 1:3].sum(axis=-1) < own[:, None, 1:3].sum(axis=-1) - 0.3).all()
+
+
+def with_background(views: list[Cloud], depths: list[float], whole: list[Cloud] | None = None) -> PointClouds:
+    """Return clouds with points at these depths around each view, or around the `whole` object."""
+    around = []
+    for (seen, _), depth in zip(whole or views, depths, strict=True):
+        rays = seen[:, :2] / seen[:, 2:]
+        low, high = rays.min(axis=0) - 0.06, rays.max(axis=0) + 0.06
+        grid = np.stack(np.meshgrid(*np.linspace(low, high, 24).T), axis=-1)
+        is_free = np.linalg.norm(grid[:, :, None] - seen[:, :2] / seen[:, 2:], axis=3).min(axis=2) > 0.008
+        around.append(np.dstack([grid, np.where(is_free, depth, 0)]))
+    return dataclasses.replace(PointClouds.pack(views), around=jnp.asarray(np.array(around), jnp.float32))
+
+
+def test_the_surface_of_a_class_is_not_in_free_space(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """Half of a box that is not occluded is no box; another object may hide the other half."""
+    whole = views[3:6]
+    half = [tuple(a[xyz[:, 0] < np.median(xyz[:, 0])] for a in (xyz, rgb)) for xyz, rgb in whole]
+    classes = np.full(3, 1)
+    free = np.array(
+        [
+            evidence(surfaces, with_background(*each), classes)[:, 3]
+            for each in ((whole, [3.0] * 3), (half, [3.0] * 3), (half, [0.2] * 3), (half, [3.0] * 3, whole))
+        ]
+    )
+    assert (free[0] < 0.01).all() and (free[1] > 0.03).all() and (free[2] == 0).all() and (free[3] < 0.01).all()
+    np.testing.assert_array_equal(evidence(surfaces, PointClouds.pack(half), classes)[:, 3], 0)
+
+
+def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) -> None:
+    poses = np.asarray(fit_poses(surfaces, PointClouds.pack(views), OWN))
+    for (xyz, _), pose, index in zip(views, poses, OWN, strict=True):
+        np.testing.assert_allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-5)
+        assert np.quantile(surfaces.distances(index, pose, xyz), 0.95) < 0.004
+        nearer = xyz - 0.015 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+        assert 0.005 < np.median(surfaces.distances(index, pose, nearer)) < 0.0155
+        assert np.isinf(surfaces.distances(index, pose, xyz + 1)).all()
+
+
+def test_other_colours_do_not_fit(surfaces: Surfaces, views: list[Cloud]) -> None:
+    inverted = [(xyz, 255 - rgb) for xyz, rgb in views]
+    before, after = (np.asarray(evidence(surfaces, PointClouds.pack(each), OWN)) for each in (views, inverted))
+    assert (after[:, 1:3].sum(axis=1) < before[:, 1:3].sum(axis=1) - 0.3).all()
+
+
+def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """Cloud and camera are moved together; the search is not continuous."""
+    position = np.array([0.3, -2, 5], np.float32)
+    moved = PointClouds.pack([(xyz + position, rgb) for xyz, rgb in views], camera=np.tile(position, (9, 1)))
+    still = PointClouds.pack(views)
+    np.testing.assert_allclose(sample_points(moved).points, sample_points(still).points, atol=1e-5)
+    before, after = (np.asarray(evidence(surfaces, each, OWN)) for each in (still, moved))
+    assert np.abs(after - before).max() < 0.3
+
+
+def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views: list[Cloud]) -> None:
+    whole = np.asarray(evidence(surfaces, PointClouds.pack(views), OWN))
+    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    padded = PointClouds.pack([views[4], empty, views[0]], 8192)
+    values = np.asarray(evidence(surfaces, padded, np.array([1, 2, 0])))
+    assert np.array_equal(values, [whole[4], np.zeros(4), whole[0]])
+
+
+def test_few_points_and_noise_have_finite_evidence(surfaces: Surfaces) -> None:
+    """Also points that are far apart, for example in millimetres."""
+    clouds = random_clouds(0, (1, 3, 30, 500, 3000))
+    clouds.append((clouds[-1][0] * np.float32(1000), clouds[-1][1]))
+    assert np.isfinite(evidence(surfaces, PointClouds.pack(clouds), np.array([0, 1, 2, 0, 1, 2]))).all()
+
+
+def test_points_beyond_the_surface_count_with_the_largest_distance(surfaces: Surfaces) -> None:
+    points = (np.random.default_rng(0).random((2000, 3)) * 3 + [0, 0, 2]).astype(np.float32)
+    clouds = PointClouds.pack([(points, np.zeros((2000, 3), np.uint8))])
+    expected = [np.log((REACH + 3e-4) / (1e-3 + 3e-4)), 0, 0, 0]  # nothing is near, and no point has neighbours
+    np.testing.assert_allclose(evidence(surfaces, clouds, np.zeros(1, int))[0], expected, atol=0.01)
+
+
+def test_samples_spread_over_large_clouds() -> None:
+    x = np.linspace(0, 1, 3000, dtype=np.float32)
+    line = np.stack([x, np.zeros_like(x), np.full_like(x, 0.5)], axis=1)
+    chosen = sample_points(PointClouds.pack([(line, np.zeros((3000, 3), np.uint8))])).points
+    np.testing.assert_allclose(np.sort(chosen[0, :, 0]), np.linspace(0, 1, SAMPLED), atol=0.02)
+
+
+@pytest.mark.parametrize("noise", [3e-4, 1e-3])
+def test_the_roughness_is_the_noise_of_a_plane(noise: float) -> None:
+    """The plane through some twenty neighbours takes a part of the noise."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(0, 0.08, (1000, 2)), 0.5 + rng.normal(0, noise, 1000)]).astype(np.float32)
+    flat = points * np.array([1, 1, 0], np.float32) + np.array([0, 0, 0.5], np.float32)  # as a coarse step of depth
+    rough = sample_points(PointClouds.pack([(each, np.zeros((1000, 3), np.uint8)) for each in (points, flat)])).rough
+    assert 0.7 * noise < float(rough[0]) < 1.05 * noise and float(rough[1]) == pytest.approx(1e-3)
+
+
+def test_one_colour_has_no_correlation() -> None:
+    plate = builtin_objects()["white_plate"]
+    nearly = 200 + np.random.default_rng(0).integers(0, 4, (len(plate.faces), 3, 3), dtype=np.uint8)
+    plain = TexturedMesh(plate.vertices, plate.faces, corner_colors=nearly)
+    clouds = PointClouds.pack([view_cloud(plain, camera_pose(*angles, plain.centre)) for angles in POSES])
+    assert np.abs(evidence(surfaces_of([plain]), clouds, np.zeros(3, int))[:, 1:]).max() < 0.05
+
+
+def test_accelerators_compare_all_rows_at_once(
+    surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds = PointClouds.pack(views)
+    expected = np.asarray(evidence(surfaces, clouds, OWN))
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, default: default(*arguments))
+    _fit_rows.clear_cache()
+    try:
+        np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
+    finally:
+        _fit_rows.clear_cache()
+
+
+@pytest.mark.parametrize("n_classes", [3, 1])
+def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
+    """Against the two formulas in float64."""
+    surfaces = jax.tree.map(lambda field: field[:n_classes], surfaces)
+    clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
+    before = rng.dirichlet(np.full(n_classes + 1, 0.4), 9)[:, :n_classes].astype(np.float32)
+    after = np.asarray(with_evidence(jnp.asarray(before), surfaces, sample_points(clouds)), np.float64)
+    values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
+    n_compared = 0
+    for row, probabilities in enumerate(before.astype(np.float64)):
+        best = np.argsort(-probabilities)[:3]
+        best = best[probabilities[best] > 0.1 * probabilities[best[0]]]
+        if len(best) > 1:
+            odds = probabilities[best] * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
+            probabilities[best] = probabilities[best].sum() * odds / odds.sum()
+            n_compared += 1
+        known = probabilities.sum()
+        odds = (known / (1 - known)) ** 0.5 * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
+        np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
+    assert n_compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
+    nothing = np.zeros((9, n_classes), np.float32)
+    assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
+
+
+def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
+    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    clouds = with_background([*views, empty], [3.0] * 10, [*views, views[0]])
+    samples = sample_points(clouds)
+    each = [jax.tree.map(lambda field, k=k: field[k : k + 1], surfaces) for k in range(3)]
+    for n in (3, 1):
+        p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 10)[:, :n].astype(np.float32)
+        p[2] = 0
+        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), samples)
+        np.testing.assert_allclose(compared(p, each[:n], samples), expected, atol=1e-5)
+    assert compared(p[:0], each[:1], jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
+
+
+def test_surfaces_decide_between_the_two_best_names(views: list[Cloud]) -> None:
+    """Two cans of one shape have different colours; a class that is far less probable is not compared."""
+    cans = surfaces_of(builtin_objects()[name] for name in ("soup_can_green", "soup_can_red"))
+    clouds = PointClouds.pack(views[:3])
+    for red, is_named in ((0.2, True), (0.03, False)):
+        probabilities = jnp.tile(jnp.array([0.4, red]), (3, 1))
+        assert (np.asarray(with_evidence(probabilities, cans, sample_points(clouds))).argmax(axis=1) == is_named).all()
+
+
+def test_only_points_well_in_front_of_what_is_seen_are_in_free_space(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """The middle of the view is that of the object; what lies beside the grid is unknown."""
+    box = views[3]
+    clouds = with_background([box], [3.0])
+    middle = float(box[0][:, 2].min())
+    for depth, is_free in ((middle + 0.018, False), (3.0, True)):
+        seen = np.asarray(clouds.around).copy()
+        seen[..., 2] = depth
+        free = evidence(surfaces, dataclasses.replace(clouds, around=jnp.asarray(seen)), np.array([1]))[0, 3]
+        assert (free == 0) != is_free, free
+    for shift, expected in ((0, 1), (2, 0)):  # everything, nothing
+        seen[..., :2] += shift
+        assert (
+            evidence(surfaces, dataclasses.replace(clouds, around=jnp.asarray(seen)), np.array([1]))[0, 3] == expected
+        )
+
+
+def test_without_what_the_camera_sees_the_axes_do_not_matter(surfaces: Surfaces, views: list[Cloud]) -> None:
+    turned = PointClouds.pack([(xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in views])
+    assert not evidence(surfaces, turned, OWN)[:, 3].any()
+
+
+@pytest.mark.usefixtures("x64")
+def test_evidence_is_float32_in_float64_mode(surfaces: Surfaces, views: list[Cloud]) -> None:
+    clouds = PointClouds.pack(views)
+    assert evidence(surfaces, clouds, jnp.asarray(OWN)).dtype == np.float32
+    assert fit_poses(surfaces, clouds, OWN).dtype == np.float32
