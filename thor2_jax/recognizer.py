@@ -21,7 +21,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +41,7 @@ from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
-from thor2_jax.surface_evidence import compared, fit_poses
+from thor2_jax.surface_evidence import compile_comparison, fit_poses
 from thor2_jax.surfaces import Surfaces
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
@@ -288,7 +287,7 @@ class Recognizer:
         for b, n in shapes:
             samples = infer_clouds(self.model, pack_instances([], b, n)).samples
             if samples is not None:
-                compared(np.zeros((1, 1)), [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
+                compile_comparison(samples)
         return len(shapes)
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:

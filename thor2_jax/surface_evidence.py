@@ -23,7 +23,7 @@ from thor2_jax.descriptor.slicing import to_lab
 from thor2_jax.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
 from thor2_jax.types import PointClouds, matmul
 
-__all__ = ["Sample", "compared", "evidence", "fit_poses", "sample_points", "with_evidence"]
+__all__ = ["Sample", "compared", "compile_comparison", "evidence", "fit_poses", "sample_points", "with_evidence"]
 
 SAMPLED = 256
 """Points of an instance that are compared in the end; the stages use the first ones of them."""
@@ -138,11 +138,11 @@ def compared(
     """Return probabilities [B, n] on the host, changed as by `with_evidence`, for n surfaces of one class each.
 
     Every instance and name is compared on its own, so that other numbers of instances and names compile nothing. Rows
-    of zeros are not compared. Empty clouds are, so that they compile the programs in advance.
+    of zeros are not compared.
     """
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)
-    is_compared = (largest >= RIVAL * largest[:, :1]) & ((largest[:, :1] > 0) | np.asarray(samples.is_empty)[:, None])
+    is_compared = (largest >= RIVAL * largest[:, :1]) & (largest > 0)
     pairs = np.argwhere(is_compared)
     fits = [  # all are dispatched before the first result is awaited
         _fit_rows(surfaces[index[row, k]], jax.tree.map(lambda a, row=row: a[row : row + 1], samples), np.zeros(1, int))
@@ -159,6 +159,11 @@ def compared(
         changed[row, index[row]] = shares[0, : index.shape[1]]
         changed[row] *= factor[0]
     return changed
+
+
+def compile_comparison(samples: Sample) -> None:
+    """Compile the programs of `compared`, which do not depend on the number of instances and names."""
+    compared(np.ones((1, 1)) / 2, [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
 
 
 @jax.jit

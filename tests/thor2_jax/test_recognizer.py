@@ -197,14 +197,14 @@ def test_known_instances_are_located(monkeypatch: pytest.MonkeyPatch) -> None:
         "thor2_jax.recognizer.answers",
         lambda model, instances, inference: [Recognition(each.label, names.get(each.label)) for each in instances],
     )
-    found = recognizer._locate(frame)
-    assert list(found) == [3, 200]
+    distances = recognizer._locate(frame)
+    assert list(distances) == [3, 200]
     for label, index in ((3, 1), (200, 3)):
         (instance,) = recognizer.prepare(frame, [label])
         pose = np.asarray(fit_poses(surfaces, pack_instances([instance], 1), [index])[0])
         expected = surfaces.distances(index, pose, instance.points)
         assert np.isfinite(expected).any()
-        np.testing.assert_allclose(found[label](instance.points), expected, atol=1e-4)
+        np.testing.assert_allclose(distances[label](instance.points), expected, atol=1e-4)
     names.clear()
     assert recognizer._locate(frame) == {}
     names[3] = "b"

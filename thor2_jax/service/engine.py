@@ -28,8 +28,7 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
-from thor2_jax.surface_evidence import compared
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surface_evidence import compile_comparison
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
 
@@ -217,7 +216,7 @@ class InferenceEngine:
         computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
         batch = CloudResult(*jax.tree.map(np.asarray, computed))
         if not instances and batch.inference.samples is not None:  # a mesh may be enrolled later
-            compared(np.zeros((1, 1)), [Surfaces.empty()], jax.tree.map(lambda a: a[:1], batch.inference.samples))
+            compile_comparison(batch.inference.samples)
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
