@@ -128,17 +128,13 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     length = np.sqrt(_floats(cv2.transform(around * around, ones))) + np.float32(1e-3)
     direction = _floats(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
     reference = _floats(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
-    # A shadow changes the length of a colour, not its direction. The products share memory, since allocation is slow.
-    product = cv2.multiply(color, direction, direction, dtype=cv2.CV_32F)
-    along = _floats(cv2.transform(product, ones))
-    across = _floats(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
-    across -= along * along
+    # A shadow changes the length of a colour, not its direction.
+    along = _floats(cv2.transform(cv2.multiply(color, direction, dtype=cv2.CV_32F), ones))
+    across = _floats(cv2.transform(cv2.multiply(color, color, dtype=cv2.CV_32F), ones)) - along * along
     brightness = along - reference
     darker = (brightness < 0) & (across < SHADE * SHADE * brightness * brightness)
-    brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
-    brightness *= brightness
-    across += brightness
-    difference = np.sqrt(np.maximum(across, 0, out=across), out=across)
+    weighted = brightness * np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
+    difference = np.sqrt(np.maximum(across + weighted * weighted, 0))
     size = (share.shape[1], share.shape[0])
     noise = cv2.resize(np.minimum(difference, 60) * plane, size, interpolation=cv2.INTER_AREA)
     noise = _floats(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)

@@ -89,14 +89,9 @@ class Plane:
         """Return the distance [H, W] of each point to the plane, metres, positive towards the camera; 0 if missing."""
         a, b, c, d, e, f = (float(value) for value in self.coefficients)
         x, y = depth.x, depth.y[:, None]
-        heights = (np.float32(e) * y + np.float32(a)) * x
-        heights += d * x * x
-        heights += b * y + f * y * y + c
-        np.subtract(depth.inverse, heights, out=heights)
-        heights *= depth.z
+        inverse = (np.float32(e) * y + np.float32(a)) * x + d * x * x + (b * y + f * y * y + c)
         # The distance to the plane is z times the difference in 1 / z, divided by the length of (a, b, c).
-        heights *= np.float32(1 / math.hypot(a, b, c))
-        return heights
+        return np.asarray((depth.inverse - inverse) * depth.z * np.float32(1 / math.hypot(a, b, c)), np.float32)
 
     def region(self, shape: tuple[int, ...]) -> Mask:
         """Return which pixels [H, W] lie in the hull."""

@@ -91,13 +91,10 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
 
     A pixel belongs to the rim if the square of `size` pixels around it contains another label.
     """
-    rim = np.flatnonzero(label_borders(labels, size))
-    of_rim = labels.take(rim)
+    is_rim = label_borders(labels, size)
     sizes = np.bincount(labels.ravel())
-    thick = sizes - np.bincount(of_rim, minlength=len(sizes)) >= LEAST_INNER * sizes
-    trimmed = labels.copy()
-    trimmed.put(rim[thick[of_rim]], 0)
-    return trimmed
+    is_thick = np.bincount(labels[~is_rim], minlength=len(sizes)) >= LEAST_INNER * sizes
+    return np.where(is_rim & is_thick[labels], 0, labels)
 
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:
