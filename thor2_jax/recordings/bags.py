@@ -191,15 +191,10 @@ class Bag:
 
     def _messages(self, *topics: str | None) -> Iterator[tuple[str, Any, int]]:
         """Yield the messages of some topics: topic, message, and time of arrival in nanoseconds."""
-        messages = self._reader.messages([each for each in self._reader.connections if each.topic in topics])
-        while True:
-            with self._damage_named():
-                item = next(messages, None)
-                if item is None:
-                    return
-                connection, arrival, content = item
-                message, arrival = self._deserialize(content, connection.msgtype), int(arrival)
-            yield connection.topic, message, arrival
+        connections = [each for each in self._reader.connections if each.topic in topics]
+        with self._damage_named():
+            for connection, arrival, content in self._reader.messages(connections):
+                yield connection.topic, self._deserialize(content, connection.msgtype), int(arrival)
 
     def _choose(self) -> None:
         """Choose the topics by their first messages, and read the camera."""
