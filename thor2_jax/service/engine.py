@@ -123,15 +123,26 @@ class InferenceEngine:
         """Load the run.
 
         Raises:
-            InputError: the run or the gallery cannot be used; also as `Recognizer`.
+            InputError: the given gallery does not exist and `teach` is not set, or the gallery cannot be written and
+                `teach` is set; also as `Recognizer.load`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
             # By default JAX caches only large programs that take more than a second to compile.
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        self._recognizer = recognizer = _load(settings)
+        directory = settings.gallery or settings.model / GALLERY_DIRECTORY
+        if settings.gallery is not None and not settings.teach:
+            check_exists(directory)
+        self._recognizer = recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
         self.objects, run = recognizer.objects, recognizer.run
+        if settings.teach:
+            try:
+                check_writable(directory)
+            except OSError as error:
+                raise InputError(
+                    f"gallery: {directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
+                ) from None
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         model = dataclasses.replace(recognizer.model, run=self.run)
@@ -235,26 +246,6 @@ class InferenceEngine:
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain answers for clouds of `n_points` points."""
         return [(batch_points([n_points]), kind) for kind in dict.fromkeys(explained_by_classifiers(self.model))]
-
-
-def _load(settings: Settings) -> Recognizer:
-    """Load the recognizer of a service.
-
-    Raises:
-        InputError: as `Recognizer.load`; also if the given gallery does not exist and `teach` is not set.
-    """
-    directory = settings.gallery or settings.model / GALLERY_DIRECTORY
-    if settings.gallery is not None and not settings.teach:
-        check_exists(directory)
-    recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
-    if settings.teach:
-        try:
-            check_writable(directory)
-        except OSError as error:
-            raise InputError(
-                f"gallery: {directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
-            ) from None
-    return recognizer
 
 
 def _padded_batch(n_clouds: int) -> int:
