@@ -149,6 +149,7 @@ def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: 
 
 def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
     assert_refused("'bowl'", gallery.with_object, "bowl", enrolled(1))
+    assert_refused("name is 'unknown'", gallery.with_object, "unknown", enrolled(1))
     assert_refused("extend and replace", gallery.with_object, "bowl", enrolled(1), extend=True, replace=True)
     extended = gallery.with_object("bowl", enrolled(1, 5), extend=True)
     replaced = gallery.with_object("bowl", enrolled(1, 5), replace=True)
