@@ -23,10 +23,9 @@ the time, and each size takes seconds to compile."""
 
 
 def _smallest_bucket(buckets: tuple[int, ...], n: int, name: str, advice: str) -> int:
-    for bucket in buckets:
-        if n <= bucket:
-            return bucket
-    raise InputError(f"{name} is {n}; expected at most {buckets[-1]}, the largest bucket; {advice}")
+    if n > buckets[-1]:
+        raise InputError(f"{name} is {n}; expected at most {buckets[-1]}, the largest bucket; {advice}")
+    return min(bucket for bucket in buckets if n <= bucket)
 
 
 def point_bucket(n_points: int) -> int:

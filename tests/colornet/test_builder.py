@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import floyd_warshall
 
 import colornet
 from colornet.builder import merge_redundant, relabel, similarity
@@ -12,13 +13,11 @@ from .test_colors import reference_hyab, reference_lab
 NETWORK = colornet.load_default()
 
 
-def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    length = np.full((n, n), np.inf)
-    np.fill_diagonal(length, 0)
-    length[tuple(edges.T)] = length[tuple(edges.T[::-1])] = weights
-    for via in range(n):
-        length = np.minimum(length, length[:, via, None] + length[via])
-    return length
+def path_lengths(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths of shortest paths by the algorithm of Floyd and Warshall."""
+    graph = np.zeros((n, n))
+    graph[tuple(edges.T)] = weights
+    return floyd_warshall(graph, directed=False)
 
 
 def test_similarity_of_the_packaged_network() -> None:
@@ -30,7 +29,7 @@ def test_similarity_of_the_packaged_network() -> None:
     lab = reference_lab(means, MEAN_WHITE)
     weights = np.array([reference_hyab(lab[i], lab[j]) for i, j in NETWORK.edges])
     np.testing.assert_allclose(NETWORK.edge_weights, weights, rtol=1e-11)
-    expected = 1 / (1 + floyd_warshall(22, NETWORK.edges, weights))
+    expected = 1 / (1 + path_lengths(22, NETWORK.edges, weights))
     np.testing.assert_allclose(NETWORK.similarity, expected, rtol=1e-11)
 
 
@@ -41,7 +40,7 @@ def test_similarity_of_random_graphs() -> None:
         edges = pairs[rng.random(len(pairs)) < 0.3]
         weights = rng.uniform(1, 100, len(edges))
         delta = similarity(n, edges, weights)
-        np.testing.assert_allclose(delta, 1 / (1 + floyd_warshall(n, edges, weights)), rtol=1e-13)
+        np.testing.assert_allclose(delta, 1 / (1 + path_lengths(n, edges, weights)), rtol=1e-13)
         np.testing.assert_array_equal(delta, delta.T)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,11 @@ def clouds() -> thor2.PointClouds:
     return thor2.PointClouds.pack(pairs, 2048)
 
 
+def on_both(accelerator: jax.Device, function: Callable[..., Any], *arguments: Any) -> Iterator[Any]:
+    """Return the results of a function on the accelerator and on a CPU."""
+    return (function(*jax.device_put(arguments, device)) for device in (accelerator, jax.devices("cpu")[0]))
+
+
 def assert_near_except_at_borders(
     actual: jax.Array, expected: jax.Array, median: float = 1e-5, limit: float = 1e-3
 ) -> None:
@@ -67,8 +72,8 @@ def assert_near_except_at_borders(
 @pytest.mark.parametrize("homology", ["closed_form", "gudhi"])
 def test_descriptors_are_those_of_a_cpu(homology: str, accelerator: jax.Device, clouds: thor2.PointClouds) -> None:
     config = thor2.DescriptorConfig(homology=homology)
-    descriptors = thor2.describe(jax.device_put(clouds, accelerator), NETWORK, config)
-    expected = thor2.describe(jax.device_put(clouds, jax.devices("cpu")[0]), NETWORK, config)
+    describe = partial(thor2.describe, network=NETWORK, config=config)
+    descriptors, expected = on_both(accelerator, describe, clouds)
     assert descriptors.images.devices() == {accelerator}
     assert_near_except_at_borders(descriptors.images, expected.images)
     assert_near_except_at_borders(descriptors.embeddings, expected.embeddings)
@@ -82,10 +87,7 @@ def test_gradients_are_those_of_a_cpu(homology: str, accelerator: jax.Device, cl
     def mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
         return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
 
-    gradient, expected = (
-        jax.jit(jax.grad(mass))(*jax.device_put((clouds.points, clouds), device))
-        for device in (accelerator, jax.devices("cpu")[0])
-    )
+    gradient, expected = on_both(accelerator, jax.jit(jax.grad(mass)), clouds.points, clouds)
     assert_near_except_at_borders(gradient, expected, median=1e-3, limit=1e-2)
 
 
@@ -95,10 +97,7 @@ def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2
     model = MLP(described.tops2.shape[1], 17, rngs=nnx.Rngs(0))
     graph, state = nnx.split(model)
     forward = jax.jit(lambda state, descriptors: jax.nn.softmax(nnx.merge(graph, state)(descriptors.tops2)))
-    probabilities, expected = (
-        np.asarray(forward(*jax.device_put((state, described), device)))
-        for device in (accelerator, jax.devices("cpu")[0])
-    )
+    probabilities, expected = on_both(accelerator, forward, state, described)
     np.testing.assert_allclose(probabilities, expected, atol=1e-5)
 
 

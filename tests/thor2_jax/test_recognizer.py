@@ -139,7 +139,7 @@ def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
     config, embedding = dataclasses.replace(SMALL_CONFIG, sigma_1=0.03), small_embedding()
     model = Recognizer(dataclasses.replace(untrained_run(CLASSES, ("tops",), config), embedding=embedding)).model
     clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
-    inference = infer(model, describe_looks(clouds, model.run.network, config), clouds, embeds=True)
+    inference = infer(model, describe_looks(clouds, model.run.network, config, 2), clouds, embeds=True)
     expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
     np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
 

@@ -27,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+import colornet
 from colornet import ColorNetwork
-from colornet.colors import GRID_SIZE
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_strips, persistence_images
@@ -138,11 +138,6 @@ def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, co
     return jax.vmap(one)(planes, aligned.colors, aligned.mask, region_set)
 
 
-def _strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    """Return `strips` with the given region sets instead of those of a network."""
-    return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
-
-
 _diagrams = jax.jit(diagrams_of_strips, static_argnums=1)
 
 
@@ -168,7 +163,8 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
     """
     check_batch(aligned)
     check_types(network=network, config=config)
-    return _strips_by_sets(aligned, region_sets(network), config)
+    sets = region_sets(network)
+    return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
 
 def describe_strips(
@@ -180,11 +176,8 @@ def describe_strips(
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
-    """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours are not used."""
-    check_batch(aligned)
-    check_types(config=config)
-    one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
-    return _diagrams(_strips_by_sets(aligned, one_set, config), config)
+    """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours do not matter."""
+    return _diagrams(strips(aligned, colornet.load_default(), config), config)
 
 
 def describe_aligned(

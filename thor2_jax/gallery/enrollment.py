@@ -247,7 +247,7 @@ class ObjectGallery:
         """
         if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
             return False
-        self._set(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
+        self.gallery = self._of_run(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
         return True
 
     def _reembedded(self, gallery: Gallery) -> Gallery:
@@ -259,21 +259,20 @@ class ObjectGallery:
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
     def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
-        if self.directory is None:
-            self._set(change(self.gallery))
-            return
-        trained, embedding = self.gallery.trained, None if rebuild else self.embedding.fingerprint
-
         def change_stored(stored: Gallery) -> Gallery:
-            return change(dataclasses.replace(stored, trained=trained))
+            return self._of_run(change(self._of_run(stored)))
 
-        self._set(
-            store.update_gallery(self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild)
+        if self.directory is None:
+            self.gallery = change_stored(self.gallery)
+            return
+        embedding = None if rebuild else self.embedding.fingerprint
+        self.gallery = store.update_gallery(
+            self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
         )
 
-    def _set(self, gallery: Gallery) -> None:
-        """Set the gallery, with the values of the run and the options; it has references only if it has objects."""
-        self.gallery = dataclasses.replace(
+    def _of_run(self, gallery: Gallery) -> Gallery:
+        """Return a gallery with the values of the run and the options; it has references only if it has objects."""
+        return dataclasses.replace(
             gallery,
             trained=self.gallery.trained,
             search=self.gallery.search,

@@ -20,7 +20,7 @@ import dataclasses
 import itertools
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import numpy as np
@@ -109,21 +109,33 @@ def _log_with_rest(probabilities: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.log(np.maximum(np.append(probabilities.astype(np.float64), rest), np.finfo(np.float32).tiny))
 
 
-class FusedEvidence:
-    """The fused inferences of the views of one object.
+class _Means:
+    """Weighted means of named values over the views of an object, where old views lose weight.
 
-    Attributes:
-        weight: total weight of the views.
-        logs: classifier -> weighted sum [C + 1] of log-probabilities; the last one is for none of the classes.
-        score_weight: total weight of the views with gallery scores.
-        scores: weighted sum of the gallery's scores, by name of the object; None if the classifiers alone answer.
+    The means start again with the first view that has values of other names.
     """
 
     def __init__(self) -> None:
-        self.weight = 0.0
-        self.logs: dict[str, NDArray[np.float64]] = {}
-        self.score_weight = 0.0
-        self.scores: dict[str, float] | None = None
+        self._weight = 0.0
+        self._sums: dict[str, Any] = {}
+
+    def add(self, weight: float, values: Mapping[str, Any]) -> None:
+        decay = 0.5 ** (1 / HALF_LIFE)
+        if self._sums.keys() != values.keys():
+            self._weight, self._sums = 0.0, dict.fromkeys(values, 0.0)
+        self._weight = decay * self._weight + weight
+        self._sums = {name: decay * self._sums[name] + weight * value for name, value in values.items()}
+
+    def values(self) -> dict[str, Any]:
+        return {name: total / max(self._weight, np.finfo(np.float64).tiny) for name, total in self._sums.items()}
+
+
+class FusedEvidence:
+    """The fused inferences of the views of one object: means of log-probabilities, and of scores of the gallery."""
+
+    def __init__(self) -> None:
+        self._logs, self._scores = _Means(), _Means()
+        self._has_gallery = False
 
     def add(
         self, weight: float, probabilities: Mapping[str, NDArray[np.floating]], scores: Mapping[str, float] | None
@@ -132,31 +144,19 @@ class FusedEvidence:
 
         Args:
             weight: weight of the view, see `view_weight`.
-            probabilities: classifier -> class probabilities [C], which may sum to less than 1.
-            scores: object -> score of the gallery. If objects were enrolled or forgotten since the last view, the sums
-                of the scores start again.
+            probabilities: classifier -> class probabilities [C], which may sum to less than 1. If other classifiers
+                answer than for the last view, their means start again.
+            scores: object -> score of the gallery. If objects were enrolled or forgotten since the last view, the means
+                of the scores start again. None if the classifiers alone answer.
         """
-        decay = 0.5 ** (1 / HALF_LIFE)
-        self.weight = decay * self.weight + weight
-        self.logs = {
-            name: decay * self.logs.get(name, np.zeros(len(p) + 1)) + weight * _log_with_rest(p)
-            for name, p in probabilities.items()
-        }
-        if scores is None:
-            self.scores = None
-            return
-        if self.scores is None or self.scores.keys() != scores.keys():
-            self.score_weight, self.scores = 0.0, dict.fromkeys(scores, 0.0)
-        self.score_weight = decay * self.score_weight + weight
-        self.scores = {name: decay * self.scores[name] + weight * value for name, value in scores.items()}
+        self._logs.add(weight, {name: _log_with_rest(p) for name, p in probabilities.items()})
+        self._scores.add(weight, scores or {})
+        self._has_gallery = scores is not None
 
     def fused(self) -> tuple[dict[str, NDArray[np.float64]], dict[str, float] | None]:
         """Return classifier -> fused class probabilities [C], and object -> fused score; None without a gallery."""
-        tiny = np.finfo(np.float64).tiny
-        probabilities = {name: softmax(logs / max(self.weight, tiny))[:-1] for name, logs in self.logs.items()}
-        if self.scores is None:
-            return probabilities, None
-        return probabilities, {name: value / max(self.score_weight, tiny) for name, value in self.scores.items()}
+        probabilities = {name: softmax(logs)[:-1] for name, logs in self._logs.values().items()}
+        return probabilities, self._scores.values() if self._has_gallery else None
 
 
 MAX_MISSED = 10

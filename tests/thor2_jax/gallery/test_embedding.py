@@ -13,14 +13,11 @@ import safetensors.numpy
 import scipy.special
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, untrained_run
+from small_runs import SMALL_CONFIG
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
-from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.inference import infer
-from thor2_jax.model.model import Model
 from thor2_jax.networks import EmbeddingSizes
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
@@ -59,14 +56,6 @@ def test_embeddings_have_unit_length(
     np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], values, atol=1e-5)
     empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     assert np.isfinite(embedding.embed(thor2.PointClouds.pack([empty, *random_clouds(0, [300]), empty]))).all()
-
-
-def test_a_gallery_beside_a_run_of_another_descriptor(embedding: Embedding, clouds: thor2.PointClouds) -> None:
-    run = untrained_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, n_slices=3))
-    model = Model.of_run(dataclasses.replace(run, embedding=embedding))
-    oriented = describe_looks(clouds, run.network, run.config, LOOKS)
-    embeddings = infer(model, oriented, clouds, embeds=True).embeddings
-    np.testing.assert_allclose(embeddings[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
 def ensemble() -> Embedding:

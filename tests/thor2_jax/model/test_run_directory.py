@@ -1,6 +1,7 @@
 """Run directories: a saved run is loaded unchanged, and a damaged one is refused in one line."""
 
 import dataclasses
+import functools
 import gc
 import json
 import shutil
@@ -13,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import assert_refused
-from small_runs import class_probabilities, untrained_embedding_run, untrained_run, with_surfaces
+from small_runs import class_probabilities, untrained_embedding_run, with_surfaces
 from written_files import files_of
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
-from thor2_jax.model.run_directory import TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.surfaces import SURFACES_FILE
 
@@ -29,8 +30,12 @@ CLASSES = ("a mug", "b", "ç")
 CONSTANTS = dataclasses.asdict(CONFIG)
 
 
+@functools.cache
 def make_run() -> TrainedRun:
-    return untrained_run(CLASSES, ("tops", "ce"), CONFIG, {"epochs": 3, "figures": [0.5, 1]})
+    """Return a run with all files: those of classifiers, an embedding, its references, and surfaces."""
+    run = untrained_embedding_run(CLASSES, ("tops", "ce"), CONFIG, {"epochs": 3, "figures": [0.5, 1]})
+    views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
+    return with_surfaces(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +49,9 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
     run, loaded = make_run(), load_run(saved)
     assert (loaded.config, loaded.classes, loaded.record) == (run.config, run.classes, run.record)
     assert loaded.network.fingerprint == run.network.fingerprint
-    assert tuple(loaded.classifiers) == ("ce", "tops") and loaded.embedding_classifier is None
+    assert tuple(loaded.classifiers) == ("ce", "tops") and loaded.embedding_classifier is not None
+    assert loaded.embedding.fingerprint == run.embedding.fingerprint
+    jax.tree.map(np.testing.assert_array_equal, loaded.surfaces, run.surfaces)
     rng = np.random.default_rng(0)
     images, color = rng.random((1, 1, 2, 8, 8), np.float32), rng.random((1, 1, 2, 22, 5), np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros((1, 1), jnp.int32))
@@ -55,8 +62,9 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_a_run_directory_has_four_files_and_is_readable(saved: Path) -> None:
-    assert sorted(files_of(saved)) == ["network.npz", "run.json", "weights/ce.safetensors", "weights/tops.safetensors"]
+def test_a_run_directory_has_its_files_and_is_readable(saved: Path) -> None:
+    stems = ("embedding", "references", "surfaces", "weights/ce", "weights/tops")
+    assert set(files_of(saved)) == {"network.npz", "run.json", *(f"{stem}.safetensors" for stem in stems)}
     assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
     assert saved.stat().st_mode & 0o777 == 0o755
     description = json.loads((saved / "run.json").read_text())
@@ -105,6 +113,10 @@ def other_network(path: Path) -> None:
     dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
 
 
+def other_embedding(path: Path) -> None:
+    dataclasses.replace(make_run().embedding, further=()).save(path / EMBEDDING_FILE)
+
+
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
@@ -125,6 +137,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
     "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
+    "other embedding": (other_embedding, "embedding.safetensors is not the embedding"),
+    "no embedding": (lambda path: (path / EMBEDDING_FILE).unlink(), "embedding.safetensors is missing"),
+    "no references": (lambda path: (path / REFERENCES_FILE).unlink(), "references.safetensors is missing; copy"),
+    "other surfaces": (lambda path: (path / SURFACES_FILE).write_bytes(b"0"), "surfaces.safetensors is damaged: its"),
+    "no surfaces": (lambda path: (path / SURFACES_FILE).unlink(), "surfaces.safetensors is missing; copy"),
     "no weights": (lambda path: weights_file(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 
@@ -149,34 +166,19 @@ def test_a_damaged_run_directory_is_refused_in_one_line(name: str, saved: Path, 
     assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700
 
 
-def test_a_run_without_classifiers_needs_its_other_files(tmp_path: Path) -> None:
+def test_a_run_without_classifiers_needs_its_embedding(tmp_path: Path) -> None:
     run = untrained_embedding_run(("a", "b"))
     save_run(run, tmp_path / "run")
     loaded = load_run(tmp_path / "run")
     assert loaded.classes == ("a", "b") and not loaded.classifiers and loaded.embedding_classifier is not None
-    assert loaded.embedding.fingerprint == run.embedding.fingerprint
     save_run(dataclasses.replace(run, classes=("b", "a")), tmp_path / "renamed")
-    other = dataclasses.replace(run.embedding, further=())
-    other.save(tmp_path / "run" / "embedding.safetensors")
-    assert_refused(r"^model: .*embedding\.safetensors is not the embedding [^\n]*$", load_run, tmp_path / "run")
-    (tmp_path / "run" / "embedding.safetensors").unlink()
-    for name, expected in (("run", "is missing"), ("renamed", "does not recognize the classes")):
-        assert_refused(rf"^model: .*embedding\.safetensors {expected}.*[^\n]*$", load_run, tmp_path / name)
-    run = with_surfaces(run)
-    save_run(run, tmp_path / "meshes")
-    assert json.loads((tmp_path / "meshes" / "run.json").read_text())["format"] == 3
-    jax.tree.map(np.testing.assert_array_equal, load_run(tmp_path / "meshes").surfaces, run.surfaces)
+    expected = r"^model: .*embedding\.safetensors does not recognize the classes [^\n]*$"
+    assert_refused(expected, load_run, tmp_path / "renamed")
+
+
+def test_every_class_has_a_surface(tmp_path: Path) -> None:
+    run = make_run()
     few = dataclasses.replace(run, surfaces=jax.tree.map(lambda field: field[:1], run.surfaces))
     save_run(few, tmp_path / "few")
-    assert_refused(
-        rf"^model: .*{SURFACES_FILE} has surfaces of 1 classes; expected 2; copy [^\n]*$", load_run, tmp_path / "few"
-    )
-    with (tmp_path / "meshes" / SURFACES_FILE).open("ab") as file:
-        file.write(b"0")
-    assert_refused(rf"^model: .*{SURFACES_FILE} is damaged: its SHA-256 [^\n]*$", load_run, tmp_path / "meshes")
-    (tmp_path / "meshes" / SURFACES_FILE).unlink()
-    assert_refused(rf"^model: .*{SURFACES_FILE} is missing; copy [^\n]*$", load_run, tmp_path / "meshes")
-    views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
-    save_run(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)), tmp_path / "own")
-    (tmp_path / "own" / REFERENCES_FILE).unlink()
-    assert_refused(r"^model: .*references\.safetensors is missing; copy [^\n]*$", load_run, tmp_path / "own")
+    expected = rf"^model: .*{SURFACES_FILE} has surfaces of 1 classes; expected 3; copy [^\n]*$"
+    assert_refused(expected, load_run, tmp_path / "few")

@@ -139,3 +139,8 @@ def test_fused_evidence_is_a_weighted_mean() -> None:
     assert scores == {"mug": pytest.approx((decayed * 0.9 + 0.1) / (decayed + 1))}
     evidence.add(1.0, {"embedding": views[1]}, {"mug": 0.2, "bowl": 0.7})  # an object was enrolled
     assert evidence.fused()[1] == pytest.approx({"mug": 0.2, "bowl": 0.7})
+    evidence.add(1.0, {}, {"mug": 0.2})  # the gallery alone answers
+    evidence.add(1.0, {"embedding": views[1]}, None)
+    probabilities, scores = evidence.fused()
+    np.testing.assert_allclose(probabilities["embedding"], views[1])
+    assert scores is None
