@@ -256,7 +256,8 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
 
     report(names, accuracy, runs["THOR2-L"])
     print(f"{time.perf_counter() - start:.0f} s")
-    batch = samples.take(np.array([np.argmax(samples.lengths)]), NETWORK, CONFIG)
+    lengths = samples.strips[:, :: 1 + NETWORK.n_regions]
+    batch = samples.take(np.diff(lengths.indptr).argmax(keepdims=True), NETWORK, CONFIG)
     draw(batch, runs["THOR2-L"][0], accuracy, names.index("THOR2"), options.out / "learn_descriptor.png")
     print(f"picture: {options.out / 'learn_descriptor.png'}; run: {options.out / 'thor2-l'}")
 

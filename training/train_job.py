@@ -68,7 +68,7 @@ class TrainJob:
     @property
     def crop_size(self) -> int | None:
         """Side of the crops that the baselines are trained on, pixels; None if they need none."""
-        return crop_size(self.baselines, self.weights is not None)
+        return crop_size(self.baselines, self.weights is not None) if self.baselines else None
 
     @property
     def stages(self) -> dict[str, float]:
@@ -102,7 +102,7 @@ def run_train_job(
             raise InputError(f"weights is {job.weights}, {reason}; leave it out")
         for name in baselines:
             check_weights(job.weights, name)
-    else:
+    elif baselines:
         check_backbone(baselines, job.out)
     labelled = _read_frames(job, baselines)
     if job.sequences is None:

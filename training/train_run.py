@@ -224,22 +224,20 @@ class _Fold(NamedTuple):
         """Train and publish the run unless it is finished, and load it from its directory."""
         directory = self.out if self.settings.folds == 1 else self.out / f"fold-{self.number}"
         if not (directory / RUN_FILE).is_file():
-            classifiers, best_epochs, temperatures = self.fit_classifiers()
+            run = self.fit_classifiers()
             if jax.process_index() == 0:
-                run = self.complete_run(classifiers, best_epochs, temperatures)
-                _publish(run, self.scratch / "run", directory)
+                _publish(self.complete_run(run), self.scratch / "run", directory)
             wait_for_all("published")
         return load_run(directory)
 
-    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int], dict[str, float]]:
-        """Fit the classifiers; return the classifiers, the epoch of each, and their temperatures."""
+    def fit_classifiers(self) -> TrainedRun:
+        """Return a run with the fitted classifiers; its record has only the epoch and the temperature of each."""
         settings, samples = self.settings, self.samples
-        if samples is None:
-            return {}, {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
-        temperatures: dict[str, float] = {}
+        temperatures: dict[Feature, float] = {}
         for name in settings.classifiers:
+            assert samples is not None
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
@@ -248,15 +246,12 @@ class _Fold(NamedTuple):
                 rows = np.flatnonzero(self.held_out)
                 probabilities = sample_probabilities(classifiers[name], samples, rows, context)
                 temperatures[name] = fit_temperature(probabilities, samples.label[rows])
-        return classifiers, best_epochs, temperatures
+        record = {"kept_epochs": best_epochs, "temperatures": temperatures}
+        return TrainedRun(settings.config, settings.network, self.source.classes, classifiers, record)
 
-    def complete_run(
-        self, classifiers: Mapping[Feature, MLP], best_epochs: Mapping[Feature, int], temperatures: Mapping[str, float]
-    ) -> TrainedRun:
-        """Return the run: classifiers, the embedding if there are distractors, calibrated confidence and record."""
-        settings = self.settings
-        run = TrainedRun(settings.config, settings.network, self.source.classes, classifiers, {})
-        accuracy, confidence = {}, {}
+    def complete_run(self, run: TrainedRun) -> TrainedRun:
+        """Add the embedding and a calibrated confidence, if there are distractors, and the whole record."""
+        settings, accuracy, confidence = self.settings, {}, {}
         if settings.distractors is not None:
             embedding, held_out = self.fit_embedding(settings.distractors)
             run = dataclasses.replace(run, embedding=embedding, surfaces=self.source.surfaces)
@@ -269,9 +264,9 @@ class _Fold(NamedTuple):
         draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, self.out / CURVES)
         record = settings.record(self.source.digest)
         record |= {"dataset": self.source.record, "samples": len(self.label), "fold": self.number}
-        record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
+        record |= _outcome([row for row in rows if row["fold"] == self.number], run.record["kept_epochs"])
         record["held_out_accuracy"] |= accuracy
-        record |= {"temperatures": temperatures, **confidence}
+        record |= {"temperatures": run.record["temperatures"], **confidence}
         return dataclasses.replace(run, record=record)
 
     def fit_embedding(self, distractors: Distractors) -> tuple[Embedding, list[tuple[int, Cloud]]]:

@@ -149,12 +149,11 @@ def train_step(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def count_correct(context: FitContext, graph: Any, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
-    """Return how many of the first `count` samples of a batch are classified correctly."""
+def predicted_labels(context: FitContext, graph: Any, state: FitState, batch: Batch) -> jax.Array:
+    """Return the predicted class indices [B] of the samples of a batch."""
     model = nnx.merge(graph, state.params, state.rest, copy=True)
     logits = model(feature_of(describe_batch(batch, context.network, context.config), context.feature))
-    correct = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
-    return _replicated(correct.sum())
+    return _replicated(logits.argmax(axis=-1))
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
@@ -241,12 +240,8 @@ def fit(
         if not len(held_out_rows):
             return None
         padded = np.resize(held_out_rows, len(held_out_rows) + -len(held_out_rows) % batch_size)
-        remaining = range(len(held_out_rows), 0, -batch_size)
-        correct = [
-            count_correct(context, graph, state, batch, np.int32(n))
-            for n, batch in zip(remaining, batches(padded), strict=True)
-        ]
-        return float(np.sum(jax.device_get(correct)) / len(held_out_rows))
+        predicted = np.concatenate([predicted_labels(context, graph, state, batch) for batch in batches(padded)])
+        return float(np.mean(predicted[: len(held_out_rows)] == samples.label[held_out_rows]))
 
     state = run_epochs(
         context.feature,

@@ -8,7 +8,6 @@ A sample stores only the nonzero lengths and colours of its strips: about a kilo
 """
 
 import dataclasses
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
@@ -54,7 +54,7 @@ class Form(NamedTuple):
         mirrors: axes of each mirrored copy, such as "xy".
         orientations: number of copies in random orientations.
         of_embedding: whether the samples are for an embedding, which needs their statistics. Their strips are then
-            stored in float16, otherwise exactly.
+            rounded to float16.
     """
 
     mirrors: Sequence[str] = MIRRORS
@@ -83,28 +83,23 @@ class Batch(NamedTuple):
     label: Any
 
 
+ARRAYS = ("shape", "data", "indices", "indptr", "statistics", "label", "view")
+"""Names of the arrays of stored samples: first those of the sparse matrix."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """Samples in compact form: the nonzero values of `length` and `color` in a batch, one sample after the other.
+    """M samples in compact form.
 
     Attributes:
-        lengths: [M] int64, number of lengths of each sample.
-        strip: [T] uint32, index of each length among the strips of its sample, slice x J + strip.
-        length: [T] float32, or float16 for an embedding.
-        colors: [M] int64, number of colour values of each sample.
-        cell: [U] uint32, index of each colour value in its sample, strip x R + region.
-        color: [U] float32, or float16 for an embedding.
+        strips: [M, S x J x (1 + R)] float32, a sparse matrix, since most strips and colour regions are empty: length
+            and colour vector of each strip.
         statistics: as in a batch, [M, ...].
         label: [M] int32.
         view: [M] int32, index of the view among the views of its object; all copies of a view share it.
     """
 
-    lengths: NDArray[np.int64]
-    strip: NDArray[np.uint32]
-    length: NDArray[np.floating[Any]]
-    colors: NDArray[np.int64]
-    cell: NDArray[np.uint32]
-    color: NDArray[np.floating[Any]]
+    strips: csr_array
     statistics: NDArray[np.float32]
     label: NDArray[np.int32]
     view: NDArray[np.int32]
@@ -112,31 +107,27 @@ class Samples:
     @classmethod
     def concatenated(cls, chunks: Sequence["Samples"]) -> "Samples":
         """Return the samples of all chunks, of which there must be at least one."""
-        return cls(**{name: np.concatenate([chunk.arrays()[name] for chunk in chunks]) for name in chunks[0].arrays()})
+        strips, *others = zip(*(vars(chunk).values() for chunk in chunks), strict=True)
+        return cls(vstack(strips, "csr"), *map(np.concatenate, others))
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Samples":
+        """Return the samples with these `arrays`; raise an error if one is missing or has another shape."""
+        shape, *matrix, statistics, label, view = (arrays[name] for name in ARRAYS)
+        return cls(csr_array(tuple(matrix), tuple(shape)), statistics, label, view)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return field name -> array."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        """Return name -> array."""
+        others = self.statistics, self.label, self.view
+        values = np.array(self.strips.shape), self.strips.data, self.strips.indices, self.strips.indptr, *others
+        return dict(zip(ARRAYS, values, strict=True))
 
     def __len__(self) -> int:
         return len(self.label)
 
-    @functools.cached_property
-    def _ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        return np.cumsum(self.lengths), np.cumsum(self.colors)
-
     def select(self, rows: NDArray[np.integer[Any]]) -> "Samples":
         """Return the samples with the given indices."""
-        lengths, colors = self.lengths[rows], self.colors[rows]
-        of_length, of_color = (
-            np.arange(counts.sum()) + np.repeat(ends[rows] - np.cumsum(counts), counts)
-            for counts, ends in zip((lengths, colors), self._ends, strict=True)
-        )
-        return Samples(
-            *(lengths, self.strip[of_length], self.length[of_length]),
-            *(colors, self.cell[of_color], self.color[of_color]),
-            *(self.statistics[rows], self.label[rows], self.view[rows]),
-        )
+        return Samples(*(values[rows] for values in vars(self).values()))
 
     def take(self, rows: NDArray[np.integer[Any]], network: ColorNetwork, config: DescriptorConfig) -> Batch:
         """Return the samples with the given indices as a batch.
@@ -146,10 +137,9 @@ class Samples:
             network: colour network of the samples.
             config: descriptor of the samples, or one with fewer slices, to which the batch is cut.
         """
-        chosen, grid = self.select(rows), (config.n_slices, config.n_strips)
-        length = _dense(chosen.lengths, chosen.strip, chosen.length, grid)
-        color = _dense(chosen.colors, chosen.cell, chosen.color, (*grid, network.n_regions))
-        return Batch(length, color, chosen.statistics, chosen.label)
+        shape = config.n_slices, config.n_strips, 1 + network.n_regions
+        strips = self.strips[rows, : math.prod(shape)].toarray().reshape(-1, *shape)
+        return Batch(strips[..., 0], strips[..., 1:], self.statistics[rows], self.label[rows])
 
     def batches(
         self, rows: NDArray[np.integer[Any]], size: int, network: ColorNetwork, config: DescriptorConfig
@@ -157,23 +147,6 @@ class Samples:
         """Yield the samples with the given indices in batches of one size; the last one is filled with the first."""
         for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
             yield self.take(chunk, network, config)
-
-
-def _sparse(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the number of nonzero values of each sample [n, ...], their indices in the sample, and the values."""
-    flat = values.reshape(len(values), -1)
-    sample, index = np.nonzero(flat)
-    return np.bincount(sample, minlength=len(flat)), index.astype(np.uint32), flat[sample, index]
-
-
-def _dense(
-    counts: NDArray[np.int64], index: NDArray[np.uint32], value: NDArray[Any], shape: tuple[int, ...]
-) -> NDArray[Any]:
-    """Return the values [n, *shape] of samples, the inverse of `_sparse`; indices past the shape are left out."""
-    dense = np.zeros((len(counts), math.prod(shape)), value.dtype)
-    sample, inside = np.repeat(np.arange(len(counts)), counts), index < dense.shape[1]
-    dense[sample[inside], index[inside]] = value[inside]
-    return dense.reshape(-1, *shape)
 
 
 def describe_batch(
@@ -215,12 +188,13 @@ def sample_normalized(
         mirrored = (mirror(normal, axes) for axes in form.mirrors)
         for copy in itertools.chain(mirrored, (reorient(normal, rng) for _ in range(form.orientations))):
             cut = strips(turn(copy, config), network, config)
-            length = np.where(cut.occupied, cut.high - cut.low, 0)[:count]
-            color, statistics = np.asarray(cut.color)[:count], np.zeros((count, 0), np.float32)
+            length = np.where(cut.occupied, cut.high - cut.low, 0)
+            values = np.concatenate([length[..., None], cut.color], axis=-1)[:count].reshape(count, -1)
+            statistics = np.zeros((count, 0), np.float32)
             if form.of_embedding:
-                length, color = length.astype(np.float16), color.astype(np.float16)
+                values = values.astype(np.float16).astype(np.float32)
                 statistics = np.hstack([cloud_statistics(sides, normal, cut), balanced])[:count]
-            chunks.append(Samples(*_sparse(length), *_sparse(color), statistics, *named))
+            chunks.append(Samples(csr_array(values), statistics, *named))
         done += count
     return Samples.concatenated(chunks)
 

@@ -304,10 +304,6 @@ def read_crops(dataset: "ViewDataset", index: int, size: int) -> ViewCrops:
             f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
             f"render with --crops {size}"
         )
-    content = intact_content(directory, name, files.get(name, ""))
-    if content is None:
-        raise InputError(
-            f"dataset: {directory / name} is missing or damaged; repeat `thor2 render` with --crops to restore it"
-        )
+    content = dataset.content(f"{CROPS}/{name}", files.get(name, ""), "`thor2 render` with --crops")
     with np.load(io.BytesIO(content)) as arrays:
         return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)

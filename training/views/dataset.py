@@ -242,13 +242,13 @@ class ViewDataset:
             InputError: their file is missing or damaged.
         """
         digest = self.manifest.surfaces
-        return None if digest is None else Surfaces.of_content(self._content(SURFACES_FILE, digest))
+        return None if digest is None else Surfaces.of_content(self.content(SURFACES_FILE, digest))
 
-    def _content(self, file: str, digest: str) -> bytes:
+    def content(self, file: str, digest: str, command: str = "`thor2 render`") -> bytes:
+        """Return the bytes of a file; raise InputError, which says to repeat the command, if it is not intact."""
         content = intact_content(self.directory, file, digest)
         if content is None:
-            path = self.directory / file
-            raise InputError(f"dataset: {path} is missing or damaged; repeat `thor2 render` to restore it")
+            raise InputError(f"dataset: {self.directory / file} is missing or damaged; repeat {command} to restore it")
         return content
 
     def read(self, index: int) -> NormalizedViews:
@@ -258,7 +258,7 @@ class ViewDataset:
             InputError: the shard's file is missing or damaged.
         """
         shard = self.shards[index]
-        arrays = safetensors.numpy.load(self._content(shard.file, shard.sha256))
+        arrays = safetensors.numpy.load(self.content(shard.file, shard.sha256))
         xyz = arrays.pop("xyz").astype(np.float32) * np.float32(COORDINATE_STEP)
         arrays.setdefault("camera", np.zeros((len(arrays["counts"]), 3), np.float32))
         return NormalizedViews(xyz, label=shard.label, **arrays)

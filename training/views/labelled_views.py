@@ -20,7 +20,7 @@ from thor2_jax.printable import check_name, normal_name
 from thor2_jax.surfaces import Surfaces
 from training.readers.frames import FrameFolder
 from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
-from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views
+from training.views.normalized_views import MemoryViews, NormalizedViews, SourceShard, ViewSource, normalize_views
 
 __all__ = ["MAX_COPIES", "LabelledInstances", "WithLabelledViews", "read_instances"]
 
@@ -126,10 +126,11 @@ class WithLabelledViews:
             config: descriptor; only `sigma_s` is used.
             rendered: source of rendered views, or None.
         """
-        self._rendered, self._instances, self._config = rendered, instances, config
+        self._rendered: ViewSource = MemoryViews({}, config) if rendered is None else rendered
+        self._instances, self._config = instances, config
         self._views = views = dict(instances.views)
-        self.classes = tuple(dict.fromkeys([*(rendered.classes if rendered else ()), *views]))
-        shards = list(rendered.shards) if rendered else []
+        self.classes = tuple(dict.fromkeys([*self._rendered.classes, *views]))
+        shards = self._rendered.shards
         clouds = [0] * len(self.classes)
         for shard in shards:
             clouds[shard.label] += shard.views
@@ -142,14 +143,14 @@ class WithLabelledViews:
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
-        rendered = self._rendered.digest if self._rendered else None
+        rendered = self._rendered.digest if self._rendered.classes else None
         return content_digest([repr((rendered, self._instances.digest, list(self._copies.values())))])
 
     @property
     def record(self) -> Mapping[str, Any]:
         """Record of the rendered views, and of the instances and copies of each class."""
         return {
-            **(self._rendered.record if self._rendered else {}),
+            **self._rendered.record,
             "digest": self.digest,
             "views": sum(shard.views for shard in self.shards),
             "frames": {
@@ -163,7 +164,7 @@ class WithLabelledViews:
     @property
     def surfaces(self) -> Surfaces | None:
         """Surfaces of the rendered views; None if a class has labelled views only."""
-        return self._rendered.surfaces if self._rendered and self._rendered.classes == self.classes else None
+        return self._rendered.surfaces if self._rendered.classes == self.classes else None
 
     def read(self, index: int) -> NormalizedViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.
@@ -172,7 +173,6 @@ class WithLabelledViews:
             InputError: an instance is too long; also as the source of the rendered views.
         """
         if index < self._first:
-            assert self._rendered is not None
             return self._rendered.read(index)
         name, label = list(self._views)[index - self._first], self.shards[index].label
         views, copies = self._views[name], self._copies[name]
@@ -191,7 +191,6 @@ class WithLabelledViews:
             InputError: as the source of the rendered views.
         """
         if index < self._first:
-            assert self._rendered is not None
             return self._rendered.read_crops(index, size)
         assert self._instances.crops is not None
         name = list(self._views)[index - self._first]

@@ -88,8 +88,6 @@ def test_a_selection_has_the_samples_in_its_order(views: Samples) -> None:
     rows = np.array([5, 0, 5])
     chosen, batch = views.select(rows), views.take(rows, NETWORK, SMALL_CONFIG)
     np.testing.assert_equal(chosen.take(np.arange(3), NETWORK, SMALL_CONFIG), batch)
-    np.testing.assert_array_equal((batch.length != 0).sum(axis=(1, 2)), chosen.lengths)
-    np.testing.assert_array_equal((batch.color != 0).sum(axis=(1, 2, 3)), chosen.colors)
 
 
 def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -113,7 +111,7 @@ def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest
     rendered.clear()
     done.clear()
     for _ in range(2):
-        np.testing.assert_equal(vars(sample(pool=stopped, directory=tmp_path / "samples")), vars(whole))
+        np.testing.assert_equal(sample(pool=stopped, directory=tmp_path / "samples").arrays(), whole.arrays())
         assert rendered == [0, 6] and done[:3] == [(3, 8), (6, 8), (8, 8)]
 
 
@@ -127,9 +125,9 @@ def test_only_damaged_files_are_rendered_again(monkeypatch: pytest.MonkeyPatch, 
     with mock.patch.object(module, "render_clouds", wraps=render_clouds) as render:
         for bad in (content[:-1] + bytes([content[-1] ^ 1]), content[:-1], incomplete):
             damaged.write_bytes(bad)
-            np.testing.assert_equal(vars(sample()), vars(whole))
+            np.testing.assert_equal(sample().arrays(), whole.arrays())
             assert damaged.read_bytes() == content
-            np.testing.assert_equal(vars(sample()), vars(whole))
+            np.testing.assert_equal(sample().arrays(), whole.arrays())
     assert [set(call.args[0]) for call in render.call_args_list] == [{2, 3}] * 3
 
 

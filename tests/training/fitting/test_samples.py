@@ -36,9 +36,8 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
     assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
     if config is CONFIG:
-        points = np.add.reduceat(samples.color, np.cumsum(samples.colors) - samples.colors)
+        points = samples.take(np.arange(16), NETWORK, config).color.sum(axis=(1, 2, 3))
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
-        assert samples.color.dtype == samples.length.dtype == np.float32
     batch = samples.take(np.arange(16), NETWORK, config)
     lowest = samples.take(np.arange(16), NETWORK, dataclasses.replace(config, n_slices=1))  # as THOR takes them
     np.testing.assert_array_equal(lowest.length, batch.length[:, :1])
@@ -71,8 +70,7 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     keys = zip(samples.label.tolist(), samples.view.tolist(), strict=True)
     assert sorted(keys) == sorted([(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2)
     expected, _ = sample_views(whole, NETWORK, CONFIG)
-    np.testing.assert_array_equal(np.sort(samples.color), np.sort(expected.color))
-    np.testing.assert_allclose(np.sort(samples.length), np.sort(expected.length), atol=1e-6)
+    np.testing.assert_allclose(np.sort(samples.strips.data), np.sort(expected.strips.data), atol=1e-6)
     # A fifteenth of the TOPS2 descriptor.
     assert sum(array.nbytes for array in samples.arrays().values()) / len(samples) < 4 * 11942 / 15
 
