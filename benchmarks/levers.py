@@ -29,9 +29,9 @@ from typing import Any
 from benchmarks.cameras import (
     ALL,
     CAMERAS,
-    LOOK_ALIKES,
     ORIGINAL,
     RunResults,
+    add_camera_options,
     answers_by_camera,
     labelled_frames,
     mean_and_deviation,
@@ -226,11 +226,9 @@ class Table:
             directories.append(self.train(levers[0], seed))
         runs = self._load(levers[0], directories)
 
-        def progress(camera: str, done: int, total: int) -> None:
-            if done == total:
-                _report(f"{', '.join(lever.name for lever in levers)}: {camera}")
-
-        answers = answers_by_camera(runs, self.frames, CAMERAS[self.options.cameras], progress)
+        names = ", ".join(lever.name for lever in levers)
+        cameras = CAMERAS[self.options.cameras]
+        answers = answers_by_camera(runs, self.frames, cameras, lambda camera: _report(f"{names}: {camera}"))
         for lever in levers:
             for seed, results in zip(missing, measure(runs, answers, lever.fusion, lever.rule), strict=True):
                 self._write_cell(lever, seed, results)
@@ -292,8 +290,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--seeds", type=int, default=3, help="number of trainings (%(default)s)")
     parser.add_argument("--levers", nargs="+", metavar="NAME", help=f"of: {', '.join(lever.name for lever in LEVERS)}")
-    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
-    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    add_camera_options(parser)
     parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='for all renderings ("%(default)s")')
     parser.add_argument("--train", default="", metavar="OPTIONS", help="for all trainings")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes")
