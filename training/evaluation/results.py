@@ -117,10 +117,10 @@ def split_known(
         placement = np.concatenate([np.zeros(0, np.intp), *scores.find_placements(frames)])
     labelled = [(instance, frame) for frame in frames for instance in frame.instances]
     is_known = np.array([instance.truth in classes for instance, _ in labelled], bool)
-    known, of_known = zip(*itertools.compress(labelled, is_known), strict=True) if is_known.any() else ((), ())
-    truth = np.array([classes.index(instance.truth) for instance in known], np.intp)
+    known = list(itertools.compress(labelled, is_known))
+    truth = np.array([classes.index(instance.truth) for instance, _ in known], np.intp)
     unknown = [instance for instance, _ in itertools.compress(labelled, ~is_known)]
-    return KnownAndUnknown(list(known), list(of_known), truth, placement[is_known], unknown)
+    return KnownAndUnknown([i for i, _ in known], [frame for _, frame in known], truth, placement[is_known], unknown)
 
 
 def named_answers(

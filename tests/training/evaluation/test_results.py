@@ -6,7 +6,15 @@ from sklearn.metrics import confusion_matrix
 from toy_recognizers import ToyRun, UntaughtRecognizer
 
 from thor2_jax.networks import FEATURES
-from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
+from training.evaluation.answers import (
+    ALL_CLASSIFIERS,
+    EMBEDDED,
+    FrameAnswers,
+    InstancePrediction,
+    fuse_by,
+    fusions,
+    main_fusion,
+)
 from training.evaluation.page import _accuracy_text, answer_texts
 from training.evaluation.results import compute_results, named_answers
 from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
@@ -60,11 +68,17 @@ def test_main_fusion_is_that_of_what_answers() -> None:
         assert fusions(features)[main_fusion(fusions(features))] == chosen
 
 
-@pytest.mark.parametrize(("feature", "names"), [("tops", "the names from TOPS"), ("ce", "these names")])
-def test_the_page_says_which_column_gives_the_names(feature: str, names: str) -> None:
-    titles = list(fusions([feature, "embedding", "classifiers"]))
-    text = _accuracy_text({"fusions": titles, "rule": "log-mean", "scratch": [], "runs": ["run"]})
-    assert f"column classifiers shows {names} with" in text and "THOR2" not in text
+@pytest.mark.parametrize(
+    ("columns", "shown"),
+    [
+        ((EMBEDDED,), "column embedding shows the answers"),
+        (("tops", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows the names from TOPS with"),
+        (("ce", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows these names with"),
+    ],
+)
+def test_the_page_says_which_column_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
+    text = _accuracy_text({"fusions": list(fusions(columns)), "rule": "log-mean", "scratch": [], "runs": ["run"]})
+    assert shown in text and "THOR2" not in text
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
