@@ -38,6 +38,7 @@ from benchmarks.cameras import (
     measure,
     summarize,
 )
+from benchmarks.paper_report import markdown_table
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
@@ -244,8 +245,7 @@ class Table:
 
     def write(self, levers: Sequence[Lever], seeds: Sequence[int]) -> str:
         """Write mean and standard deviation of the levers with complete cells, and return the table."""
-        report = {}
-        lines = ["| lever | runs | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
+        report, rows = {}, []
         for lever in levers:
             cells = [results for seed in seeds if (results := self.cell(lever, seed)) is not None]
             if len(cells) < len(seeds):
@@ -255,8 +255,8 @@ class Table:
                 mean_and_deviation(summary[part][metric]).replace("+-", "±") if part in summary else "-"
                 for part, metric in COLUMNS.values()
             ]
-            lines.append(f"| {lever.name} | {len(cells)} | " + " | ".join(values) + " |")
-        table = "\n".join(lines) + "\n"
+            rows.append([lever.name, str(len(cells)), *values])
+        table = markdown_table(["lever", "runs", *COLUMNS], rows)
         write_text(self.out / "levers.json", json.dumps(report, indent=1) + "\n")
         write_text(self.out / "levers.md", table)
         return table

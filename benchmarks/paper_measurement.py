@@ -86,11 +86,7 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
     return {
         "objects": len(report["classes"]),
         "frames": len(frames),
-        "instances": report["instances"],
-        "placements": report["placements"],
-        "fusions": report["fusions"],
-        "main": report["main"],
-        "scratch": report["scratch"],
+        **{name: report[name] for name in ("instances", "placements", "fusions", "main", "scratch")},
         "accuracy": {rule: report["accuracy"][rule] for rule in RULES},
         "by_part": _accuracy_by_part(dataset, runs, frames),
         "published_tables": report["published_tables"],
