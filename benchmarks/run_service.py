@@ -203,7 +203,7 @@ def main() -> None:
 
 def multipart_request(files: Files) -> bytes:
     kind, body = multipart(files)
-    head = f"POST /v1/recognize HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Type: {kind}\r\n"
+    head = f"POST /v1/recognize HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\nContent-Type: {kind}\r\n"
     return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
 
 
