@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cameras import CAMERAS, LOOK_ALIKES, ORIGINAL, labelled_frames, measure
+from benchmarks.cameras import CAMERAS, ORIGINAL, add_camera_options, labelled_frames, measure, seen_by
 from thor2_jax.adaptation.estimate import adaptation_criterion, estimate_transform
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import prepare_instance
-from training.augmentation.simulated_cameras import SimulatedCamera, through_camera
+from training.augmentation.simulated_cameras import SimulatedCamera
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.job import answer_frames
 from training.evaluation.runs import Run, load_runs
@@ -34,11 +34,6 @@ from training.storage.jobs import check_same_job
 
 LOST = 0.05
 """Smallest loss of accuracy at which a camera counts as affected."""
-
-
-def seen_by(camera: SimulatedCamera | None, item: LabelledFrame) -> LabelledFrame:
-    """Return a frame as a camera sees it; None returns the frame unchanged."""
-    return item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
 
 
 def only_labelled(item: LabelledFrame) -> RGBDFrame:
@@ -113,8 +108,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True, metavar="RUN")
     parser.add_argument("--frames", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--unknown", type=Path, nargs="*", default=[], metavar="DIR")
-    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
-    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
+    add_camera_options(parser)
     parser.add_argument("--instances", type=int, default=40, help="largest number of instances (%(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()

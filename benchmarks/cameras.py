@@ -21,13 +21,12 @@ all twenty cameras.
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -39,17 +38,9 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
 from training.evaluation.answers import FrameAnswers, Rule, main_fusion
 from training.evaluation.job import answer_frames
-from training.evaluation.results import fuse_answers
+from training.evaluation.results import confidence_metrics, judged_confidences, split_known
 from training.evaluation.runs import Run, load_runs
-from training.evaluation.scores import (
-    auroc,
-    expected_calibration_error,
-    find_placements,
-    placement_accuracy,
-    steadiness,
-    summarize_rows,
-    unknown_named,
-)
+from training.evaluation.scores import Floats, find_placements, placement_accuracy, steadiness, summarize_rows
 from training.objects.builtin_objects import builtin_objects
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, sequence_of
@@ -74,9 +65,6 @@ SCENE = 5
 
 RunResults = dict[str, dict[str, float]]
 """Results of a run: frames or camera -> metric -> value; NaN if there is no value."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with a camera's name, frames done and the number of frames."""
 
 
 def labelled_frames(directories: Sequence[Path], ignore: Sequence[str] = ()) -> list[LabelledFrame]:
@@ -105,25 +93,27 @@ def labelled_frames(directories: Sequence[Path], ignore: Sequence[str] = ()) -> 
     return list(frames.values())
 
 
+def seen_by(camera: SimulatedCamera | None, item: LabelledFrame) -> LabelledFrame:
+    """Return a frame as a camera sees it; None returns the frame unchanged."""
+    return item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
+
+
 def answers_by_camera(
     runs: Sequence[Run],
     frames: Sequence[LabelledFrame],
     cameras: Sequence[SimulatedCamera],
-    progress: Progress = lambda camera, done, total: None,
+    report: Callable[[str], object],
 ) -> dict[str, list[FrameAnswers]]:
-    """Return `ORIGINAL` or a camera's name -> its answers; every frame is described once for all runs."""
+    """Return `ORIGINAL` or a camera's name -> its answers; every frame is described once for all runs.
 
-    def seen(camera: SimulatedCamera | None) -> Iterator[LabelledFrame]:
-        for item in frames:
-            yield item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
-
+    `report` is called with each name when the answers are complete.
+    """
     answers: dict[str, list[FrameAnswers]] = {}
     for camera in (None, *cameras):
         name = ORIGINAL if camera is None else camera.name
-        answers[name] = []
-        for _, of_frame in answer_frames(runs, seen(camera)):
-            answers[name].append(of_frame)
-            progress(name, len(answers[name]), len(frames))
+        answered = answer_frames(runs, (seen_by(camera, item) for item in frames))
+        answers[name] = [of_frame for _, of_frame in answered]
+        report(name)
     return answers
 
 
@@ -147,7 +137,7 @@ def measure(
     Raises:
         InputError: no instance is of a class of the runs, or the runs do not have this fusion.
     """
-    placements = find_placements(answers[ORIGINAL])
+    placements = np.concatenate(find_placements(answers[ORIGINAL]))
     parts = {name: [frames] for name, frames in answers.items()}
     cameras = [frames for name, frames in answers.items() if name != ORIGINAL]
     if cameras:
@@ -159,66 +149,59 @@ def measure(
 def _measure(
     runs: Sequence[Run],
     cameras: Sequence[Sequence[FrameAnswers]],
-    placements: Sequence[NDArray[np.intp]],
+    placements: NDArray[np.intp],
     title: str | None,
     rule: Rule,
 ) -> list[dict[str, float]]:
     """Return the metrics of each run on the answers of some cameras together."""
     classes = runs[0].classes
-    labelled = [
-        (instance, sequence_of(frame.frame), (index, int(number)))
-        for index, frames in enumerate(cameras)
-        for frame, numbers in zip(frames, placements, strict=True)
-        for instance, number in zip(frame.instances, numbers, strict=True)
-    ]
-    known = [each for each in labelled if each[0].truth in classes]
-    unknown = [instance for instance, _, _ in labelled if instance.truth not in classes]
-    if not known:
+    # Placements are found in the original frames, and counted separately for each camera.
+    by_camera = np.arange(len(cameras))[:, None] * len(placements) + placements
+    scored = split_known([frame for frames in cameras for frame in frames], classes, by_camera.ravel())
+    if not scored.known:
         raise InputError(f"frames: no instance is of a class of the runs, which have {', '.join(classes[:5])}, ...")
-    instances = [instance for instance, _, _ in known]
-    described_unknown = [instance for instance in unknown if instance.probabilities is not None]
-    fused, others = fuse_answers(instances, runs, rule), fuse_answers(described_unknown, runs, rule)
+    fused, others = scored.fuse(runs, rule)
     chosen = title or main_fusion(fused, runs[0].answer_by)
     if len(fused.get(chosen, ())) < len(runs):
         raise InputError(f"fusion is {chosen}; expected one that all runs have, of {', '.join(fused)}")
-    truth = np.array([classes.index(instance.truth) for instance in instances])
-    group = np.array([name for _, name, _ in known])
-    placement = np.unique([pair for _, _, pair in known], axis=0, return_inverse=True)[1].ravel()
+    group, placement = np.array([sequence_of(frame.frame) for frame in scored.frames]), scored.placement
     results = []
     for run, predictions in fused[chosen].items():
-        answer, described = predictions.class_index, predictions.described
-        correct = answer == truth
-        confidence = np.minimum(predictions.confidence[described], 1)
-        of_unknown = np.minimum(others[chosen][run].confidence, 1)
-        every = np.concatenate([confidence, of_unknown])
+        correct, unknown = predictions.class_index == scored.truth, others[chosen][run]
+        confidence, is_right = judged_confidences(predictions, scored.truth)
+        metrics = confidence_metrics(predictions, scored.truth, unknown)
         results.append(
             {
                 "accuracy": placement_accuracy(placement, correct),
                 "accuracy_of_instances": float(correct.mean()),
-                "steadiness": steadiness(placement, answer),
-                "calibration_error": expected_calibration_error(confidence, correct[described]),
-                "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
-                "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown)),
-                **at_threshold(float(np.median(runs[run].thresholds)), confidence, correct[described], of_unknown),
+                "steadiness": steadiness(placement, predictions.class_index),
+                "calibration_error": metrics["expected_calibration_error"],
+                "auroc": metrics["auroc_known"],
+                "unknown_named": metrics["unknown_named"],
+                **at_threshold(float(np.median(runs[run].thresholds)), confidence[is_right], unknown.confidence),
                 **{
                     f"accuracy in {name}": placement_accuracy(placement[group == name], correct[group == name])
                     for name in np.unique(group).tolist()
                 },
-                "instances": len(known),
+                "instances": len(scored.known),
                 "placements": len(np.unique(placement)),
-                "unknown_instances": len(unknown),
+                "unknown_instances": len(scored.unknown),
             }
         )
     return results
 
 
-def at_threshold(
-    threshold: float, confidence: NDArray[np.floating], correct: NDArray[np.bool_], of_unknown: NDArray[np.floating]
-) -> dict[str, float]:
-    """Return the fractions of correct answers and of unknown objects above a threshold; NaN without a threshold."""
+def at_threshold(threshold: float, of_correct: Floats, of_unknown: Floats) -> dict[str, float]:
+    """Return the fractions of correct answers and of unknown objects above a threshold; NaN without a threshold.
+
+    Args:
+        threshold: the threshold; 0 for none.
+        of_correct: [N], confidences of the correct answers, at most 1.
+        of_unknown: [M], confidences of the answers to unknown objects.
+    """
     kept, named = (
         float((values >= threshold).mean()) if threshold and len(values) else np.nan
-        for values in (confidence[correct], of_unknown)
+        for values in (of_correct, np.minimum(of_unknown, 1))
     )
     return {"threshold": threshold or np.nan, "kept_at_threshold": kept, "unknown_named_at_threshold": named}
 
@@ -241,7 +224,6 @@ def draw_cameras(frame: RGBDFrame, path: Path) -> None:
         axes.set(xlim=(columns.min() - 30, columns.max() + 30), ylim=(rows.max() + 30, rows.min() - 30))
         axes.set_title(f"{camera.name} ({'choose' if camera in CHOOSE else 'report'})", fontsize=11)
         axes.set_axis_off()
-    FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100, format="jpeg", pil_kwargs={"quality": 80})
 
@@ -262,10 +244,10 @@ def mean_and_deviation(statistics: Mapping[str, Any]) -> str:
     return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" +- {statistics['std']:.3f}")
 
 
-def print_progress(camera: str, done: int, total: int) -> None:
-    """Print a line when all frames of a camera are answered."""
-    if done == total:
-        print(f"{camera}: {total} frames", flush=True)
+def add_camera_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of all benchmarks with simulated cameras."""
+    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
+    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
 
 
 def main() -> None:
@@ -273,8 +255,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, nargs="+", default=[], metavar="RUN")
     parser.add_argument("--frames", type=Path, nargs="+", default=[], metavar="DIR")
-    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
-    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    add_camera_options(parser)
     parser.add_argument("--fusion", metavar="TITLE", help="such as CE+TOPS+TOPS2; default: as in recognition")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
     parser.add_argument("--picture", type=Path, metavar="FILE.jpg")
@@ -289,17 +270,21 @@ def main() -> None:
             draw_cameras(scene.frame, options.picture)
         if options.model:
             runs = load_runs(options.model)
-            answers = answers_by_camera(runs, frames, CAMERAS[options.cameras], print_progress)
+
+            def report(camera: str) -> None:
+                print(f"{camera}: {len(frames)} frames", flush=True)
+
+            answers = answers_by_camera(runs, frames, CAMERAS[options.cameras], report)
             results = summarize(measure(runs, answers, options.fusion))
             print(show(results))
-            report = {
+            content = {
                 "runs": [run.name for run in runs],
                 "frames": [str(path) for path in options.frames],
                 "ignored": list(options.ignore),
                 "cameras": options.cameras,
                 "results": results,
             }
-            write_text(options.out, json.dumps(report, indent=1) + "\n")
+            write_text(options.out, json.dumps(content, indent=1) + "\n")
     except (InputError, OSError) as error:
         parser.error(str(error))
 

@@ -88,22 +88,12 @@ def _set(**values: Any) -> Callable[[SetUp], None]:
     return lambda setup: setup.intrinsics.update(values)
 
 
-def _scale_depth(factor: float) -> Callable[[SetUp], None]:
-    def damage(setup: SetUp) -> None:
-        setup.depth = np.clip(np.rint(setup.depth * factor), 0, 65535).astype(np.uint16)
-
-    return damage
-
-
-def _depth_in_float(factor: float) -> Callable[[SetUp], None]:
-    def damage(setup: SetUp) -> None:
-        setup.depth = (setup.depth * factor).astype(np.float32)
-
-    return damage
-
-
 def _change(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[SetUp], None]:
     return lambda setup: setattr(setup, name, np.ascontiguousarray(change(getattr(setup, name))))
+
+
+def _scale_depth(factor: float) -> Callable[[SetUp], None]:
+    return _change("depth", lambda depth: np.clip(np.rint(depth * factor), 0, 65535).astype(np.uint16))
 
 
 def _moved(columns: int, rows: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -140,7 +130,7 @@ DAMAGES: dict[str, tuple[Callable[[SetUp], None], set[str]]] = {
     "depth in 0.1 mm, read as mm": (_scale_depth(10), {"depth-unit"}),
     "depth in 0.2 mm, read as mm": (_scale_depth(5), {"depth-unit"}),
     "depth_scale in metres per unit (0.001)": (_set(depth_scale=0.001), {"depth-unit"}),
-    "depth in floats of mm": (_depth_in_float(1.0), {"depth-unit"}),
+    "depth in floats of mm": (_change("depth", lambda depth: depth.astype(np.float32)), {"depth-unit"}),
     "camera 5 m away": (
         lambda s: (_scale_depth(5)(s), s.intrinsics.update(fx=s.intrinsics["fx"] * 5, fy=s.intrinsics["fy"] * 5)),
         {"distance", "intrinsics-focal"},
@@ -192,13 +182,11 @@ def sound(folders: Sequence[Path], recognizer: Recognizer | None) -> dict[str, A
     """Diagnose sound frames; return their number and the findings, which should be none."""
     count, findings = 0, {}
     for folder in folders:
-        for color in sorted(folder.rglob("color.png")):
-            frame = color.parent
-            files = FrameFiles(color, frame / "depth.png", frame / "mask.png", frame / "intrinsics.json")
-            diagnosis = diagnose(files, recognizer=recognizer)
+        for source in find_frames([folder]):
+            diagnosis = diagnose(source.files or source.read(), recognizer=recognizer)
             count += 1
             if diagnosis.findings:
-                findings[str(frame.relative_to(folder))] = [finding.message for finding in diagnosis.findings]
+                findings[source.name] = [finding.message for finding in diagnosis.findings]
     return {"frames": count, "with_findings": findings}
 
 

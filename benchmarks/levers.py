@@ -29,15 +29,16 @@ from typing import Any
 from benchmarks.cameras import (
     ALL,
     CAMERAS,
-    LOOK_ALIKES,
     ORIGINAL,
     RunResults,
+    add_camera_options,
     answers_by_camera,
     labelled_frames,
     mean_and_deviation,
     measure,
     summarize,
 )
+from benchmarks.paper_report import markdown_table
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
@@ -226,11 +227,9 @@ class Table:
             directories.append(self.train(levers[0], seed))
         runs = self._load(levers[0], directories)
 
-        def progress(camera: str, done: int, total: int) -> None:
-            if done == total:
-                _report(f"{', '.join(lever.name for lever in levers)}: {camera}")
-
-        answers = answers_by_camera(runs, self.frames, CAMERAS[self.options.cameras], progress)
+        names = ", ".join(lever.name for lever in levers)
+        cameras = CAMERAS[self.options.cameras]
+        answers = answers_by_camera(runs, self.frames, cameras, lambda camera: _report(f"{names}: {camera}"))
         for lever in levers:
             for seed, results in zip(missing, measure(runs, answers, lever.fusion, lever.rule), strict=True):
                 self._write_cell(lever, seed, results)
@@ -246,8 +245,7 @@ class Table:
 
     def write(self, levers: Sequence[Lever], seeds: Sequence[int]) -> str:
         """Write mean and standard deviation of the levers with complete cells, and return the table."""
-        report = {}
-        lines = ["| lever | runs | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
+        report, rows = {}, []
         for lever in levers:
             cells = [results for seed in seeds if (results := self.cell(lever, seed)) is not None]
             if len(cells) < len(seeds):
@@ -257,8 +255,8 @@ class Table:
                 mean_and_deviation(summary[part][metric]).replace("+-", "±") if part in summary else "-"
                 for part, metric in COLUMNS.values()
             ]
-            lines.append(f"| {lever.name} | {len(cells)} | " + " | ".join(values) + " |")
-        table = "\n".join(lines) + "\n"
+            rows.append([lever.name, str(len(cells)), *values])
+        table = markdown_table(["lever", "runs", *COLUMNS], rows)
         write_text(self.out / "levers.json", json.dumps(report, indent=1) + "\n")
         write_text(self.out / "levers.md", table)
         return table
@@ -292,8 +290,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--seeds", type=int, default=3, help="number of trainings (%(default)s)")
     parser.add_argument("--levers", nargs="+", metavar="NAME", help=f"of: {', '.join(lever.name for lever in LEVERS)}")
-    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
-    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    add_camera_options(parser)
     parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='for all renderings ("%(default)s")')
     parser.add_argument("--train", default="", metavar="OPTIONS", help="for all trainings")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes")

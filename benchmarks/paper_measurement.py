@@ -26,9 +26,8 @@ from training.baselines.baseline import Predictor, baseline_inputs
 from training.baselines.job import CLOUD_BASELINES, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
-from training.evaluation.results import compute_results, fuse_answers
+from training.evaluation.results import compute_results, fuse_answers, split_known
 from training.evaluation.runs import Run
-from training.evaluation.scores import find_placements
 from training.readers.labelled import LabelledFrames
 
 __all__ = ["CLAIMS", "Dataset", "compare_runs", "paired_difference", "recognition_seconds"]
@@ -87,11 +86,7 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
     return {
         "objects": len(report["classes"]),
         "frames": len(frames),
-        "instances": report["instances"],
-        "placements": report["placements"],
-        "fusions": report["fusions"],
-        "main": report["main"],
-        "scratch": report["scratch"],
+        **{name: report[name] for name in ("instances", "placements", "fusions", "main", "scratch")},
         "accuracy": {rule: report["accuracy"][rule] for rule in RULES},
         "by_part": _accuracy_by_part(dataset, runs, frames),
         "published_tables": report["published_tables"],
@@ -117,17 +112,12 @@ def correct_answers(
     runs: Sequence[Run], frames: Sequence[FrameAnswers], rule: Rule
 ) -> tuple[dict[str, NDArray[np.bool_]], NDArray[np.intp]]:
     """Return column -> [F, N] whether each fold is correct on each known instance, and the placements [N]."""
-    classes = runs[0].classes
-    labelled = [instance for frame in frames for instance in frame.instances]
-    known = np.array([instance.truth in classes for instance in labelled], bool)
-    placement = np.concatenate([np.zeros(0, np.intp), *find_placements(frames)])[known]
-    instances = [instance for instance, is_known in zip(labelled, known, strict=True) if is_known]
-    truth = np.array([classes.index(instance.truth) for instance in instances], np.intp)
+    scored = split_known(frames, runs[0].classes)
     correct = {
-        title: np.stack([predictions.class_index == truth for predictions in by_run.values()])
-        for title, by_run in fuse_answers(instances, runs, rule).items()
+        title: np.stack([predictions.class_index == scored.truth for predictions in by_run.values()])
+        for title, by_run in fuse_answers(scored.known, runs, rule).items()
     }
-    return correct, placement
+    return correct, scored.placement
 
 
 RESAMPLES = 9999

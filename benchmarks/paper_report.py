@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -13,15 +12,16 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from training.baselines.job import TITLES
 from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
 
-__all__ = ["draw_claims", "report_text"]
+__all__ = ["draw_claims", "markdown_table", "report_text"]
 
 NAMES = {"scenes": "Rendered scenes in the layout of UW-IS Occluded", "frames": "Real frames"}
 COLORS = {"holds": "#2a7f3f", "undecided": "#777777", "does not hold": "#b03030"}
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [" | ".join(header), "|".join(["---"] * len(header)), *(" | ".join(row) for row in rows)]
-    return "\n".join(f"| {line} |" if "---" not in line else f"|{line}|" for line in lines) + "\n"
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    first, *others = (f"| {' | '.join(row)} |" for row in (header, *rows))
+    return "\n".join([first, "|---" * len(header) + "|", *others]) + "\n"
 
 
 def _points(value: float) -> str:
@@ -41,7 +41,7 @@ def _claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
         ]
         for each in claims
     ]
-    return _table(header, rows)
+    return markdown_table(header, rows)
 
 
 def _cost_table(costs: Mapping[str, Mapping[str, Any]], folds: int) -> str:
@@ -59,7 +59,7 @@ def _cost_table(costs: Mapping[str, Mapping[str, Any]], folds: int) -> str:
                 f"{cost['milliseconds_per_instance']:.1f}" if "milliseconds_per_instance" in cost else "-",
             ]
         )
-    return _table(header, rows)
+    return markdown_table(header, rows)
 
 
 def _dataset_text(name: str, results: Mapping[str, Any], folds: int) -> str:
@@ -81,7 +81,7 @@ def _dataset_text(name: str, results: Mapping[str, Any], folds: int) -> str:
         parts.append(_claims_table(claims))
     parts.append(f"### Accuracy, fusion rule `{DEFAULT_RULE}`\n")
     for table in results["accuracy"][DEFAULT_RULE]:
-        parts.append(_table(*accuracy_table(table, results["fusions"])))
+        parts.append(markdown_table(*accuracy_table(table, results["fusions"])))
     if results["by_part"]:
         header = ["frames", "instances", "placements", *results["fusions"]]
         rows = [
@@ -93,11 +93,11 @@ def _dataset_text(name: str, results: Mapping[str, Any], folds: int) -> str:
             ]
             for part, v in results["by_part"].items()
         ]
-        parts.append(_table(header, rows))
+        parts.append(markdown_table(header, rows))
     if results["published_tables"]:
         parts.append("### Tables of the paper, ours beside the printed figures\n")
         for table in results["published_tables"]:
-            parts += [f"**{comparison_title(table)}**\n", _table(*comparison_table(table, "THOR2"))]
+            parts += [f"**{comparison_title(table)}**\n", markdown_table(*comparison_table(table, "THOR2"))]
             parts.append(comparison_text(table) + "\n")
     parts += ["### Time and memory\n", _cost_table(results["costs"], folds)]
     return "\n".join(parts)
@@ -147,6 +147,5 @@ def draw_claims(report: Mapping[str, Any], path: Path) -> None:
         Line2D([], [], color=color, marker="o", label=name) for name, color in COLORS.items() if name in verdicts
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
-    FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")

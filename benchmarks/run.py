@@ -18,20 +18,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax import nnx
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import colornet
 import thor2_jax as thor2
-from benchmarks.clouds import sample_clouds
+from benchmarks.clouds import make_frames, random_run, sample_clouds
 from benchmarks.timing import time_calls
 from thor2_jax.descriptor.describe import describe_stream
-from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import FEATURES, MLP, input_size
-from training.objects.builtin_objects import builtin_objects
-from training.rendering.scenes import compose_scene
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
@@ -147,15 +141,8 @@ def stream(clouds: list[Any], count: int) -> dict[str, float]:
 
 def frame_latency(calls: int) -> dict[str, float]:
     """Return the milliseconds to recognize a decoded frame of 640 x 480 with six objects and three classifiers."""
-    classifiers = {name: MLP(input_size(name, CLOSED, NETWORK.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
-    run = TrainedRun(CLOSED, NETWORK, tuple(map(str, range(17))), classifiers, {})
-    recognizer = thor2.Recognizer(run)
-    objects = builtin_objects()
-    frames = []
-    for seed in range(40):
-        frame = compose_scene(objects, np.random.default_rng(seed), n_objects=6).frame
-        if len(frame.instances) == 6:
-            frames.append(frame)
+    recognizer = thor2.Recognizer(random_run())
+    frames = list(itertools.islice(make_frames(6), 32))
     times = []
     for frame in frames:
         recognizer.recognize(thor2.RGBDFrame(frame.color, frame.depth, frame.labels, frame.intrinsics))
@@ -170,7 +157,6 @@ def frame_latency(calls: int) -> dict[str, float]:
 def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
     """Plot times against the numbers of points and of clouds, with a fitted model: constant plus linear term."""
     figure = Figure(figsize=(9, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):
         x, seconds = np.array(rows).T
         slope, fixed = np.polyfit(x, seconds, 1, w=1 / seconds)  # minimizes relative errors

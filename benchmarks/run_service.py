@@ -8,6 +8,7 @@ below 250 ms. Other options are passed to `thor2 serve`.
 import argparse
 import asyncio
 import io
+import itertools
 import json
 import os
 import signal
@@ -22,17 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flax import nnx
 from PIL import Image
 
-import colornet
 import thor2_jax as thor2
+from benchmarks.clouds import make_frames, random_run
 from thor2_jax.client import multipart
-from thor2_jax.model.run_directory import TrainedRun, save_run
-from thor2_jax.networks import FEATURES, MLP, input_size
+from thor2_jax.model.run_directory import save_run
 from thor2_jax.service.decoding import decode_frame
-from training.objects.builtin_objects import builtin_objects
-from training.rendering.scenes import compose_scene
 
 LIMIT_MS = 250.0
 RATES = (30, 35, 40, 45, 50)
@@ -40,32 +37,17 @@ RATES = (30, 35, 40, 45, 50)
 Files = dict[str, bytes]
 
 
-def make_run(folder: Path) -> None:
-    """Write a run directory with random weights, since accuracy does not matter here."""
-    config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
-    classifiers = {name: MLP(input_size(name, config, network.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
-    save_run(TrainedRun(config, network, tuple(map(str, range(17))), classifiers, {}), folder)
-
-
-def make_frames(count: int, n_objects: int) -> list[Files]:
-    """Return rendered frames of 640 x 480 as the bytes of their files."""
+def files_of(frame: thor2.RGBDFrame) -> Files:
+    """Return a frame as the bytes of its files."""
 
     def png(image: Any) -> bytes:
         stream = io.BytesIO()
         Image.fromarray(image).save(stream, "PNG")
         return stream.getvalue()
 
-    objects, frames, seed = builtin_objects(), [], 0
-    while len(frames) < count:
-        frame = compose_scene(objects, np.random.default_rng(seed), n_objects=n_objects).frame
-        seed += 1
-        if len(frame.instances) == n_objects:
-            camera = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
-            images = {name: png(getattr(frame, name)) for name in ("color", "depth")}
-            frames.append(
-                {**images, "labels": png(frame.labels.astype(np.uint8)), "intrinsics": json.dumps(camera).encode()}
-            )
-    return frames
+    camera = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
+    images = {"color": frame.color, "depth": frame.depth, "labels": frame.label_image.astype(np.uint8)}
+    return {name: png(image) for name, image in images.items()} | {"intrinsics": json.dumps(camera).encode()}
 
 
 def percentiles(milliseconds: list[float]) -> dict[str, float]:
@@ -194,9 +176,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # exit through `finally`, which stops the server
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        make_run(run)
+        save_run(random_run(), run)  # accuracy does not matter here
         n_objects = 1 if options.soak else 6
-        frames = make_frames(8, n_objects)
+        frames = [files_of(frame) for frame in itertools.islice(make_frames(n_objects), 8)]
         result: dict[str, Any] = {"cores": os.cpu_count(), "objects": n_objects, "serve_options": serve_options}
         requests = [multipart_request(files) for files in frames]
         if not options.soak:
@@ -221,7 +203,7 @@ def main() -> None:
 
 def multipart_request(files: Files) -> bytes:
     kind, body = multipart(files)
-    head = f"POST /v1/recognize HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Type: {kind}\r\n"
+    head = f"POST /v1/recognize HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\nContent-Type: {kind}\r\n"
     return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
 
 

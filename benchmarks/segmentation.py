@@ -7,6 +7,7 @@ with the true and with the segmented masks.
 """
 
 import argparse
+import dataclasses
 import glob
 import json
 import time
@@ -77,9 +78,7 @@ def timed(segmenter: Any, item: LabelledFrame) -> tuple[NDArray[Any], float, flo
 
 def names_of(recognizer: Recognizer, item: LabelledFrame, labels: NDArray[Any]) -> dict[int, str | None]:
     """Return label -> recognized name."""
-    from dataclasses import replace
-
-    return {r.label: r.name for r in recognizer.recognize(replace(item.frame, labels=labels))}
+    return {r.label: r.name for r in recognizer.recognize(dataclasses.replace(item.frame, labels=labels))}
 
 
 def measure(items: Sequence[LabelledFrame], segmenter: Any, recognizer: Recognizer | None) -> dict[str, Any]:

@@ -1,22 +1,19 @@
-"""Timing of functions on a device: time of the first call, and best and median time of later calls."""
+"""Timing of functions on a device: time of the first call, and median time of later calls."""
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 __all__ = ["Timing", "time_calls"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Timing:
-    """Seconds of the first call, which includes compilation, and the best and the median of later calls."""
+class Timing(NamedTuple):
+    """Seconds of the first call, which includes compilation, and the median of later calls."""
 
     first: float
-    best: float
     median: float
 
 
@@ -32,4 +29,4 @@ def time_calls(function: Callable[[], Any], seconds: float = 2.0, least: int = 5
     calls: list[float] = []
     while len(calls) < least or sum(calls) < seconds:
         calls.append(once())
-    return Timing(first, min(calls), statistics.median(calls))
+    return Timing(first, statistics.median(calls))

@@ -19,9 +19,11 @@ An interrupted command resumes: finished runs and scenes are kept in the file.
 """
 
 import argparse
+import functools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -32,9 +34,9 @@ from benchmarks.cameras import labelled_frames
 from thor2_jax.capacity import point_bucket
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.model.inference import Inference, answers, infer_clouds
+from thor2_jax.model.inference import answers, infer_clouds
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
 from thor2_jax.tracking.viewpoints import ViewTable, merge_views, next_view, transform
@@ -65,28 +67,6 @@ METHODS = ("fused", "merged", "random", "next_view")
 Probabilities = Mapping[str, NDArray[np.floating]]
 
 
-class _Cached:
-    """A recognizer that evaluates the model once for each frame."""
-
-    def __init__(self, recognizer: Recognizer) -> None:
-        self._recognizer = recognizer
-        self._instances: dict[int, list[PreparedInstance]] = {}
-        self._inferences: dict[int, tuple[list[PreparedInstance], Inference]] = {}
-        self.model = recognizer.model
-
-    def prepare(self, frame: RGBDFrame) -> list[PreparedInstance]:
-        if id(frame) not in self._instances:
-            self._instances[id(frame)] = list(self._recognizer.prepare(frame))
-        return self._instances[id(frame)]
-
-    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]:
-        if not isinstance(instances, list):  # merged from several frames
-            return self._recognizer.infer(instances)
-        if id(instances) not in self._inferences:
-            self._inferences[id(instances)] = self._recognizer.infer(instances)
-        return self._inferences[id(instances)]
-
-
 def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> dict[str, Any]:
     """Return the results of one run on videos, as in the module's docstring; a placement is an object of a video.
 
@@ -94,7 +74,9 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
         recognizer: a recognizer with `unknown_below` 0, so that every answer has a name.
         frames: frames of one or more videos, in order.
     """
-    cached = _Cached(recognizer)
+    # The model is evaluated once for each frame and once for each merged cloud.
+    prepare, infer = functools.cache(lambda frame: tuple(recognizer.prepare(frame))), functools.cache(recognizer.infer)
+    cached: Any = SimpleNamespace(model=recognizer.model, prepare=prepare, infer=infer)
     rows: list[tuple[str, str, str, str]] = []  # placement, truth, alone, tracked
     for number, item in enumerate(frames):
         video = [each for each in frames[: number + 1] if sequence_of(each.identifier) == sequence_of(item.identifier)]
@@ -103,7 +85,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
         tracker = Tracker(cached)
         for each in video[-WINDOW:]:
             tracked = tracker.update(each.frame)
-        alone = {answer.label: answer for answer in answers(cached.model, *cached.infer(cached.prepare(item.frame)))}
+        alone = {answer.label: answer for answer in answers(recognizer.model, *infer(prepare(item.frame)))}
         for answer in tracked:
             truth = item.truth.get(answer.label)
             if truth in recognizer.classes:

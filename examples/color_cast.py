@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import colornet
@@ -101,7 +100,6 @@ def draw(
 ) -> None:
     """Draw the objects in both lights and with the estimated lamp removed, and the progress of the descent."""
     figure = Figure(figsize=(11, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.6))
     shown = {"model": model, "under the lamp": seen, "lamp removed": under(jnp.asarray(1 / estimate), seen)}
     for axes, (title, clouds) in zip(upper.subplots(1, 3), shown.items(), strict=True):

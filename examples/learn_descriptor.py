@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
@@ -283,7 +282,6 @@ def report(names: Sequence[str], accuracy: Mapping[str, Mapping[str, Any]], lear
 def draw(batch: Batch, learned: TrainedRun, accuracy: Mapping[str, Mapping[str, Any]], column: int, path: Path) -> None:
     """Draw Delta, a persistence image and the accuracies, before and after."""
     figure = Figure(figsize=(12, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.2, 1))
     colors = ("#56b4e9", "#d55e00")
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.scipy.linalg import expm
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -235,7 +234,6 @@ def draw(
 ) -> None:
     """Draw one view before and after refinement over the stored view, and the differences of all views."""
     figure = Figure(figsize=(11, 7), layout="constrained")
-    FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.1))
     stored, *others = clouds
     titles = (f"{name} in the frame of its box, {own['angle'][0]:.1f}° off", f"refined, {own['angle'][1]:.1f}° off")

@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.inference import infer
-from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.networks import FEATURES, MLP, EmbeddingSizes, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
+from training.views.normalized_views import ViewSource
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
@@ -37,6 +39,16 @@ def untrained_run(
         for k, name in enumerate(features)
     }
     return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+
+
+def save_trained_run(
+    folder: Path, source: ViewSource, config: thor2.DescriptorConfig, temperatures: Mapping[str, float] = {}, **fit: int
+) -> Path:
+    """Write an untrained run of TOPS with the record of a training on these views; `fit` has epochs, folds and fold."""
+    record = {"dataset": dict(source.record), "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0, **fit}
+    run = untrained_run(source.classes, ("tops",), config, record | {"temperatures": temperatures})
+    save_run(run, folder)
+    return folder
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import numpy as np
 import thor2_jax as thor2
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.model import Model
+from training.evaluation.answers import InstancePrediction
 
 
 class UntaughtRecognizer:
@@ -60,3 +61,15 @@ class ToyRun(NamedTuple):
     baselines: Mapping[str, Any] = {}
     own_objects: bool = False
     has_real_views: bool = False
+
+
+def toy_answer(truth: str, name: str | None, confidence: float = 0.6, n_predictors: int = 1) -> InstancePrediction:
+    """Return an unmoved instance for which all predictors of a `ToyRun` have this confidence in a name.
+
+    The other classes share the rest. An instance without a name has not been described.
+    """
+    if name is None:
+        return InstancePrediction(1, truth, reason="too few points", position=(0.0, 0.0, 1.0))
+    row = np.full(3, (1 - confidence) / 2, np.float32)
+    row[ToyRun("").classes.index(name)] = confidence
+    return InstancePrediction(1, truth, False, None, np.stack([row] * n_predictors), (0.0, 0.0, 1.0))

@@ -9,7 +9,7 @@ import pytest
 from image_files import small_frame, write_frame_files
 from refusals import assert_refused
 from small_runs import untrained_run
-from toy_recognizers import ToyRun
+from toy_recognizers import ToyRun, toy_answer
 
 from benchmarks import cameras
 from thor2_jax.model.run_directory import save_run
@@ -30,22 +30,13 @@ def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
     assert_refused("video/1", cameras.labelled_frames, [tmp_path / "video", tmp_path / "video" / "1"])
 
 
-def answer(truth: str, name: str | None, confidence: float = 0.6) -> InstancePrediction:
-    """Return an unmoved instance; a name of None has not been described."""
-    if name is None:
-        return InstancePrediction(1, truth, reason="too few points", position=(0.0, 0.0, 1.0))
-    row = np.full(3, (1 - confidence) / 2, np.float32)
-    row[CLASSES.index(name)] = confidence
-    return InstancePrediction(1, truth, False, None, row[None], (0.0, 0.0, 1.0))
-
-
 def test_metrics_match_hand_calculation() -> None:
     """A mug in a video of three frames, a can, a dragon; under the camera, one answer is lost and one is new."""
 
     def frames(mug: list[str | None], can: str, dragon: float) -> list[FrameAnswers]:
-        video = [FrameAnswers(f"v/{k}", {}, 1.0, [answer("mug", name, 0.7)]) for k, name in enumerate(mug)]
-        can_frame = FrameAnswers("w/0", {}, 1.0, [answer("can", can, 0.9)])
-        return [*video, can_frame, FrameAnswers("u/0", {}, 1.0, [answer("dragon", "can", dragon)])]
+        video = [FrameAnswers(f"v/{k}", {}, 1.0, [toy_answer("mug", name, 0.7)]) for k, name in enumerate(mug)]
+        can_frame = FrameAnswers("w/0", {}, 1.0, [toy_answer("can", can, 0.9)])
+        return [*video, can_frame, FrameAnswers("u/0", {}, 1.0, [toy_answer("dragon", "can", dragon)])]
 
     answers = {
         "original": frames(["mug", "mug", "bowl"], "can", 0.8),

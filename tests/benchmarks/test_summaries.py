@@ -11,8 +11,10 @@ import pytest
 import thor2_jax as thor2
 from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
 from benchmarks.doctor import DAMAGES, run
+from benchmarks.run_service import multipart_request
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 from thor2_jax.explanation.attributions import Attributions
+from thor2_jax.service.hosts import is_allowed_host
 from training.readers.frames import frame_files
 from training.readers.labelled import LabelledFrame
 
@@ -87,6 +89,12 @@ def test_bad_arguments_write_nothing(
         error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
         assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1], arguments
         assert list(tmp_path.iterdir()) == []
+
+
+def test_the_service_accepts_the_host_of_the_load_test() -> None:
+    head = multipart_request({"color": b"", "depth": b""}).split(b"\r\n\r\n")[0].decode()
+    fields = dict(line.split(": ") for line in head.split("\r\n")[1:])
+    assert is_allowed_host(fields["Host"], "127.0.0.1", ())
 
 
 SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"

@@ -203,8 +203,6 @@ def main() -> None:
         context = getattr(error, "ctx", None)
         advice = f"; see {context.command_path} --help" if context else ""
         _exit_with(error.format_message().rstrip(".") + _given_value(error) + advice)
-    except InputError as error:
-        _exit_with(str(error))
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in TRAINING_PACKAGES:
@@ -214,7 +212,7 @@ def main() -> None:
         if "Symlink loop" not in str(error):  # of Path.resolve
             raise
         _exit_with(str(error))
-    except OSError as error:
+    except (InputError, OSError) as error:
         _exit_with(reason_of(error))
     finally:
         sys.unraisablehook = report

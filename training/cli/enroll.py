@@ -19,6 +19,20 @@ if TYPE_CHECKING:
     from thor2_jax.frames.prepared_instance import PreparedInstance
 
 
+@dataclasses.dataclass(frozen=True)
+class EnrollOptions:
+    """Options that are arguments of `enroll_objects`."""
+
+    label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None
+    instance: Annotated[
+        int | None, typer.Option(help="Label number of the object. Default: as in labels.json, or the only instance.")
+    ] = None
+    mesh_scale: options.MeshScaleOption = 1.0
+    extend: Annotated[bool, typer.Option("--extend", help="Add the views to an existing object.")] = False
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the views of an existing object.")] = False
+    gallery: options.GalleryOption = None
+
+
 @app.command(cls=options.ManyFrames)
 @options.grouped_options
 def enroll(
@@ -33,15 +47,8 @@ def enroll(
         list[Path] | None,
         typer.Option("--frames", metavar="FRAME...", help="Frames whose labelled objects are all enrolled; no NAME."),
     ] = None,
-    label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None,
-    instance: Annotated[
-        int | None, typer.Option(help="Label number of the object. Default: as in labels.json, or the only instance.")
-    ] = None,
+    target: EnrollOptions,
     segment: options.SegmentOption = None,
-    mesh_scale: options.MeshScaleOption = 1.0,
-    extend: Annotated[bool, typer.Option("--extend", help="Add the views to an existing object.")] = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the views of an existing object.")] = False,
-    gallery: options.GalleryOption = None,
     processes: options.RenderWorkers,
     quiet: options.QuietOption = False,
 ) -> None:
@@ -58,11 +65,12 @@ def enroll(
     has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
-    if name is None and (label_name is not None or instance is not None):
+    if name is None and (target.label_name is not None or target.instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
-    if extend and replace:
+    if target.extend and target.replace:
         raise InputError("extend and replace are both given; choose one")
-    options.check_belongs("frames", has_frames, label_name=label_name, instance=instance)
+    options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
+    mesh_scale = target.mesh_scale
     scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes, load_mesh
@@ -77,28 +85,18 @@ def enroll(
         from training.enrollment import enroll_objects
 
         with show_progress(quiet) as progress:
-            counts, known, skipped = enroll_objects(
-                model,
-                (meshes, views_of_meshes) if frames is None else frames,
-                name=name,
-                label_name=label_name,
-                instance=instance,
-                extend=extend,
-                replace=replace,
-                gallery=gallery,
-                mesh_scale=mesh_scale,
-                progress=progress,
-            )
+            source = (meshes, views_of_meshes) if frames is None else frames
+            counts, known, skipped = enroll_objects(model, source, name=name, progress=progress, **vars(target))
     for reason in skipped:
         console.print(f"skipped: {reason}")
     for each, count in counts.items():
         console.print(f"{each}: {count} views")
     if known.weak_rejection:
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
-    enrolled = f"enrolled in {gallery or model}, which recognizes {known.gallery.summary}"
+    enrolled = f"enrolled in {target.gallery or model}, which recognizes {known.gallery.summary}"
     # `thor2 recognize` uses the gallery in the run directory.
-    then = ("serve the objects", "serve") if gallery else ("recognize a frame", "recognize", "FRAME")
-    finish(enrolled, *then, model=model, gallery=gallery)
+    then = ("serve the objects", "serve") if target.gallery else ("recognize a frame", "recognize", "FRAME")
+    finish(enrolled, *then, model=model, gallery=target.gallery)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import functools
 import itertools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -50,7 +50,7 @@ class _Answers:
     """The answers as they are printed and written; unusable files are refused before any frame is recognized.
 
     Attributes:
-        tables: the COCO and BOP results, from `opened` on.
+        tables: the COCO and BOP results, from `write` on.
         failed: names of the frames that could not be recognized.
         failures: the `segmentation_failure` of each recognized frame.
         has_unknown: whether an instance got no name.
@@ -88,15 +88,15 @@ class _Answers:
         check_output_file("coco", given.coco, result_files.is_coco_file)
         check_output_file("bop", given.bop, result_files.is_bop_file)
 
-    @contextlib.contextmanager
-    def opened(self, classes: Sequence[str]) -> Iterator[None]:
-        """Open the files, and complete them at the end; the error of a damaged recording says what they have."""
+    def write(self, answers: Iterable["FrameAnswer"], classes: Sequence[str]) -> None:
+        """Print and write all answers; the error of a damaged recording says where those before it are."""
         from thor2_jax.model.result_files import ResultTables
 
         self.tables = ResultTables(self._frames, classes, self._numbers)
         try:
             with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
-                yield
+                for answer in answers:
+                    self._add(answer)
         except InputError as error:
             if self._frames or not self.failures:
                 raise
@@ -104,8 +104,7 @@ class _Answers:
             raise InputError(f"{error}; {len(self.failures)} frames were recognized before{place}") from None
         self.tables.write(self._given.coco, self._given.bop)
 
-    def add(self, answer: "FrameAnswer") -> None:
-        """Print and write the answers for a frame."""
+    def _add(self, answer: "FrameAnswer") -> None:
         from thor2_jax.model.result_files import write_recognitions
 
         frame, place, out = answer.frame, answer.recorded, self._given.out
@@ -128,8 +127,7 @@ class _Answers:
         if self._bag is not None and place is not None:
             self._bag.write(frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
         if self._rerun is not None:
-            stamp = None if place is None else place.stamp
-            self._rerun.write(frame, answer.detections, name=answer.name, stamp=stamp)
+            self._rerun.write(frame, answer.detections, name=answer.name, stamp=None if place is None else place.stamp)
 
     @property
     def written(self) -> str:
@@ -209,9 +207,7 @@ def recognize(
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:
             answers = recognize_frames(recognizer.recognize, sources)
-        stack.enter_context(results.opened(recognizer.classes))
-        for answer in answers:
-            results.add(answer)
+        results.write(answers, recognizer.classes)
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")

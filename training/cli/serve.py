@@ -1,5 +1,6 @@
 """`thor2 serve`: the HTTP service."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Annotated
@@ -11,40 +12,48 @@ from training.cli import options
 from training.cli.app import app
 
 
+@dataclasses.dataclass(frozen=True)
+class ServiceOptions:
+    """Options that are fields of `Settings`."""
+
+    model: options.ModelOption
+    processes: Annotated[
+        int, typer.Option(min=1, max=options.MAX_WORKERS, help="Processes per worker that decode and prepare frames.")
+    ] = 2
+    queue: Annotated[int, typer.Option(min=1, help="Concurrent requests per worker; others get status 429.")] = 32
+    deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0
+    max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32
+    unknown_below: options.UnknownOption = None
+    cache: Annotated[
+        Path | None, typer.Option(help="Directory for compiled programs, which makes the next start faster.")
+    ] = None
+    gallery: options.GalleryOption = None
+    teach: Annotated[bool, typer.Option("--teach", help="Let clients enroll and forget objects.")] = False
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="Estimate the camera's colours from the latest frames, and correct them.")
+    ] = False
+    warm_why: Annotated[
+        bool,
+        typer.Option(
+            help="Compile explanations (/v1/why) in the background after the start, rather than at the first request."
+        ),
+    ] = True
+
+
 @app.command()
+@options.grouped_options
 def serve(
-    model: options.ModelOption,
+    given: ServiceOptions,
     host: options.HostOption = "127.0.0.1",
     allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free port, which is logged.")] = 8080,
     workers: Annotated[
         int, typer.Option(min=1, max=options.MAX_WORKERS, help="Server processes, each with its own model and queue.")
     ] = 1,
-    processes: Annotated[
-        int, typer.Option(min=1, max=options.MAX_WORKERS, help="Processes per worker that decode and prepare frames.")
-    ] = 2,
-    queue: Annotated[int, typer.Option(min=1, help="Concurrent requests per worker; others get status 429.")] = 32,
-    deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0,
-    max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32,
-    unknown_below: options.UnknownOption = None,
-    cache: Annotated[
-        Path | None, typer.Option(help="Directory for compiled programs, which makes the next start faster.")
-    ] = None,
-    gallery: options.GalleryOption = None,
-    teach: Annotated[bool, typer.Option("--teach", help="Let clients enroll and forget objects.")] = False,
     segment: Annotated[
         str | None,
         typer.Option(help="Segmenter for frames without labels, or none. Default: table, if OpenCV is installed."),
     ] = None,
-    adapt: Annotated[
-        bool, typer.Option("--adapt", help="Estimate the camera's colours from the latest frames, and correct them.")
-    ] = False,
-    warm_why: Annotated[
-        bool,
-        typer.Option(
-            help="Compile explanations (/v1/why) in the background after the start, rather than at the first request."
-        ),
-    ] = True,
     token: Annotated[
         str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
     ] = None,
@@ -58,20 +67,10 @@ def serve(
         from thor2_jax.service.settings import Settings, default_segmenter
 
         settings = Settings(
-            model,
-            os.environ.get("THOR2_TOKEN") if token is None else token,  # Typer ignores an empty variable
-            queue,
-            deadline,
-            max_batch,
-            processes=processes,
-            unknown_below=unknown_below,
-            cache=cache,
-            gallery=gallery,
-            teach=teach,
-            adapt=adapt,
+            token=os.environ.get("THOR2_TOKEN") if token is None else token,  # Typer ignores an empty variable
             segmenter=default_segmenter() if segment is None else segment if segment != "none" else None,
             allow_host=tuple(allow_host or ()),
-            warm_why=warm_why,
+            **vars(given),
         )
     serve_forever(settings, host, port, workers)
     os._exit(0)  # a normal exit would wait until explanations are compiled

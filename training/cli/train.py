@@ -1,5 +1,6 @@
 """`thor2 train`: train a recognizer."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,41 +28,45 @@ class _TrainCommand(options.ManyFrames):
         super().format_help(ctx, formatter)
 
 
-@app.command(cls=_TrainCommand)
-def train(
-    out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")],
-    meshes: Annotated[Path | None, typer.Option(help="Folder of meshes (GLB, OBJ, PLY) to render.")] = None,
+@dataclasses.dataclass(frozen=True)
+class JobOptions:
+    """Options that are fields of `TrainJob`."""
+
+    out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")]
+    meshes: Annotated[Path | None, typer.Option(help="Folder of meshes (GLB, OBJ, PLY) to render.")] = None
     dataset: Annotated[
-        Path | None, typer.Option(help="Directory written by `thor2 render`, instead of --meshes.")
-    ] = None,
-    frames: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="DIR...", help="Folders of labelled frames; their instances are used as views, too."),
-    ] = None,
-    names: options.NamesOption = None,
-    paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Train in half of the time, with fewer distractors and networks.")
-    ] = False,
+        Path | None,
+        typer.Option(help="Directory written by `thor2 render`, instead of --meshes."),
+    ] = None
+    names: options.NamesOption = None
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="Folder of pretrained weights (safetensors) for the networks. Default: from scratch."),
+    ] = None
+    sequences: Annotated[
+        Path | None,
+        typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
+    ] = None
+    mesh_scale: options.MeshScaleOption = 1.0
+    workers: Annotated[int, typer.Option(min=1, max=options.MAX_WORKERS, help="Rendering processes.")] = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolOptions:
+    """Options that replace values of the protocol; None keeps a value."""
+
     azimuth_step: Annotated[
         float | None,
         typer.Option(
             help="Degrees between cameras around the object. ({default.azimuth_step:g}; paper: {paper.azimuth_step:g})"
         ),
-    ] = None,
+    ] = None
     polar_step: Annotated[
         float | None,
         typer.Option(
             help="Degrees between cameras from pole to pole. ({default.polar_step:g}; paper: {paper.polar_step:g})"
         ),
-    ] = None,
-    classifiers: Annotated[
-        str | None,
-        typer.Option(
-            help="The paper's classifiers to train, too, comma-separated: tops, tops2, ce. (none; "
-            "without an embedding, as with --paper: all)"
-        ),
-    ] = None,
+    ] = None
     epochs: Annotated[
         int | None,
         typer.Option(
@@ -69,17 +74,47 @@ def train(
             "half at a learning rate of {default.fit.learning_rates[0]:g}, half at {default.fit.learning_rates[1]:g} "
             "({default.fit.epochs}; paper: {paper.fit.epochs})."
         ),
-    ] = None,
+    ] = None
     batch_size: Annotated[
         int | None,
         typer.Option(
             help="Samples per step of the classifiers. ({default.fit.batch_size}; paper: {paper.fit.batch_size})"
         ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
+    ] = None
+    seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0
     folds: Annotated[
         int, typer.Option(min=1, max=1000, help="Number of folds; if more than 1, one model per held-out fold.")
-    ] = 1,
+    ] = 1
+    orientation_copies: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Additional samples of each view in random orientations, for the classifiers. "
+            "({default.orientation_copies}; paper: {paper.orientation_copies})",
+        ),
+    ] = None
+
+
+@app.command(cls=_TrainCommand)
+@options.grouped_options
+def train(
+    given: JobOptions,
+    settings: ProtocolOptions,
+    frames: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="DIR...", help="Folders of labelled frames; their instances are used as views, too."),
+    ] = None,
+    paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Train in half of the time, with fewer distractors and networks.")
+    ] = False,
+    classifiers: Annotated[
+        str | None,
+        typer.Option(
+            help="The paper's classifiers to train, too, comma-separated: tops, tops2, ce. (none; "
+            "without an embedding, as with --paper: all)"
+        ),
+    ] = None,
     baselines: Annotated[
         str,
         typer.Option(
@@ -87,15 +122,7 @@ def train(
             "rgbd-vit; the last three also with -small."
         ),
     ] = "",
-    weights: Annotated[
-        Path | None,
-        typer.Option(help="Folder of pretrained weights (safetensors) for the networks. Default: from scratch."),
-    ] = None,
     leave_out: Annotated[str, typer.Option(help="Comma-separated objects to leave out of the training.")] = "",
-    sequences: Annotated[
-        Path | None,
-        typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
-    ] = None,
     embedding: Annotated[
         int | None,
         typer.Option(
@@ -105,19 +132,9 @@ def train(
             "({default.distractors.procedural}; quick: {quick.distractors.procedural}; paper: 0)",
         ),
     ] = None,
-    orientation_copies: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            help="Additional samples of each view in random orientations, for the classifiers. "
-            "({default.orientation_copies}; paper: {paper.orientation_copies})",
-        ),
-    ] = None,
     distractors: Annotated[
         Path | None, typer.Option(help="Folder of meshes of further distractors: objects of none of the classes.")
     ] = None,
-    mesh_scale: options.MeshScaleOption = 1.0,
-    workers: Annotated[int, typer.Option(min=1, max=options.MAX_WORKERS, help="Rendering processes.")] = 2,
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
     ] = None,
@@ -149,19 +166,19 @@ def train(
 
     if paper and quick:
         raise InputError("paper and quick are given; expected one of them")
-    if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
+    if (given.meshes is None) == (given.dataset is None) and (given.meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
-    steps = {"azimuth_step": azimuth_step, "polar_step": polar_step}
-    options.check_belongs("--meshes", meshes, names=names, mesh_scale=scale, **steps)
+    scale = None if given.mesh_scale == 1 else f"{given.mesh_scale:g}"
+    steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
+    options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
-    if sequences is not None and (dataset is None or leave_out):
-        raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
+    if given.sequences is not None and (given.dataset is None or leave_out):
+        raise InputError(f"sequences is {given.sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
-        if meshes is not None or frames:
+        if given.meshes is not None or frames:
             raise InputError(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
@@ -175,23 +192,14 @@ def train(
     keep_freed_memory()
     protocol = PAPER if paper else QUICK if quick else DEFAULT
     others = {} if distractors is None else find_meshes(distractors)
-    protocol = protocol.with_distractors(embedding, others, workers)
-    protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
+    protocol = protocol.with_distractors(embedding, others, given.workers)
     features = None if classifiers is None else options.split_names(classifiers)
-    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds, classifiers=features)
     job = TrainJob(
-        out=out,
-        protocol=protocol,
-        meshes=meshes,
-        dataset=dataset,
+        protocol=protocol.replace(classifiers=features, **vars(settings)),
         frames=frames or (),
-        names=names,
         baselines=options.split_names(baselines),
-        weights=weights,
         leave_out=options.split_names(leave_out),
-        sequences=sequences,
-        workers=workers,
-        mesh_scale=mesh_scale,
+        **vars(given),
     )
     with show_progress(quiet) as progress:
         trained = run_train_job(job, progress)

@@ -3,7 +3,7 @@
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,16 @@ from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import Flags, Floats, summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
-__all__ = ["check_known", "compute_results", "fuse_answers", "named_answers"]
+__all__ = [
+    "KnownAndUnknown",
+    "check_known",
+    "compute_results",
+    "confidence_metrics",
+    "fuse_answers",
+    "judged_confidences",
+    "named_answers",
+    "split_known",
+]
 
 CURVE = tuple(k / 100 for k in range(101))
 """Fractions of the correct answers at which the known/unknown curve is computed."""
@@ -71,6 +80,49 @@ def fuse_answers(
     return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
+class KnownAndUnknown(NamedTuple):
+    """The labelled instances of an evaluation: those of a class of the runs are known objects, the others unknown.
+
+    Attributes:
+        known: N instances of known objects.
+        frames: [N] their frames.
+        truth: [N] their classes.
+        placement: [N] their placements, see `find_placements`.
+        unknown: instances of unknown objects.
+    """
+
+    known: list[InstancePrediction]
+    frames: list[FrameAnswers]
+    truth: Integers
+    placement: Integers
+    unknown: list[InstancePrediction]
+
+    def fuse(self, runs: Sequence[Run], rule: Rule) -> tuple[Fused, Fused]:
+        """Return the fused predictions for the known objects, and for the unknown objects that could be described."""
+        described = [instance for instance in self.unknown if instance.probabilities is not None]
+        return fuse_answers(self.known, runs, rule), fuse_answers(described, runs, rule)
+
+
+def split_known(
+    frames: Sequence[FrameAnswers], classes: Sequence[str], placement: Integers | None = None
+) -> KnownAndUnknown:
+    """Separate the instances of known objects from those of unknown objects.
+
+    Args:
+        frames: the answers.
+        classes: names of the known objects.
+        placement: placement of every instance; by default those of `find_placements`.
+    """
+    if placement is None:
+        placement = np.concatenate([np.zeros(0, np.intp), *scores.find_placements(frames)])
+    labelled = [(instance, frame) for frame in frames for instance in frame.instances]
+    is_known = np.array([instance.truth in classes for instance, _ in labelled], bool)
+    known = list(itertools.compress(labelled, is_known))
+    truth = np.array([classes.index(instance.truth) for instance, _ in known], np.intp)
+    unknown = [instance for instance, _ in itertools.compress(labelled, ~is_known)]
+    return KnownAndUnknown([i for i, _ in known], [frame for _, frame in known], truth, placement[is_known], unknown)
+
+
 def named_answers(
     instances: Sequence[InstancePrediction], runs: Sequence[Run]
 ) -> Iterator[tuple[int, InstancePrediction, str | None, float]]:
@@ -99,28 +151,23 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         InputError: no instance is of a class of the runs.
     """
     classes = runs[0].classes
-    labelled = [(instance, frame) for frame in frames for instance in frame.instances]
-    is_known = [instance.truth in classes for instance, _ in labelled]
-    known = list(itertools.compress(labelled, is_known))
-    instances = [instance for instance, _ in known]
-    unknown = [instance for instance, _ in labelled if instance.truth not in classes]
-    check_known({instance.truth for instance, _ in labelled}, classes)
+    scored = split_known(frames, classes)
+    truth, placement = scored.truth, scored.placement
+    check_known({instance.truth for frame in frames for instance in frame.instances}, classes)
     seconds = [frame.seconds for frame in frames]
     # One table of OCID is by sequence, which is the directory of the frame.
     attributes = [
-        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})} for _, frame in known
+        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
+        for frame in scored.frames
     ]
-    placement = np.concatenate(scores.find_placements(frames))[is_known]
-    truth = np.array([classes.index(i.truth) for i in instances], np.intp)
-    by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
-    described_unknown = [instance for instance in unknown if instance.probabilities is not None]
-    unknown_by_rule = {rule: fuse_answers(described_unknown, runs, rule) for rule in (DEFAULT_RULE, "calibrated")}
+    fused = {rule: scored.fuse(runs, rule) for rule in RULES}
+    by_rule = {rule: known for rule, (known, _) in fused.items()}
     tables = scores.attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
-    by_run, unknown_by_run = by_rule[DEFAULT_RULE][main], unknown_by_rule[DEFAULT_RULE][main]
+    by_run, unknown_by_run = (of_rule[main] for of_rule in fused[DEFAULT_RULE])
     correct = {
-        rule: {title: [p.class_index == truth for p in by_run.values()] for title, by_run in fused.items()}
-        for rule, fused in by_rule.items()
+        rule: {title: [p.class_index == truth for p in of_runs.values()] for title, of_runs in known.items()}
+        for rule, known in by_rule.items()
     }
     rejection = [_rejection(by_run[run], truth, unknown_by_run[run], runs[run].thresholds) for run in by_run]
     # Rows are true classes. The last column counts instances that are not described, since their index is -1.
@@ -129,19 +176,19 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         np.add.at(confusion, (truth, predictions.class_index), 1)
 
     def of_runs(measure: Callable[[Predictions], float]) -> dict[str, Any]:
-        fused = by_rule[DEFAULT_RULE]
-        return {title: summarize_runs([measure(each) for each in fused[title].values()]) for title in fused}
+        known = by_rule[DEFAULT_RULE]
+        return {title: summarize_runs([measure(each) for each in known[title].values()]) for title in known}
 
-    counts, worst = _answers([*instances, *unknown], runs)
+    counts, worst = _answers([*scored.known, *scored.unknown], runs)
     return {
         "runs": [run.name for run in runs],
         "classes": list(classes),
         "rule": DEFAULT_RULE,
         "instances": {
-            "labelled": len(labelled),
-            "scored": len(instances),
-            "not_described": dict(Counter(i.reason for i in instances if i.probabilities is None)),
-            "no_class": dict(Counter(i.truth for i in unknown)),
+            "labelled": len(scored.known) + len(scored.unknown),
+            "scored": len(scored.known),
+            "not_described": dict(Counter(i.reason for i in scored.known if i.probabilities is None)),
+            "no_class": dict(Counter(i.truth for i in scored.unknown)),
         },
         "speed": {
             "frames": len(seconds),
@@ -152,7 +199,7 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         "fusions": list(by_rule[DEFAULT_RULE]),
         "worst": worst,
         "published_tables": compare_with_published(
-            kind, runs, len(frames), attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
+            kind, runs, len(frames), attributes, [i.truth for i in scored.known], correct[DEFAULT_RULE]
         ),
         "scratch": scratch_networks(runs),
         "accuracy": {
@@ -162,8 +209,8 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
         },
-        "confidence": _confidence(by_rule[DEFAULT_RULE], truth, unknown_by_rule[DEFAULT_RULE]),
-        "calibrated_confidence": _confidence(by_rule["calibrated"], truth, unknown_by_rule["calibrated"]),
+        "confidence": _confidence(*fused[DEFAULT_RULE], truth),
+        "calibrated_confidence": _confidence(*fused["calibrated"], truth),
         "placements": {
             "count": len(np.unique(placement)),
             "accuracy": of_runs(lambda each: scores.placement_accuracy(placement, each.class_index == truth)),
@@ -206,22 +253,29 @@ def _accuracy(
     return {"by": list(names), "cells": cells}
 
 
-def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]:
+def _confidence(fused: Fused, unknown: Fused, truth: Integers) -> dict[str, Any]:
     """Return confidence metrics of each fusion, for known objects and for known against unknown objects."""
     return {
-        title: summarize_rows([_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run])
+        title: summarize_rows([confidence_metrics(by_run[run], truth, unknown[title][run]) for run in by_run])
         for title, by_run in fused.items()
     }
 
 
-def _judged(known: Predictions, truth: Integers) -> tuple[Floats, Flags]:
+def judged_confidences(known: Predictions, truth: Integers) -> tuple[Floats, Flags]:
     """Return the confidences of the described instances, at most 1, and whether their answers are correct."""
     described = known.described
     return np.minimum(known.confidence[described], 1), (known.class_index == truth)[described]
 
 
-def _confidence_of_run(known: Predictions, truth: Integers, unknown: Predictions) -> dict[str, float]:
-    confidence, correct = _judged(known, truth)
+def confidence_metrics(known: Predictions, truth: Integers, unknown: Predictions) -> dict[str, float]:
+    """Return the confidence metrics of a run: see `scores`; "unknown_refused" is at the `COVERAGE` of all answers.
+
+    Args:
+        known: predictions for N known objects.
+        truth: [N] their classes.
+        unknown: predictions for unknown objects that could be described.
+    """
+    confidence, correct = judged_confidences(known, truth)
     of_unknown = np.minimum(unknown.confidence, 1)
     threshold, accuracy = scores.accuracy_at_coverage(confidence, correct)
     every = np.concatenate([confidence, of_unknown])
@@ -271,7 +325,7 @@ def _known_unknown(
 
 def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[str, list[Any]]:
     """Return the bins of the reliability diagram, all runs together."""
-    confidence, correct = zip(*(_judged(each, truth) for each in predictions), strict=True)
+    confidence, correct = zip(*(judged_confidences(each, truth) for each in predictions), strict=True)
     bins = scores.reliability(np.concatenate(confidence), np.concatenate(correct))
     return {name: [None if np.isnan(value) else value for value in values.tolist()] for name, values in bins.items()}
 

@@ -1,7 +1,6 @@
 """The random forest against NumPy and scikit-learn, and PointNet against a NumPy reference."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import thor2_jax as thor2
 from thor2_jax.networks import model_arrays
 from training.baselines import cloud_baselines as module
 from training.baselines.baseline import BaselineInputs, Predictor
-from training.baselines.cloud_baselines import POINTS, PointNet, forest_features, load_forest, load_pointnet
+from training.baselines.cloud_baselines import POINTS, PointNet, forest_features, load_pointnet
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -50,23 +49,17 @@ def test_features_match_numpy() -> None:
             assert expected[32 + k] == pytest.approx(deep, abs=1e-6)
 
 
-@pytest.mark.parametrize("depth", [None, 1])
-def test_predictions_match_scikit_learn(depth: int | None) -> None:
+@pytest.mark.parametrize(("depth", "scale"), [(None, 1), (1, 1), (None, 0)])
+def test_predictions_match_scikit_learn(depth: int | None, scale: int) -> None:
+    """The trees have many leaves, two leaves, or, for equal features, a single one."""
     rng = np.random.default_rng(0)
-    x = rng.random((300, 5)).astype(np.float32)
-    y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
+    x = scale * rng.random((300, 5)).astype(np.float32)
+    y = rng.integers(0, 4, 300) if scale == 0 else (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
     grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
     features = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
     np.testing.assert_allclose(
         module.predict_forest(module.tree_arrays(grown), features), grown.predict_proba(features), atol=1e-6
     )
-
-
-def test_trees_of_a_single_leaf() -> None:
-    grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
-    run: Any = SimpleNamespace(network=NETWORK, config=CONFIG)
-    probabilities = load_forest(module.tree_arrays(grown), run)(BaselineInputs(normal((60, 0)), None, None))
-    np.testing.assert_allclose(probabilities, grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
 
 
 ARRAYS = model_arrays(PointNet(5, rngs=nnx.Rngs(3)))

@@ -14,10 +14,10 @@ from refusals import assert_refused
 from safetensors.numpy import load_file, save_file
 from slow_tier import slow
 from small_clouds import random_clouds
-from small_runs import untrained_run
+from small_runs import save_trained_run
 
 import thor2_jax as thor2
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from training.baselines import architectures
 from training.baselines import baseline as module
 from training.baselines.architectures import (
@@ -65,12 +65,7 @@ SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 
 def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
-    record = {
-        "dataset": dict(SOURCE.record), "epochs": epochs, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
-        "folds": folds, "fold": 0, "temperatures": {},
-    }  # fmt: skip
-    save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
-    return folder
+    return save_trained_run(folder, SOURCE, CONFIG, epochs=epochs, folds=folds, fold=0)
 
 
 @pytest.fixture(scope="module", autouse=True)

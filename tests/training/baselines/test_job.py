@@ -9,12 +9,12 @@ import pytest
 from commands import Command
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import untrained_run
+from small_runs import save_trained_run
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from thor2_jax.types import Cloud
 from training.baselines import cloud_baselines, job
 from training.baselines.baseline import (
@@ -54,12 +54,7 @@ SOURCE = Views(clouds(), CONFIG)
 
 
 def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
-    record = {
-        "dataset": dict(SOURCE.record), "epochs": 4, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
-        "folds": folds, "fold": fold, "temperatures": {"tops": 1.5},
-    }  # fmt: skip
-    save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
-    return folder
+    return save_trained_run(folder, SOURCE, CONFIG, {"tops": 1.5}, epochs=4, folds=folds, fold=fold)
 
 
 @pytest.fixture(scope="module")

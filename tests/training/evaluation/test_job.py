@@ -14,19 +14,15 @@ from commands import json_lines
 from image_files import small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
-from small_runs import SMALL_CONFIG, untrained_embedding_run
 from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
 from written_files import ParsedPage, files_of
 
 import thor2_jax as thor2
 from thor2_jax.files import temporary_directory
 from thor2_jax.frames.overlay import Annotation
-from thor2_jax.model.fusion import Calibration
-from thor2_jax.model.run_directory import save_run
-from thor2_jax.recognizer import Recognizer
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
-from training.evaluation.runs import Run, load_runs
+from training.evaluation.runs import Run
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import LOCK, locked
@@ -128,37 +124,6 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     assert without_times(evaluate_toys(tmp_path / "stopped", 9)) == without_times(whole)
     assert len((tmp_path / "stopped" / "log").read_text().split()) == 9
     assert {p.name for p in report.rglob(".*")} == {LOCK, ".answers.x.jsonl"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> None:
-    record: dict[str, object] = {"calibration": vars(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))} if calibrated else {}
-    config = dataclasses.replace(SMALL_CONFIG, looks=2)
-    save_run(untrained_embedding_run(CLASSES, config=config, record=record), tmp_path / "run")
-    (run,) = load_runs([tmp_path / "run"])
-    assert run.predictors == ("embedding",) and run.answer_by == "classifiers"
-    dataset = ToyDataset(5)
-    report = evaluate_dataset([run], dataset, DESCRIPTION, tmp_path / "report")
-    assert report["main"] == "embedding" and report["fusions"] == ["embedding"]
-    assert report["temperatures"]["embedding"]["runs"] == 0
-    confusion, confidences = np.zeros((3, 4), int), []
-    recognizer = Recognizer.load(tmp_path / "run", unknown_below=0.0)
-    for item in dataset:
-        answered = {answer.label: answer for answer in recognizer.recognize(item.frame)}
-        for label in (1, 2):
-            answer = answered.get(label)  # every fourth frame has no label 2
-            column = 3 if answer is None else CLASSES.index(answer.top["embedding"][0][0])
-            confusion[CLASSES.index(item.truth[label]), column] += 1
-            confidences += [] if answer is None else [answer.confidence]
-    assert report["confusion"] == confusion.tolist()
-    bins = report["reliability"]
-    assert sum(bins["answers"]) == len(confidences) == 8
-    sums = [count * mean for count, mean in zip(bins["answers"], bins["confidence"], strict=True) if count]
-    assert sum(sums) == pytest.approx(sum(filter(None, confidences)), abs=1e-3)
-    page = ParsedPage((tmp_path / "report" / "report.html").read_text())
-    assert "Fusion rules" not in page.text and "column embedding" in " ".join(page.text)
-    assert "Confidence" in page.text and "reliability.png" in {p["src"] for p in page.pictures}
 
 
 @pytest.mark.usefixtures("drawn_pictures")

@@ -11,7 +11,7 @@ from toy_recognizers import ToyRun
 
 from training.evaluation import published
 from training.evaluation.page import comparison_table, comparison_title, marked
-from training.evaluation.published import compare_with_published, published_attributes, published_tables
+from training.evaluation.published import compare_with_published, published_tables
 from training.readers.uwis import NOT_SCORED
 
 OWN: tuple[Any, Any] = [ToyRun("run", own_objects=True)] * 2, 10
@@ -38,13 +38,6 @@ def test_published_figures_are_complete() -> None:
     assert len(figures) == 5 * (75 + 17) + 7 * 7 + 5 * 6 + 4 * 7
     assert all(0 <= mean <= 100 and std is not None and 0 <= std < 10 for mean, std in figures)
     assert all(seconds > 0 for seconds in published.published_seconds().values())
-
-
-def test_attributes_have_the_names_of_the_paper() -> None:
-    assert published_attributes("uwis", {"light": "2", "occlusion": "low"}) == {"light": "dim", "occlusion": "low"}
-    assert published_attributes("frames", {"light": "2"}) == {"light": "2"}
-    sequence = {"camera": "lower", "sequence": "table/bottom/curved/seq05"}
-    assert published_attributes("ocid", sequence) == {"camera": "lower", "sequence": "S-05"}
 
 
 def test_measured_values_stand_beside_the_published_ones() -> None:

@@ -3,10 +3,18 @@
 import numpy as np
 import pytest
 from sklearn.metrics import confusion_matrix
-from toy_recognizers import ToyRun, UntaughtRecognizer
+from toy_recognizers import ToyRun, UntaughtRecognizer, toy_answer
 
 from thor2_jax.networks import FEATURES
-from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
+from training.evaluation.answers import (
+    ALL_CLASSIFIERS,
+    EMBEDDED,
+    FrameAnswers,
+    InstancePrediction,
+    fuse_by,
+    fusions,
+    main_fusion,
+)
 from training.evaluation.page import _accuracy_text, answer_texts
 from training.evaluation.results import compute_results, named_answers
 from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
@@ -60,11 +68,17 @@ def test_main_fusion_is_that_of_what_answers() -> None:
         assert fusions(features)[main_fusion(fusions(features))] == chosen
 
 
-@pytest.mark.parametrize(("feature", "names"), [("tops", "the names from TOPS"), ("ce", "these names")])
-def test_the_page_says_which_column_gives_the_names(feature: str, names: str) -> None:
-    titles = list(fusions([feature, "embedding", "classifiers"]))
-    text = _accuracy_text({"fusions": titles, "rule": "log-mean", "scratch": [], "runs": ["run"]})
-    assert f"column classifiers shows {names} with" in text and "THOR2" not in text
+@pytest.mark.parametrize(
+    ("columns", "shown"),
+    [
+        ((EMBEDDED,), "column embedding shows the answers"),
+        (("tops", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows the names from TOPS with"),
+        (("ce", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows these names with"),
+    ],
+)
+def test_the_page_says_which_column_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
+    text = _accuracy_text({"fusions": list(fusions(columns)), "rule": "log-mean", "scratch": [], "runs": ["run"]})
+    assert shown in text and "THOR2" not in text
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
@@ -160,22 +174,14 @@ def test_named_answers_are_those_of_the_main_fusion_and_the_threshold() -> None:
     assert named == [(0, 1, None, 1.0), (1, 1, "bowl", 1.0)]
 
 
-def sure_of(name: str, confidence: float) -> np.ndarray:
-    """Return probabilities of TOPS and TOPS2 that give a class this confidence and share the rest."""
-    row = np.full(3, (1 - confidence) / 2)
-    row[CLASSES.index(name)] = confidence
-    return np.stack([row, row]).astype(np.float32)
-
-
 def test_rejection_and_placements_match_hand_calculation() -> None:
     """A mug in four frames, correct in two; a can in one; three dragons. The thresholds reject the less sure."""
     answers = [("mug", 0.9), ("mug", 0.7), ("can", 0.8), ("bowl", 0.6)]
     dragons: list[tuple[str, float]] = [("mug", 0.8), ("can", 0.65), ("can", 0.5)]
-    mugs = [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0)) for answer in answers]
-    frames = [FrameAnswers("f", {}, 1.0, [mug]) for mug in mugs]
-    frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
-    frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
-    frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
+    given = [("f", "mug", *answer) for answer in answers] + [("g", "can", "can", 0.95)]
+    given += [("h", "dragon", *answer) for answer in dragons]
+    frames = [FrameAnswers(frame, {}, 1.0, [toy_answer(*answer, n_predictors=2)]) for frame, *answer in given]
+    frames.append(FrameAnswers("i", {}, 1.0, [toy_answer("can", None)]))
     run = RUNS[0]._replace(thresholds=np.array([0.61, 0.75, 0.75]))
     report = compute_results("frames", [run], frames)
     placements = report["placements"]
