@@ -159,6 +159,13 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
     assert frame.labels is None and frame.intrinsics == CAMERA
 
 
+@pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
+def test_missing_files(files: dict[str, Path], name: str) -> None:
+    files[name].unlink()
+    with pytest.raises(FileNotFoundError, match=str(files[name])):
+        read_frame(**files)
+
+
 @pytest.mark.parametrize("name", ["color", "depth", "labels"])
 def test_damaged_images_and_other_formats(files: dict[str, Path], name: str) -> None:
     """Some formats that Pillow opens run other programs; only documented formats are read."""

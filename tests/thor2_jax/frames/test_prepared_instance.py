@@ -275,8 +275,9 @@ def test_around_at_the_image_border() -> None:
 
 def test_nothing_is_seen_beside_narrow_parts() -> None:
     """A part of the mask as wide as a pixel, and what is two pixels beside it, is not around the instance."""
-    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 70, 71))
+    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 71, 72))  # a ray meets column 71
     around = prepare_instance(frame_of(flat(1000), labels), 1, 2.5).around
     row, column = np.rint(around[..., 1] * CAMERA.fy + CAMERA.cy), np.rint(around[..., 0] * CAMERA.fx + CAMERA.cx)
-    near = labels[row.astype(int), column.astype(int)] == 1
+    beside = ndimage.binary_dilation(labels == 1, np.outer([1, 0, 1, 0, 1], [1, 0, 1, 0, 1]))
+    near = beside[row.astype(int), column.astype(int)]
     assert near.any() and not around[near, 2].any()
