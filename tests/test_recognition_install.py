@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from image_files import small_frame, write_frame_files
+from processes import finish_programs, start_program
 from refusals import assert_refused
 from rendered_objects import write_box
 from small_clouds import random_clouds
@@ -75,8 +76,7 @@ def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
 def test_training_on_given_views_needs_no_ray_caster() -> None:
     """Neither embreex nor gudhi has wheels for ARM on Linux."""
     program = "import sys; sys.modules |= dict.fromkeys(('embreex', 'gudhi')); import training.train_job"
-    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
+    finish_programs(start_program(program))
 
 
 def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """All writers on a disk that becomes full at any step: no file is partial or lost."""
 
 import builtins
-import dataclasses
 import errno
 import functools
 import io
@@ -24,9 +23,7 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fitting.loop import EpochMetrics
 from training.storage.jobs import MANIFEST
-from training.train_run import append_metrics, read_metrics
 from training.views.dataset import Manifest
 
 
@@ -133,31 +130,15 @@ def test_a_run_directory_is_written_atomically(tmp_path: Path, disk: Disk) -> No
 
 
 def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Disk) -> None:
-    path, job = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
-    answers = [FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, []) for k in range(3)]
-    AnswerFile(path, job).append(answers[0])
-    kept = 1
-    for step in range(1, 4):
-        file = AnswerFile(path, job)
-        assert [answer.frame for answer in file.frames] == [answer.frame for answer in answers[:kept]]
-        disk.fail_from(step)
-        try:
-            file.append(answers[kept])
-        except OSError as error:
-            assert error.filename == str(path)
-        else:
-            kept += 1
-        disk.fail_from(0)
-    assert kept == 2
-    AnswerFile(path, job).append(answers[kept])
-    assert len(AnswerFile(path, job).frames) == 3
-
-
-def test_metrics_on_a_full_disk(tmp_path: Path, disk: Disk) -> None:
-    """An epoch that is cut off is discarded when the training resumes."""
-    metrics = EpochMetrics(*[0.5] * len(dataclasses.fields(EpochMetrics)))
+    """Opening fails first, then the line is cut off, which is discarded."""
+    path, job, answers = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}, FrameAnswers("a", {}, 0.5, [])
+    AnswerFile(path, job).append(answers)
     for step in (1, 2):
+        file = AnswerFile(path, job)
         disk.fail_from(step)
-        with pytest.raises(OSError, match="metrics.jsonl"):
-            append_metrics(tmp_path / "metrics.jsonl", 0, "ce", metrics)
-    assert read_metrics(tmp_path / "metrics.jsonl") == []
+        with pytest.raises(OSError, match=str(path)):
+            file.append(answers)
+        disk.fail_from(0)
+        assert len(AnswerFile(path, job).frames) == 1
+    AnswerFile(path, job).append(answers)
+    assert len(AnswerFile(path, job).frames) == 2

@@ -165,14 +165,6 @@ def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attem
     assert_refused(pixels, attempt, lambda: read_color(path), ())
 
 
-@pytest.mark.parametrize("kind", ["BMP", "GIF", "PPM", "EPS"])
-def test_other_kinds_of_images_are_refused(kind: str, tmp_path: Path) -> None:
-    """Some formats that Pillow opens run other programs; only documented formats are read."""
-    path = tmp_path / "color.png"
-    path.write_bytes(encode_image(COLOR, kind))
-    assert_refused("color.png", read_color, path)
-
-
 def test_bad_readers_are_failures(attempt: Any, reader_process: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
         raise OSError("two\nlines")

@@ -40,14 +40,11 @@ class Pipeline:
     def draw(self, data: st.DataObject, clouds: Any) -> thor2.PointClouds:
         return data.draw(batches(clouds, self.capacity))
 
-    def _call(
-        self, function: Any, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None
-    ) -> thor2.Descriptors:
-        call = _compiled(function, self.config, self.mode)
-        return call(clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
+    def describe(self, clouds: thor2.PointClouds, parameters: Any = None, function: Any = thor2.describe) -> Any:
+        parameters = parameters or thor2.Parameters.of(NETWORK, self.config)
+        return _compiled(function, self.config, self.mode)(clouds, parameters)
 
-    describe = functools.partialmethod(_call, thor2.describe)
-    describe_aligned = functools.partialmethod(_call, thor2.describe_aligned)
+    describe_aligned = functools.partialmethod(describe, function=thor2.describe_aligned)
 
 
 @functools.cache

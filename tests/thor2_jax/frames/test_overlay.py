@@ -159,16 +159,12 @@ def test_tiny_pictures_have_outlines_without_labels(tmp_path: Path, boxes: list,
     assert (drawn(photo(1, 1), np.ones((1, 1), int), [named(1)], tmp_path / "b.png") == COLORS[0]).all()
 
 
-@pytest.mark.parametrize("label", [0, 4, -1, 300])
-def test_an_answer_without_an_instance(tmp_path: Path, label: int) -> None:
-    arguments = photo(), discs([(100, 100)], 20), [named(1), named(label)], tmp_path / "a.png"
-    assert_refused(f"answers: label {label} ", draw_overlay, *arguments)
+def test_answers_and_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    labels, path = discs([(100, 100)], 20), tmp_path / "a.png"
+    for label in (0, 4, -1, 300):
+        assert_refused(f"answers: label {label} ", draw_overlay, photo(), labels, [named(1), named(label)], path)
+    assert_refused(r"labels has shape \(5, 4\)", draw_overlay, photo(4, 5), np.zeros((5, 4), int), [], path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_images_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    images = photo(4, 5), np.zeros((5, 4), int)
-    assert_refused(r"labels has shape \(5, 4\)", draw_overlay, *images, [], tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(

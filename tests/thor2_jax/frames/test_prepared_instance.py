@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.frames.outliers import voxel_downsample
 from thor2_jax.frames.prepared_instance import (
@@ -53,8 +53,8 @@ def only(frame: RGBDFrame) -> PreparedInstance:
 
 def test_intrinsics_with_which_points_are_too_far_apart() -> None:
     frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
-    with pytest.raises(InputError, match="^intrinsics place the points of an instance too far apart"):
-        only(dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0)))
+    absurd = dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0))
+    assert_refused("^intrinsics place the points of an instance too far apart", instance_clouds, absurd)
 
 
 def test_points_are_voxel_means_of_backprojected_pixels() -> None:
@@ -275,12 +275,9 @@ def test_around_at_the_image_border() -> None:
 
 def test_nothing_is_seen_beside_narrow_parts() -> None:
     """A part of the mask as wide as a pixel, and what is two pixels beside it, is not around the instance."""
-    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 70, 71))
-    frame = frame_of(flat(1000), labels)
-    around = prepare_instance(frame, 1, 2.5).around
-    x, y = (
-        np.rint(around[..., k] * f + c).astype(int)
-        for k, f, c in ((0, CAMERA.fx, CAMERA.cx), (1, CAMERA.fy, CAMERA.cy))
-    )
-    near = ndimage.binary_dilation(labels == 1, [[1]])[y, x]
+    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 71, 72))  # a ray meets column 71
+    around = prepare_instance(frame_of(flat(1000), labels), 1, 2.5).around
+    row, column = np.rint(around[..., 1] * CAMERA.fy + CAMERA.cy), np.rint(around[..., 0] * CAMERA.fx + CAMERA.cx)
+    beside = ndimage.binary_dilation(labels == 1, np.outer([1, 0, 1, 0, 1], [1, 0, 1, 0, 1]))
+    near = beside[row.astype(int), column.astype(int)]
     assert near.any() and not around[near, 2].any()
