@@ -105,7 +105,7 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         )
     else:
         lost = "lead"
-        answer = f"{name} is {check.margin:.2f} more similar (in cosine) than any other enrolled object."
+        answer = _similarity_text(name, check.margin)
     answer += " The attributions below explain this number."
     if explanation.runner_up is not None:
         answer += f" The best other name is {explanation.runner_up}."
@@ -124,6 +124,12 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         Section("Slice by slice", _SLICES, pictures=pictures.get("slices", ())),
         Section("Its colours", pictures=pictures["network"]),
     ]
+
+
+def _similarity_text(name: str, lead: float) -> str:
+    """Return the lead of a name; it is negative if surfaces decided against the most similar object."""
+    relation = "less" if lead < 0 else "more"
+    return f"{name} is {abs(lead):.2f} {relation} similar (in cosine) than the most similar other enrolled object."
 
 
 def _advice(explanation: Explanation) -> str:
