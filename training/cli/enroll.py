@@ -70,17 +70,16 @@ def enroll(
     if target.extend and target.replace:
         raise InputError("extend and replace are both given; choose one")
     options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
-    mesh_scale = target.mesh_scale
-    scale = None if mesh_scale == 1 else f"{mesh_scale:g}"
+    scale = options.given_scale(target.mesh_scale)
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-    with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
+    with _rendered(meshes, target.mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
-            load_mesh(file, mesh_scale)
+            load_mesh(file, target.mesh_scale)
         # This import takes seconds, so the meshes are checked first.
         from training.enrollment import enroll_objects
 

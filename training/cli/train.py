@@ -168,7 +168,7 @@ def train(
         raise InputError("paper and quick are given; expected one of them")
     if (given.meshes is None) == (given.dataset is None) and (given.meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    scale = None if given.mesh_scale == 1 else f"{given.mesh_scale:g}"
+    scale = options.given_scale(given.mesh_scale)
     steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
     options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)
     if coordinator is None and (processes, process) != (1, 0):

@@ -101,7 +101,7 @@ def test_no_change_is_claimed_for_a_name_that_other_evidence_decided() -> None:
         assert explanation_page._changes_text(explanation).startswith(text)  # type: ignore[arg-type]
 
 
-def test_a_name_that_surfaces_decided_may_be_less_similar_than_another() -> None:
+def test_a_name_that_surfaces_decided_may_be_less_similar() -> None:
     for lead, similarity in ((0.25, "0.25 more similar"), (-0.25, "0.25 less similar")):
         assert f"mug is {similarity} " in explanation_page._similarity_text("mug", lead)
 
