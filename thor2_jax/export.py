@@ -9,7 +9,6 @@ The file runs with jax alone:
 >>> result["tops"], result["tops2"], result["overflow"]                                # doctest: +SKIP
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -58,7 +57,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, buckets))}")
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {tuple(platforms)!r}; expected some of {', '.join(PLATFORMS)}")
-    model = Model.of_run(dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form")))
+    model = Model.of_run(run.without_callback())
 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
         inference = infer_clouds(model, PointClouds(*fields), tuple(model.classifiers))

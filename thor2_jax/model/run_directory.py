@@ -87,6 +87,10 @@ class TrainedRun:
             return None
         return self.embedding.class_probabilities
 
+    def without_callback(self) -> "TrainedRun":
+        """Return this run with diagrams in closed form: the same pairs as gudhi's, without a host callback."""
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, homology="closed_form"))
+
 
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run directory. It appears under its name only when it is complete.

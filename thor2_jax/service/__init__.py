@@ -5,6 +5,5 @@
 Modules in the order of a request: `server` (connections), `app` (routes), `pipeline` (admission and stages), `decoding`
 (size limits, multipart forms, images and clouds), `preparation` (worker processes that decode images and compute
 instance clouds), `engine` (batches across requests, and the compiled model), `answers` (JSON records, whose fields are
-in `schemas`). `page/` is the web page served at /. The live view (`thor2 watch`) and worker pools also use
-`hosts` and `signals`.
+in `schemas`). `page/` is the web page served at /. The live view (`thor2 watch`) also uses `hosts`.
 """

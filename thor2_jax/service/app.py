@@ -34,7 +34,7 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.signals import ended_by_signals
+from thor2_jax.signals import ended_by_signals
 
 __all__ = ["create_app"]
 
@@ -190,7 +190,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def model() -> schemas.ModelAnswer:
         """Return the classes and the configuration of the model."""
         service.engine.refresh()
-        current, run = service.engine.model, service.engine.run
+        current, run = service.engine.model, service.engine.model.run
         return schemas.ModelAnswer(
             classes=list(current.names),
             knows=current.gallery.summary,
@@ -205,7 +205,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     @routes.get("/v1/colornet")
     async def colornet() -> schemas.ColorNetworkAnswer:
         """Return the colour network of the descriptors."""
-        network = service.engine.run.network
+        network = service.engine.model.run.network
         names = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
         arrays = {name: getattr(network, name).tolist() for name in names}
         return schemas.ColorNetworkAnswer(fingerprint=network.fingerprint, **arrays)

@@ -114,7 +114,6 @@ class InferenceEngine:
     """A trained run on the device. Not thread-safe, except for `recognize`.
 
     Attributes:
-        run: the run, whose descriptors are computed without a host callback.
         objects: the enrolled objects. Change a copy of them in another thread, and call `refresh` in this one.
         max_batch: largest number of clouds in a batch.
     """
@@ -135,7 +134,7 @@ class InferenceEngine:
         if settings.gallery is not None and not settings.teach:
             check_exists(directory)
         self._recognizer = recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
-        self.objects, run = recognizer.objects, recognizer.run
+        self.objects = recognizer.objects
         if settings.teach:
             try:
                 check_writable(directory)
@@ -143,9 +142,7 @@ class InferenceEngine:
                 raise InputError(
                     f"gallery: {directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
                 ) from None
-        # The closed form computes the same pairs as gudhi without a host callback.
-        self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
-        model = dataclasses.replace(recognizer.model, run=self.run)
+        model = dataclasses.replace(recognizer.model, run=recognizer.run.without_callback())
         if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")
         recognizer.model = model
@@ -161,7 +158,7 @@ class InferenceEngine:
 
     @property
     def model(self) -> Model:
-        """The current model."""
+        """The current model, whose descriptors are computed without a host callback."""
         return self._recognizer.model
 
     @property
@@ -217,7 +214,7 @@ class InferenceEngine:
         """
         n_points = batch_points(len(instance.points) for instance in instances)
         clouds = pack_instances(instances, *(shape or (_padded_batch(len(instances)), n_points)))
-        network, config = self.run.network, self.run.config
+        network, config = self.model.run.network, self.model.run.config
         aligned = aligned_looks(clouds, config, config.looks)
         cloud_strips = strips(aligned, network, config)
         oriented = describe_aligned_looks(aligned, cloud_strips, network, config, config.looks)

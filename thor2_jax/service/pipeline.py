@@ -224,7 +224,7 @@ class Service:
         Raises:
             RequestError: as `preparation.prepare_frame`.
         """
-        arguments = files, self.engine.run.config, with_label_map, self.settings.segmenter
+        arguments = files, self.engine.model.run.config, with_label_map, self.settings.segmenter
         prepared = await self._prepare(request, prepare_frame, *arguments)
         corrected = self.engine.correct(prepared.instances, observe=True)
         results = await self._infer(corrected, request)
@@ -242,7 +242,7 @@ class Service:
             RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
                 this size are compiled.
         """
-        prepared = await self._prepare(request, prepare_view, fields, self.engine.run.config)
+        prepared = await self._prepare(request, prepare_view, fields, self.engine.model.run.config)
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
@@ -279,7 +279,7 @@ class Service:
             raise RequestError(422, "replace", "extend and replace are both true; choose one.")
         with self._gallery_errors(409, "name"):
             self.known_objects().gallery.name_to_enroll(name, **flags)
-        prepared = await self._prepare(request, prepare_view, fields, self.engine.run.config)
+        prepared = await self._prepare(request, prepare_view, fields, self.engine.model.run.config)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
         except InputError as error:

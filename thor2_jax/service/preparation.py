@@ -28,7 +28,7 @@ from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.signals import signals_blocked
+from thor2_jax.signals import signals_blocked
 
 __all__ = ["PreparationPool", "Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 

@@ -26,7 +26,7 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.hosts import listening, page_headers
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.signals import ended_by_signals, signals_blocked
+from thor2_jax.signals import ended_by_signals, signals_blocked
 
 __all__ = ["TimedConnection", "serve"]
 

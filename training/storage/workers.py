@@ -25,7 +25,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.service.signals import signals_blocked
+from thor2_jax.signals import signals_blocked
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
 

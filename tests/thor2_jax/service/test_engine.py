@@ -39,7 +39,7 @@ def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
 def check_answers(run: Path, frame: thor2.RGBDFrame) -> list[float | None]:
     """Compare the engine's answers with the recognizer's; return the calibrated confidences, which are the answers'."""
     engine, recognizer = InferenceEngine(Settings(run, max_batch=8)), thor2.Recognizer.load(run)
-    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
+    instances = [prepare_instance(frame, label, engine.model.run.config.sigma_s) for label in frame.instances]
     usable = [instance for instance in instances if instance.reason is None]
     results = engine.infer(usable)
     answers = engine.recognize(instances, results)
