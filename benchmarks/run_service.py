@@ -7,7 +7,6 @@ below 250 ms. Other options are passed to `thor2 serve`.
 
 import argparse
 import asyncio
-import io
 import itertools
 import json
 import os
@@ -23,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 import thor2_jax as thor2
 from benchmarks.clouds import make_frames, random_run
 from thor2_jax.client import multipart
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.service.decoding import decode_frame
 
@@ -39,15 +38,9 @@ Files = dict[str, bytes]
 
 def files_of(frame: thor2.RGBDFrame) -> Files:
     """Return a frame as the bytes of its files."""
-
-    def png(image: Any) -> bytes:
-        stream = io.BytesIO()
-        Image.fromarray(image).save(stream, "PNG")
-        return stream.getvalue()
-
     camera = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
     images = {"color": frame.color, "depth": frame.depth, "labels": frame.label_image.astype(np.uint8)}
-    return {name: png(image) for name, image in images.items()} | {"intrinsics": json.dumps(camera).encode()}
+    return {name: encode_image(image) for name, image in images.items()} | {"intrinsics": json.dumps(camera).encode()}
 
 
 def percentiles(milliseconds: list[float]) -> dict[str, float]:

@@ -11,16 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 import thor2_jax as thor2
-
-
-def encode_image(pixels: np.ndarray, kind: str = "PNG", **options: object) -> bytes:
-    """Return an image file's bytes."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, kind, **options)
-    return stream.getvalue()
+from thor2_jax.frames.frames import encode_image
 
 
 def encode_npy(array: np.ndarray, **options: Any) -> bytes:

@@ -30,10 +30,10 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import httpx
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.hosts import check_token
@@ -337,9 +337,7 @@ def _encode_labels(labels: NDArray[Any]) -> bytes:
         raise InputError(
             f"labels has shape {labels.shape} and type {labels.dtype}; expected integers [H, W] from 0 to 65535"
         )
-    stream = io.BytesIO()
-    Image.fromarray(labels.astype(np.uint16)).save(stream, "PNG")
-    return stream.getvalue()
+    return encode_image(labels.astype(np.uint16))
 
 
 def _recognitions(response: httpx.Response) -> tuple[list[Recognition], NDArray[np.int32] | None]:

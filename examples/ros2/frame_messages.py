@@ -3,15 +3,13 @@
 The functions only read attributes of messages, so they also accept messages of rosbags.
 """
 
-import io
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from thor2_jax.client import Client
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame, encode_image
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Detection, detections_of
 from thor2_jax.recordings.messages import color_image, depth_image, detection_array, stamp_of
@@ -40,8 +38,8 @@ def detect(client: Client, frame: RGBDFrame) -> list[Detection]:
     millimetres = np.clip(np.round(frame.depth_m * MILLIMETRES), 0, 2**16 - 1).astype(np.uint16)
     camera = frame.intrinsics
     recognitions, labels = client.recognize_frame(
-        color=_png(frame.color),
-        depth=_png(millimetres),
+        color=encode_image(frame.color, compress_level=1),
+        depth=encode_image(millimetres, compress_level=1),
         intrinsics={
             **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
             "depth_scale": MILLIMETRES,
@@ -62,9 +60,3 @@ def detection_fields(client: Client, color: Any, depth: Any, camera: Any) -> dic
     """Return the fields of the Detection2DArray for a pair of images; exceptions as `frame_of` and `detect`."""
     detections = detect(client, frame_of(color, depth, camera))
     return detection_array(detections, stamp=stamp_of(color), frame_id=color.header.frame_id)
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG", compress_level=1)
-    return stream.getvalue()

@@ -10,10 +10,10 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from image_files import encode_image
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.testing import damaged
 from training.objects.meshes import load_mesh
 

@@ -8,6 +8,7 @@ Image files are not trusted. They are PNG, JPEG or TIFF; depth may also be NPY o
 """
 
 import dataclasses
+import io
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +35,7 @@ __all__ = [
     "check_images",
     "check_size",
     "decode_image",
+    "encode_image",
     "frame_intrinsics",
     "pixel_points",
     "pixel_rays",
@@ -249,6 +251,13 @@ def decode_image(
     with Image.open(stream, formats=formats) as image:
         is_deep = image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
         return np.asarray(image), f"{image.mode};16" if is_deep else image.mode
+
+
+def encode_image(image: NDArray[Any] | Image.Image, kind: str = "PNG", **options: Any) -> bytes:
+    """Return the content of an image file with these pixels; the options are those of Pillow."""
+    stream = io.BytesIO()
+    Image.fromarray(np.asarray(image)).save(stream, kind, **options)
+    return stream.getvalue()
 
 
 def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:

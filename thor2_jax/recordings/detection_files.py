@@ -6,7 +6,6 @@ with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) a
 """
 
 import contextlib
-import io
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import check_output_file, errors_name, temporary_directory
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame, encode_image
 from thor2_jax.frames.overlay import annotate, answer_paints
 from thor2_jax.model.recognition import Detection
 from thor2_jax.recordings.messages import detection_array, ros_time
@@ -172,14 +171,11 @@ class DetectionBag(MessageBag):
         """Write the detections of a frame; arguments as `detection_array`, exceptions as `write_message`."""
         array = detection_array(detections, stamp=stamp, frame_id=frame_id)
         self.write_message(DETECTIONS_TOPIC, array, stamp)
-        picture = io.BytesIO()
-        annotate(frame.color, frame.label_image, [one.recognition for one in detections]).save(
-            picture, "JPEG", quality=_JPEG_QUALITY
-        )
+        picture = annotate(frame.color, frame.label_image, [one.recognition for one in detections])
         overlay = {
             "header": {"stamp": ros_time(stamp), "frame_id": frame_id},
             "format": "rgb8; jpeg compressed bgr8",
-            "data": np.frombuffer(picture.getvalue(), np.uint8),
+            "data": np.frombuffer(encode_image(picture, "JPEG", quality=_JPEG_QUALITY), np.uint8),
         }
         self.write_message(OVERLAY_TOPIC, overlay, stamp)
 

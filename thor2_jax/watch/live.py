@@ -13,7 +13,6 @@ recognition, `error`, and `objects`: the fields of the answer, box, position and
 
 import base64
 import contextlib
-import io
 import json
 import socket
 import threading
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, encode_image
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
@@ -157,9 +156,8 @@ def _annotation(answer: Recognition, number: int) -> Annotation:
 
 def _picture(frame: RGBDFrame, annotations: Sequence[Annotation]) -> str:
     """Return the frame with its annotations, JPEG in base64."""
-    stream = io.BytesIO()
-    draw_instances(frame.color, frame.label_image, annotations).save(stream, "JPEG", quality=_JPEG_QUALITY)
-    return base64.b64encode(stream.getvalue()).decode("ascii")
+    picture = draw_instances(frame.color, frame.label_image, annotations)
+    return base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode("ascii")
 
 
 _PAGE = Path(__file__).parent / "page"

@@ -4,15 +4,13 @@ python -m training.rendering.sample_recording table.mcap
 """
 
 import argparse
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.frames.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics, encode_image
 from thor2_jax.recordings.detection_files import COMPRESSED_IMAGE, MessageBag
 from thor2_jax.recordings.messages import ros_time
 from training.objects.builtin_objects import builtin_objects
@@ -59,9 +57,7 @@ def write_sample_recording(path: str | Path) -> None:
 
 
 def _encoded(pixels: np.ndarray, kind: str, **options: Any) -> np.ndarray:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, kind, **options)
-    return np.frombuffer(stream.getvalue(), np.uint8)
+    return np.frombuffer(encode_image(pixels, kind, **options), np.uint8)
 
 
 def _camera_info(camera: Intrinsics) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from image_files import deep_png, encode_image, write_frame_files
+from image_files import deep_png, write_frame_files
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from refusals import assert_refused
@@ -16,6 +16,7 @@ from thor2_jax.frames.frames import (
     MAX_INSTANCES,
     Intrinsics,
     RGBDFrame,
+    encode_image,
     read_color,
     read_depth,
     read_frame,

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from image_files import encode_image
 from recording_files import compressed, compressed_depth, image
 from refusals import assert_refused
 
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind
 
 RNG = np.random.default_rng(0)

@@ -18,7 +18,7 @@ import httpx
 import pytest
 import uvicorn
 from fastapi import FastAPI
-from image_files import encode_image, patches, tilted
+from image_files import patches, tilted
 from page_actions import upload
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from processes import HANG, wait_until
@@ -26,6 +26,7 @@ from segmentation_scenes import APART, render
 from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app

@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from image_files import encode_image
 from processes import HANG
 from refusals import assert_refused
 from service_requests import check_refused
@@ -19,6 +18,7 @@ from small_runs import assert_same_answers
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import parse_intrinsics
 from thor2_jax.segmentation.table import segment_table
 

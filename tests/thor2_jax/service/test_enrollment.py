@@ -16,7 +16,6 @@ import pytest
 import schemathesis
 from failures import full_disk
 from hypothesis import HealthCheck
-from image_files import encode_image
 from processes import HANG
 from refusals import assert_refused
 from schemathesis.checks import not_a_server_error
@@ -30,6 +29,7 @@ from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.gallery import store
 from thor2_jax.service import pipeline
 from thor2_jax.service.app import create_app

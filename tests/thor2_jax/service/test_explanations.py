@@ -12,7 +12,6 @@ from unittest.mock import Mock
 import httpx
 import numpy as np
 import pytest
-from image_files import encode_image
 from page_actions import answered, assert_fits, wait_until
 from PIL import Image
 from playwright.sync_api import Route, expect
@@ -26,6 +25,7 @@ from thor2_jax import capacity
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model

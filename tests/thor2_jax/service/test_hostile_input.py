@@ -14,10 +14,11 @@ import httpx
 import numpy as np
 import pytest
 from failures import Pickled
-from image_files import deep_png, encode_image, encode_npy, png_of_zeros
+from image_files import deep_png, encode_npy, png_of_zeros
 from processes import HANG
 from service_requests import check_refused
 
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.pipeline import Service
 

@@ -7,10 +7,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from image_files import encode_image
 from page_actions import FIELDS, RECORD_TEXTS, answered, changed_answers, pixels, upload, wait_for_answer, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
+
+from thor2_jax.frames.frames import encode_image
 
 from .conftest import CLASSES, SAMPLE_INDEX, Files, Open
 

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from image_files import encode_image
 from page_actions import RECORD_TEXTS, assert_fits, changed_answers, pixels, upload
 from playwright.sync_api import Page, expect
+
+from thor2_jax.frames.frames import encode_image
 
 from .conftest import Files, Open
 

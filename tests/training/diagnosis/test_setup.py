@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from commands import Command, Texts, json_lines
 from dataset_files import write_bop
-from image_files import encode_image
 from rendered_objects import write_box
 
 import thor2_jax
 from benchmarks.doctor import _interpolated, _zoomed
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, encode_image
 from thor2_jax.model.recognition import Recognition
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light

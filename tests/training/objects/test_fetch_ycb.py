@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run_thor2
-from image_files import encode_image
 from processes import free_port
 from refusals import assert_refused
 
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import encode_image
 from training.objects.fetch_ycb import fetch_ycb
 from training.objects.meshes import find_meshes
 
