@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS
-from thor2_jax.errors import InputError, reason_of, with_context
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
@@ -133,17 +133,14 @@ def track_frames(
 ) -> Iterator[FrameAnswer]:
     """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
 
-    A frame that cannot be read or has no labels has an `error` and does not stop the others. The recognitions are
-    `TrackedRecognition`s. All instances of a track have the name and confidence of the track after the last frame.
+    A frame that cannot be read, has no labels, or has another size than the first has an `error` and does not stop the
+    others. The recognitions are `TrackedRecognition`s. All instances of a track have the name and confidence of the
+    track after the last frame.
 
     Args:
         recognizer: the recognizer.
         sources: the frames, in the order in which they were taken.
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
-
-    Raises:
-        InputError: a frame has another size than the first frame, or a pose is not a rigid motion. The message names
-            the frame.
     """
     tracker = recognizer.track()
     answered: list[tuple[FrameAnswer, list[TrackedRecognition]]] = []
@@ -151,13 +148,11 @@ def track_frames(
     for number, source in enumerate(sources):
         try:
             frame = source.read()
-            _ = frame.instance_pixels  # raises InputError without labels
+            start = time.perf_counter()
+            recognitions = tracker.update(frame, None if poses is None else poses[number])
         except (InputError, OSError) as error:
             answered.append((FrameAnswer(source.name, error=reason_of(error)), []))
             continue
-        start = time.perf_counter()
-        with with_context(source.name):
-            recognitions = tracker.update(frame, None if poses is None else poses[number])
         answered.append((FrameAnswer(source.name, seconds=time.perf_counter() - start), recognitions))
         last.update({each.track: each for each in recognitions})
     for source, (answer, recognitions) in zip(sources, answered, strict=True):

@@ -96,7 +96,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     Path("empty").mkdir()
     os.mkfifo("pipe")
     files = " ".join(map(str, frame_options(write_frame_files(Path("frames/one"), small_frame()))))
-    write_frame_files(Path("frames/two"), frame_of_squares({1: (10, 10, 0)}, shape=(90, 100)))
+    write_frame_files(Path("frames/two"), small_frame(1))
     Path("frames/names.json").write_text("{}")
     save_run(untrained_run((), ()), Path("gallery-only"))
     Path("damaged.json").write_text("[")
@@ -122,7 +122,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),
         ("frames --out out --poses few.json", "--track"),
-        ("frames --out out --track", "two: frame has 100 x 90 pixels"),
         ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
         ("FILES --segment table --out out", "error: labels is "),
         ("FILES --out out --color absent.png", "absent.png"),
@@ -192,10 +191,11 @@ def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_p
 
 
 def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts) -> None:
-    """One is damaged, one lacks labels, and one is removed after it has been read for the tracks."""
+    """One is damaged, one lacks labels, one is removed after it has been read, and one has another size."""
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(5)]
     (frames[1] / "depth.png").write_bytes(b"damaged")
     (frames[2] / "mask.png").unlink()
+    write_frame_files(tmp_path / "video" / "5", frame_of_squares({1: (10, 10, 0)}, shape=(90, 100)))
 
     read = FrameFiles.read
 
@@ -209,6 +209,6 @@ def test_bad_frames_end_no_sequence(model: Path, tmp_path: Path, monkeypatch: py
     out, err = texts("recognize", "--model", model, tmp_path / "video", "--track", "--json", status=2)
     answers = json_lines(out)
     assert [[one["frames"] for one in answers[n]["instances"]] for n in (0, 4)] == [[3, 3]] * 2
-    for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file")):
+    for number, reason in ((1, "depth"), (2, "labels"), (3, "No such file"), (5, "100 x 90 pixels")):
         assert reason in answers[number]["error"] and "instances" not in answers[number]
-    assert "3 of 5 frames" in err
+    assert "4 of 6 frames" in err
