@@ -1,9 +1,15 @@
-"""The exception for invalid input, a prefix for its message, and messages for damaged files and missing packages."""
+"""Invalid input: the exception, a prefix for its message, conversions of arguments, damaged files, missing packages."""
 
 import contextlib
+import os
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
-__all__ = ["InputError", "decoding", "needs_extra", "reason_of", "with_context"]
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["InputError", "as_array", "as_path", "decoding", "needs_extra", "reason_of", "with_context"]
 
 MAX_MESSAGE = 1000
 """Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
@@ -20,6 +26,21 @@ class InputError(ValueError):
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
+
+
+def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
+    """Return `values` as an array; rows of different lengths raise InputError."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
+
+
+def as_path(path: object, name: str) -> Path:
+    """Return the path of a file as a Path; a value of another type raises InputError."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{name} is a {type(path).__name__}; expected a path")
+    return Path(path)
 
 
 def reason_of(error: BaseException) -> str:

@@ -20,8 +20,8 @@ from colornet import ColorNetwork
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_stream
-from thor2_jax.errors import InputError
-from thor2_jax.types import as_array, check_capacity, check_cloud
+from thor2_jax.errors import InputError, as_array
+from thor2_jax.types import check_capacity, check_cloud
 
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from colornet import ColorNetwork
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, as_array
 
 __all__ = [
     "HIGHEST",
@@ -32,7 +32,6 @@ __all__ = [
     "Parameters",
     "PointClouds",
     "Strips",
-    "as_array",
     "check_batch",
     "check_capacity",
     "check_cloud",
@@ -191,14 +190,6 @@ def check_types(**arguments: object) -> None:
         expected = _TYPES[name]
         if not isinstance(value, expected):
             raise InputError(f"{name} is a {type(value).__name__}; expected a {expected[0].__name__}")
-
-
-def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
-    """Return `values` as an array; rows of different lengths raise InputError."""
-    try:
-        return np.asarray(values)
-    except ValueError:
-        raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
 
 
 def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from thor2_jax.errors import InputError, decoding, needs_extra
+from thor2_jax.errors import InputError, as_array, as_path, decoding, needs_extra
 from thor2_jax.files import open_file, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, check_camera, read_intrinsics, undistort
 
@@ -88,8 +88,8 @@ class RGBDFrame:
     intrinsics: Intrinsics
 
     def __post_init__(self) -> None:
-        color, depth = np.asarray(self.color), np.asarray(self.depth)
-        labels = None if self.labels is None else np.asarray(self.labels)
+        color, depth = as_array(self.color, "color", "[H, W, 3]"), as_array(self.depth, "depth", "[H, W]")
+        labels = None if self.labels is None else as_array(self.labels, "labels", "[H, W]")
         check_images(color, depth=depth, labels=labels)
         if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
             raise InputError(
@@ -268,6 +268,7 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
             JPEG compression; the message names `argument` and the file.
         OSError: the file cannot be opened.
     """
+    path = as_path(path, argument)
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
     with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
         return decode_image(stream, lossless=lossless)
@@ -285,7 +286,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
             missing; the message names the file.
         OSError: the file cannot be opened.
     """
-    path = Path(path)
+    path = as_path(path, "depth")
     suffix = path.suffix.lower()
     if suffix == ".npy":
         with open_file(path) as stream, decoding(f"depth: {path} is a damaged NPY file", _EXPECTED):
@@ -377,7 +378,7 @@ def read_frame(
 
 def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read the intrinsics of the frame with this colour file; arguments and exceptions as `read_frame`."""
-    name = Path(color).stem
+    name = as_path(color, "color").stem
     intrinsics = read_intrinsics(path, int(name) if name.isdecimal() else None)
     return intrinsics if depth_scale is None else dataclasses.replace(intrinsics, depth_scale=depth_scale)
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, decoding, with_context
+from thor2_jax.errors import InputError, as_path, decoding, with_context
 from thor2_jax.files import parse_json, parse_yaml, read_file, read_npy
 
 __all__ = [
@@ -381,6 +381,6 @@ def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:
         InputError: as `parse_intrinsics`; the message names the file.
         OSError: the file cannot be opened.
     """
-    content = read_file(path)
+    content = read_file(as_path(path, "intrinsics"))
     with with_context(str(path)):
         return parse_intrinsics(content, image)

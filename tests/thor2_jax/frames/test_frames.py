@@ -82,6 +82,7 @@ BAD_FIELDS: dict[str, list[Any]] = {
         np.ones((5, 7), kind) for kind in (np.uint8, np.int16, np.int32, bool, np.complex64, object)
     ],
     r"labels has type \w+; expected integers$": [np.ones((5, 7), kind) for kind in (np.float32, bool, object)],
+    **{rf"{name} has rows of different lengths; .*\[H, W": [[[1], [1, 2]]] for name in ("color", "depth", "labels")},
     r"labels has the value -3": [np.where(np.eye(5, 7), -3, 0)],
 }
 """Error message, which begins with the name of the field -> values of the field."""
@@ -161,7 +162,9 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
-def test_missing_files(files: dict[str, Path], name: str) -> None:
+def test_missing_files_and_values_that_are_no_path(files: dict[str, Path], name: str) -> None:
+    for value in (10**6, [files[name]]):
+        assert_refused(f"^{name} is a (int|list); expected a path$", read_frame, **files | {name: value})
     files[name].unlink()
     with pytest.raises(FileNotFoundError, match=str(files[name])):
         read_frame(**files)
