@@ -17,7 +17,7 @@ from thor2_jax.figures import name_style, plain_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 
-__all__ = ["ExplanationPicture", "change_text", "main_pictures", "pictures"]
+__all__ = ["ExplanationPicture", "change_text", "loss_text", "main_pictures", "pictures"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,6 +155,11 @@ def _unit(explanation: Explanation) -> str:
     return "in log-odds" if explanation.scores.unit == "log-odds" else "in cosine similarity"
 
 
+def loss_text(explanation: Explanation, loss: float) -> str:
+    """Return a loss of the answer in words; a negative loss is a gain."""
+    return f"{'gains' if loss < -0.005 else 'loses'} {abs(loss):.2f} {_unit(explanation)}"
+
+
 def change_text(change: Change) -> str:
     """Return a change in words.
 
@@ -251,8 +256,7 @@ def _slice(explanation: Explanation, number: int) -> ExplanationPicture:
     upper.set_title(f"slice {number}: persistence image", fontsize=10)
     lower.set_title(f"slice {number}: colour matrix", fontsize=10)
     loss = float(explanation.left_out.slices[number])
-    caption = f"Slice {number}. Without it, the answer {'loses' if loss > 0 else 'gains'} {abs(loss):.2f}"
-    caption += f" ({_unit(explanation)})."
+    caption = f"Slice {number}. Without it, the answer {loss_text(explanation, loss)}."
     return ExplanationPicture(f"slice-{number}", "slices", f"Slice {number}", caption, figure)
 
 

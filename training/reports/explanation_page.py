@@ -8,7 +8,7 @@ from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import Explanation
-from thor2_jax.explanation.pictures import change_text, pictures
+from thor2_jax.explanation.pictures import change_text, loss_text, pictures
 from thor2_jax.figures import save_figure
 from thor2_jax.files import atomic_directory, has_json, remove_written, write_text
 from thor2_jax.frames.frames import RGBDFrame
@@ -98,20 +98,19 @@ def _lead(explanation: Explanation, name: str) -> str:
 def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]]) -> list[Section]:
     check, name = explanation.attributions, explanation.name
     if explanation.scores.unit == "log-odds":
-        lost = "log-odds"
         answer = (
             f"The classifiers' log-odds of {name} are {check.margin:.1f}. Log-odds compare a class with the others "
             "together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %."
         )
     else:
-        lost = "lead"
-        answer = _similarity_text(name, check.margin)
+        answer = _similarity_text(name, explanation.runner_up, check.margin)
     answer += " The attributions below explain this number."
     if explanation.runner_up is not None:
         answer += f" The best other name is {explanation.runner_up}."
     comparison = (
-        f"Without the tenth of the points with the highest attributions, the answer loses {check.most_attributed:.2f} "
-        f"of its {lost}; without a random tenth, {check.random:.2f} on average."
+        "Without the tenth of the points with the highest attributions, the answer "
+        f"{loss_text(explanation, check.most_attributed)}; without a random tenth, it "
+        f"{loss_text(explanation, check.random)} on average."
     )
     resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
     return [
@@ -126,10 +125,14 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     ]
 
 
-def _similarity_text(name: str, lead: float) -> str:
+def _similarity_text(name: str, other: str | None, lead: float) -> str:
     """Return the lead of a name; it is negative if surfaces decided against the most similar object."""
-    relation = "less" if lead < 0 else "more"
-    return f"{name} is {abs(lead):.2f} {relation} similar (in cosine) than the most similar other enrolled object."
+    if other is None:
+        return f"The similarity to {name} (cosine) is {lead:.2f}, and no other object is enrolled."
+    degree = "as similar (in cosine, to within 0.005) as"
+    if abs(lead) >= 0.005:
+        degree = f"{abs(lead):.2f} {'less' if lead < 0 else 'more'} similar (in cosine) than"
+    return f"{name} is {degree} the most similar other enrolled object."
 
 
 def _advice(explanation: Explanation) -> str:

@@ -101,9 +101,16 @@ def test_no_change_is_claimed_for_a_name_that_other_evidence_decided() -> None:
         assert explanation_page._changes_text(explanation).startswith(text)  # type: ignore[arg-type]
 
 
-def test_a_name_that_surfaces_decided_may_be_less_similar() -> None:
-    for lead, similarity in ((0.25, "0.25 more similar"), (-0.25, "0.25 less similar")):
-        assert f"mug is {similarity} " in explanation_page._similarity_text("mug", lead)
+def test_similarities_and_losses_in_words() -> None:
+    """A name that surfaces decided may be less similar, and a name may be the only one."""
+    for other, lead, words in (
+        *(("bowl", 0.25, "mug is 0.25 more similar "), ("bowl", -0.25, "mug is 0.25 less similar ")),
+        *(("bowl", -0.004, "mug is as similar "), (None, 0.004, "mug (cosine) is 0.00, and no other object")),
+    ):
+        assert words in explanation_page._similarity_text("mug", other, lead)
+    explanation: Any = SimpleNamespace(scores=SimpleNamespace(unit="log-odds"))
+    for loss, words in ((0.3, "loses 0.30"), (-0.01, "gains 0.01"), (-0.001, "loses 0.00")):
+        assert explanation_page.loss_text(explanation, loss) == f"{words} in log-odds"
 
 
 def test_options_of_recognition_hold_and_the_next_command_is_shown(

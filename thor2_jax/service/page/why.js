@@ -34,8 +34,9 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
   const found = changes.length
     ? `Smallest changes that give another name: ${changes.join("; ")}.`
     : "No small change of colour or side lengths gives another name.";
-  const fall = `Without the tenth of the points that speaks most for the name, it falls by ${worst.toFixed(2)}; without a random tenth, by ${random.toFixed(2)}.`;
-  return `${subject}${what}: ${margin.toFixed(1)}. ${fall} ${found}`;
+  const change = (loss) => `${loss < -0.005 ? "rises" : "falls"} by ${Math.abs(loss).toFixed(2)}`;
+  const fall = `Without the tenth of the points that speaks most for the name, it ${change(worst)}; without a random tenth, it ${change(random)}.`;
+  return `${subject}${what}: ${margin.toFixed(unit === "log-odds" ? 1 : 2)}. ${fall} ${found}`;
 }
 
 /** Return the response of /v1/why; while the service compiles explanations, show this and repeat the request. */
