@@ -251,7 +251,7 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
         for name in meshes:
             n_views = n_rendered + labelled_views.get(name, 0)
             if n_views < folds and name not in job.leave_out:
-                raise InputError(f"folds is {folds}; class {name!r} has {n_views} views; use at most that many folds")
+                raise InputError(f"folds is {folds}; expected at most {n_views}, the number of views of class {name!r}")
         n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
         _check_batch_size(job.protocol, n_clouds)
         source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))

@@ -81,8 +81,8 @@ class RealSenseCamera:
             except RuntimeError as error:
                 reason = reason_of(error).rstrip(".")
                 raise InputError(
-                    f"realsense: no frame for {self._timeout:g} s after {n_frames} frames ({reason}); the camera was "
-                    "unplugged or has stopped; check the cable"
+                    f"realsense: no frame for {self._timeout:g} s ({reason}; frames before: {n_frames}); the camera "
+                    "was unplugged or has stopped; check the cable"
                 ) from None
             n_frames += 1
             stamp = round(color.get_timestamp() * 1e6)

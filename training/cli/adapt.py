@@ -32,7 +32,7 @@ def adapt(
         adaptation = adapt_run(model, sources, out, of_stage(progress, "adapt"))
     console.print(f"warmth: {adaptation.transform.warmth:+.3f}")
     console.print(
-        f"{adaptation.instances} instances; mean uncertainty of their answers {adaptation.uncertainty_before:.3f} "
+        f"instances: {adaptation.instances}; mean uncertainty of their answers {adaptation.uncertainty_before:.3f} "
         f"before, {adaptation.uncertainty_after:.3f} after"
     )
     if adaptation.uncertainty_after >= adaptation.uncertainty_before:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from thor2_jax.printable import escape_characters, first_names
+from thor2_jax.printable import counted, escape_characters, first_names
 from training.cli import options
 from training.cli.app import app, console, finish, show_help, show_progress
 
@@ -155,14 +155,14 @@ def _print_report(report: Mapping[str, Any]) -> None:
         console.print(shown)
         console.print(page.comparison_text(table))
     console.print(
-        f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
+        f"instances scored: {counts['scored']}; {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"
     )
     if report["no_pixels"]:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
         console.print(f"labels without pixels in the label image: {first_names(missing, MAX_LISTED)}")
     console.print(
-        f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
+        f"{counted(speed['frames'], 'frame')}, {speed['frames_per_second']:.2f} a second with compilation; "
         f"median {speed['median_seconds']:.2f} s a frame"
     )
     for text in page.answer_texts(report):

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from thor2_jax.printable import counted
 from training.cli import options
 from training.cli.app import app, console, finish, show_help, show_progress
 
@@ -33,4 +34,4 @@ def ycb(
         meshes = fetch_ycb(options.split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
         console.print(name)
-    finish(f"{len(meshes)} meshes in {out}", "train on them", "train", meshes=out, out="run")
+    finish(f"{counted(len(meshes), 'mesh', 'meshes')} in {out}", "train on them", "train", meshes=out, out="run")

@@ -100,8 +100,8 @@ class _Answers:
         except InputError as error:
             if self._frames or not self.failures:
                 raise
-            place = f" and are in {self.written}" if self.written else ""
-            raise InputError(f"{error}; {len(self.failures)} frames were recognized before{place}") from None
+            place = f", written to {self.written}" if self.written else ""
+            raise InputError(f"{error}; frames recognized before: {len(self.failures)}{place}") from None
         self.tables.write(self._given.coco, self._given.bop)
 
     def _add(self, answer: "FrameAnswer") -> None:
@@ -218,7 +218,7 @@ def recognize(
         print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
     finish(result, "see why", "explain", *given.arguments, file=notes, segment=segment, **vars(arguments), out="why")
     if results.tables.n_without_number:
-        print_note(f"{results.tables.n_without_number} instances have a name that {outputs.names} does not number")
+        print_note(f"instances whose name has no number in {outputs.names}: {results.tables.n_without_number}")
     if failed:
         total, listed = len(failed) + len(failures), first_names(failed, MAX_LISTED)
         raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from thor2_jax.printable import counted
 from training.baselines.job import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, main_fusion
 from training.evaluation.frame_pictures import FramePictures
@@ -130,8 +131,8 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     ]
     dataset, runs = report["dataset"], len(report["runs"])
     lead = (
-        f"{report['speed']['frames']:,} frames, {report['instances']['scored']:,} instances of known objects, "
-        f"{runs} trained {'model' if runs == 1 else 'models'}. Dataset: {dataset['path']}"
+        f"{counted(report['speed']['frames'], 'frame')}, {counted(report['instances']['scored'], 'instance')} of known "
+        f"objects, {counted(runs, 'trained model')}. Dataset: {dataset['path']}"
     )
     write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
 

@@ -349,7 +349,7 @@ def fold_of_views(
         members = label == index
         views, number = np.unique(view[members], return_inverse=True)
         if len(views) < folds:
-            raise InputError(f"folds is {folds}; class {name!r} has {len(views)} views; use at most that many folds")
+            raise InputError(f"folds is {folds}; expected at most {len(views)}, the number of views of class {name!r}")
         fold[members] = (rng.permutation(len(views)) % folds)[number]
     return fold
 

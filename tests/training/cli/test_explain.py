@@ -129,7 +129,8 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
     gallery = tmp_path / "gallery"
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
-    assert " --instance 1 " in printed("explain", *given, frame, "--out", tmp_path / "out")
+    text = printed("explain", *given, frame, "--out", tmp_path / "out")
+    assert " --instance 1 " in text and "1 page in" in text
     assert seen == [(0.9, "classifiers", gallery)] * 2
 
 

@@ -67,7 +67,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     outputs = (*tables, "--out", tmp_path / "out")
     command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
     out, err = texts(*command)
-    assert "instances have a name" not in err
+    assert "instances whose name" not in err
     assert f"written to {tmp_path / 'out'}, {tables[1]}, {tables[3]}; see why" in out
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
     with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
@@ -79,7 +79,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     expected = [{"mug": 14, "bowl": 21, "plate": 5}[name] for name in names]
     assert [entry["category_id"] for entry in coco] == [int(line.split(",")[2]) for line in lines] == expected
     (tmp_path / "names.json").write_text(json.dumps({"14": "another"}))
-    assert f"{len(names)} instances have a name" in texts(*command)[1]
+    assert f"has no number in {tmp_path / 'names.json'}: {len(names)}" in texts(*command)[1]
 
 
 def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
         ("frames --out out --track --poses damaged.json", "damaged.json is invalid"),
-        ("frames --out out --track --poses few.json", "1 poses for 2 frames"),
+        ("frames --out out --track --poses few.json", "few.json is 1; expected 2"),
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),
         ("frames --out out --poses few.json", "--track"),

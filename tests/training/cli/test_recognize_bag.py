@@ -97,7 +97,7 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, texts
     out, err = texts("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", status=2)
     n_frames = len(json_lines(out))
     assert 0 < n_frames < 8 and "mcap recover" in err and err.count("\n") == 1
-    assert f"{n_frames} frames were recognized before and are in {tmp_path / 'out.mcap'}" in err
+    assert f"frames recognized before: {n_frames}, written to {tmp_path / 'out.mcap'}" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == n_frames
 
 

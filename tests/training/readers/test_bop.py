@@ -91,7 +91,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     (tmp_path / "names.yaml").write_text("13: bowl\n14: mug\n")
     command = ("evaluate", "bop", tmp_path / "test", "--model", tmp_path / "run")
     options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")
-    assert "5 instances scored" in printed(*command, *options)
+    assert "instances scored: 5" in printed(*command, *options)
     first, by_scene = json.loads((tmp_path / "report" / "report.json").read_text())["accuracy"]["max"]
     assert first["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.6
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}

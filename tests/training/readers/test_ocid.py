@@ -140,7 +140,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
     command = ("evaluate", "ocid", tmp_path, "--model", tmp_path / "run", "--names", names)
     output = printed(*command, "--out", tmp_path / "report")
-    assert "4 instances scored" in output
+    assert "instances scored: 4" in output
     assert "Published table 3" in output and "Published table 1" not in output
     page = (tmp_path / "report" / "report.html").read_text()
     assert "Models: run." in page and "banana (unknown object)" in page

@@ -74,7 +74,7 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
     assert FrameFolder(tmp_path).note == ""
     (write_folder(tmp_path / "d", {}) / "labels.json").unlink()
     dataset = FrameFolder(tmp_path)
-    assert dataset.identifiers == ["a", "b"] and dataset.note == "1 frames without labels.json: d"
+    assert dataset.identifiers == ["a", "b"] and dataset.note == "1 frame without labels.json: d"
     items = list(dataset)
     assert [item.truth for item in items] == [{}, {1: "mug", 200: "bowl"}]
     for item, seed in zip(items, (2, 1), strict=True):
