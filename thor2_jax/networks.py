@@ -293,22 +293,33 @@ def projected_features(descriptors: Descriptors, statistics: jax.Array, version:
     return jnp.concatenate(parts, axis=1)
 
 
-def compiled(
-    function: Callable[..., jax.Array], models: Sequence[tuple[Any, Any]], *static: Any
-) -> Callable[[Any], jax.Array]:
-    """Return the compiled `function(modules, inputs, *static)` as a function of the inputs, a pytree of arrays.
+class compiled:
+    """The compiled `function(modules, inputs, *static)` as a function of the inputs, a pytree of arrays.
 
     Models of the same sizes share compiled programs. The weights are passed as a flat list and the graphs are no
-    arguments, since flattening and hashing them at every call would take 4 % of the time of a frame.
-
-    Args:
-        function: function of the modules, the inputs and `static`.
-        models: graph and state of each module, from `nnx.split`.
-        static: further arguments, hashable.
+    arguments, since flattening and hashing them at every call would take 4 % of the time of a frame. Another process
+    that receives the function compiles it again.
     """
-    graphs, states = zip(*models, strict=True)
-    leaves, structure = jax.tree.flatten(states)
-    return partial(_compiled(function, graphs, structure, static), leaves)
+
+    def __init__(self, function: Callable[..., jax.Array], models: Sequence[tuple[Any, Any]], *static: Any) -> None:
+        """Prepare the function.
+
+        Args:
+            function: function of the modules, the inputs and `static`.
+            models: graph and state of each module, from `nnx.split`.
+            static: further arguments, hashable.
+        """
+        self._arguments = function, models, *static
+        graphs, states = zip(*models, strict=True)
+        leaves, structure = jax.tree.flatten(states)
+        self._call = partial(_compiled(function, graphs, structure, static), leaves)
+
+    def __call__(self, inputs: Any) -> jax.Array:
+        """Return the result for the inputs."""
+        return self._call(inputs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return compiled, self._arguments
 
 
 @lru_cache(maxsize=32)

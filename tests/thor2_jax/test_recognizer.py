@@ -1,6 +1,7 @@
 """Recognition of frames by classifiers with random weights: everything except the accuracy is checked."""
 
 import dataclasses
+import pickle
 import re
 
 import jax
@@ -54,6 +55,12 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
         assert answer.name in CLASSES and answer.reason is None and not answer.occluded
         assert answer.points_used > 30 and answer.overflow >= 0
     assert recognizer.recognize(tilted(np.zeros((240, 320), np.uint8))) == []
+
+
+def test_a_recognizer_can_be_sent_to_another_process() -> None:
+    recognizer, frame = Recognizer(untrained_embedding_run(CLASSES), 0.1, "max"), tilted(patches())
+    expected = repr(recognizer.recognize(frame))
+    assert repr(pickle.loads(pickle.dumps(recognizer)).recognize(frame)) == expected
 
 
 @pytest.mark.parametrize("rule", [None, "max"])

@@ -26,7 +26,6 @@ from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.printable import counted
 
 __all__ = [
     "LOOKS",
@@ -234,10 +233,10 @@ class ObjectGallery:
         objects, references = self.gallery.objects.values(), self.gallery.references
         few = sum(len(views.clouds) < FEW for views in objects)
         if few:
-            return f"fewer than {FEW} views of {few} of {len(objects)} enrolled objects; add some from other sides"
+            return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
         has_surfaces = all(views.surface is not None for views in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
-            return f"{counted(len(objects), 'object')} in a run without reference views; enroll at least {FEW}"
+            return f"{len(objects)} objects are enrolled in a run without reference views; enroll more of them"
         return ""
 
     def refresh(self) -> bool:

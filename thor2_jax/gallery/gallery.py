@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
-from thor2_jax.printable import check_name, counted, find_name, first_names
+from thor2_jax.printable import check_name, find_name, first_names
 
 if TYPE_CHECKING:
     from thor2_jax.gallery.embedding import References
@@ -320,7 +320,7 @@ class Gallery:
         if toys:
             others = f", and {listed}" if own else "; none of yours"
             return f"{len(toys)} toy objects of the demo{others}"
-        return f"{counted(len(own), 'object')}: {listed}" if own else "no object yet"
+        return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
 
     def of_classifiers(self, probabilities: Values) -> Values:
         """Return class probabilities [B, C] in the order of `answered_names` [B, n]; 0 for names without an output."""
