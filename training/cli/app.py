@@ -11,6 +11,7 @@ import gc
 import itertools
 import os
 import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -118,8 +119,10 @@ app = typer.Typer(
 )
 # A closed stream is None, and its file descriptor would go to the next file that is opened.
 sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
-# Without a terminal, rich would truncate tables at 80 columns. Names of objects may look like markup.
-console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
+# Without a terminal, rich would truncate tables at 80 columns. On narrow ones, columns would vanish; lines are broken.
+# Names of objects may look like markup.
+WIDTH = max(shutil.get_terminal_size().columns, 72) if sys.stdout.isatty() else 160
+console = Console(width=WIDTH, markup=False, emoji=False)
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that only training imports; recognition and the service do not need them (docs/install.md)."""

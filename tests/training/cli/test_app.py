@@ -97,6 +97,12 @@ def test_version_and_help(printed: Command) -> None:
     assert "{" not in printed("train", "--help")  # values of the protocols are filled in
 
 
+def test_a_narrow_terminal_cuts_no_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    code = "import sys; sys.stdout.isatty = lambda: True; from training.cli.app import console; print(console.width)"
+    assert run_python("-c", code).stdout == "72\n"
+
+
 def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
     description = {"format": 2, "descriptor_version": thor2.DESCRIPTOR_VERSION, "classes": ["mug"]}
     (tmp_path / "run.json").write_text(json.dumps(description))
