@@ -10,6 +10,7 @@ import functools
 import gc
 import itertools
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -216,10 +217,17 @@ def main() -> None:
             raise
         _exit_with(str(error))
     except (InputError, OSError) as error:
-        _exit_with(reason_of(error))
+        _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
     raise SystemExit(status)
+
+
+def _with_options(message: str) -> str:
+    """Return a message with the given options in place of the arguments that they set: --max-gap, not max_gap."""
+    options = {argument.split("=")[0] for argument in sys.argv if argument.startswith("--")}
+    names = {option[2:].replace("-", "_"): option for option in options}
+    return re.sub(r"(^| and |: )(\w+)(?=:? )", lambda match: match[1] + names.get(match[2], match[2]), message)
 
 
 def _check_not_empty(arguments: list[str]) -> None:

@@ -106,7 +106,7 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: C
     assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG), ["forest"])
     assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run", "--baselines", "forest, tree")
-    assert refused(*command).startswith("error: baselines is forest, tree; ")
+    assert refused(*command).startswith("error: --baselines is forest, tree; ")
     assert not (tmp_path / "run").exists()
 
 

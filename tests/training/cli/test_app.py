@@ -65,8 +65,8 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
     out = ("--out", tmp_path / "out") if command in ("explain", "adapt") else ()
     for given, expected in (
         (("--bag", "absent.mcap"), "absent.mcap"),
-        (("--bag", "b", "--color", "c.png"), "color is c.png and bag is b"),
-        (("frames", "a b", "--bag", "b"), "frames is frames, a b and bag is b"),
+        (("--bag", "b", "--color", "c.png"), "color is c.png and --bag is b"),
+        (("frames", "a b", "--bag", "b"), "frames is frames, a b and --bag is b"),
         (("frames", "--every", 2), "every is 2; it belongs to --bag"),
         (("absent",), "absent"),
         (("--color", "c.png"), "--depth"),

@@ -262,7 +262,7 @@ def test_rendered_views_stay(meshes: Path, tmp_path: Path, refused: Command, mon
     out = tmp_path / "run"
     command = ("train", "--meshes", meshes, "--out", out, *STEPS)
     assert "folds is 99" in refused(*command, "--folds", 99, at_once=False)
-    assert "batch_size is 100000" in refused(*command, "--batch-size", 100_000, at_once=False)
+    assert "--batch-size is 100000" in refused(*command, "--batch-size", 100_000, at_once=False)
     assert not out.exists()  # no view was rendered
     with monkeypatch.context() as patch:
         patch.setattr(train_job, "train_run", mock.Mock(side_effect=InputError("stopped")))

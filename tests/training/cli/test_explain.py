@@ -143,8 +143,8 @@ def test_frames_without_instances_are_named(model: Path, tmp_path: Path, texts: 
 def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
     command = ("explain", "--model", model, frame, "--out", out)
-    assert "table: instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
-    assert "answer_by is gallery" in refused(*command, "--answer-by", "gallery")
+    assert "table: --instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
+    assert "--answer-by is gallery" in refused(*command, "--answer-by", "gallery")
     (frame / "mask.png").unlink()
     assert "error: table: labels is None" in refused(*command)
     out.mkdir()  # The error has not created it.

@@ -112,7 +112,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
         *((f"frames --coco {path}", f"coco: {path} is not a file") for path in no_files),
         *((f"frames --bop {path}", f"bop: {path} is not a file") for path in no_files),
-        ("frames --coco x --bop x", "coco and bop are x"),
+        ("frames --coco x --bop x", "coco and --bop are x"),
         ("frames --out frames", "expected a new or empty directory"),
         ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
         ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
@@ -122,14 +122,14 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),
         ("frames --out out --poses few.json", "--track"),
-        ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
-        ("FILES --segment table --out out", "error: labels is "),
+        ("frames --out-bag a.mcap", "--out-bag is a.mcap; it belongs to --bag"),
+        ("FILES --segment table --out out", "error: --labels is "),
         ("FILES --out out --color absent.png", "absent.png"),
         ("FILES --out out --labels frames/names.json", "names.json"),
         ("FILES --out out --model absent", "absent"),
         ("FILES --out out --model empty", "run.json"),
-        ("FILES --out out --answer-by gallery", "answer_by is gallery"),
-        ("FILES --out out --answer-by classifiers --model gallery-only", "answer_by is classifiers"),
+        ("FILES --out out --answer-by gallery", "--answer-by is gallery"),
+        ("FILES --out out --answer-by classifiers --model gallery-only", "--answer-by is classifiers"),
     ):
         command = arguments.replace("FILES", files).split()
         assert expected in refused("recognize", "--model", model, *command), arguments

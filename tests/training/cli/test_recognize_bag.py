@@ -129,7 +129,7 @@ def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, refused: 
     with bag_writer(path) as write:  # images without a time stamp have the time at which they were recorded
         write_images(write, FRAMES[0], late, 0)
     error = refused("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", at_once=False)
-    assert "error: out_bag: a frame has the time 2147483648 s" in error
+    assert "error: --out-bag: a frame has the time 2147483648 s" in error
     assert str(tmp_path / "out.mcap") not in error and not (tmp_path / "out.mcap").exists()
 
 
@@ -138,14 +138,14 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     path = write_recording(Path("in.mcap"), FRAMES[:1])
     before = sorted(tmp_path.iterdir())
     for arguments, expected in (
-        ("--coco c.json", "coco is c.json and bag is"),
-        ("--workers 2", "workers is 2 and bag is"),
+        ("--coco c.json", "coco is c.json and --bag is"),
+        ("--workers 2", "workers is 2 and --bag is"),
         ("--out-bag a.bag", "expected an MCAP file"),
         ("--out-bag .", "which exists"),
         ("--out-bag none/a.mcap", "No such file"),
-        ("--color-topic /x", "color_topic is /x"),
-        ("--max-gap 0", "max_gap is 0"),
-        ("--max-gap 1e300", "max_gap is 1e+300"),
+        ("--color-topic /x", "--color-topic is /x"),
+        ("--max-gap 0", "--max-gap is 0"),
+        ("--max-gap 1e300", "--max-gap is 1e+300"),
         ("--every 99999999999999999999", "'--every'"),
         ("--out-bag in.mcap/a.mcap", "a.mcap: Not a directory"),
         ("--depth-scale 0", "depth_scale is 0"),

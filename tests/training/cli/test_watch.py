@@ -64,7 +64,7 @@ def test_a_damaged_recording_ends_with_its_line(
 ) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES, gap=5 * 10**9)
     error = texts("watch", "--model", model, "--bag", path, "--port", 0, status=2)[1].splitlines()[-1]
-    assert error.startswith("error: bag: ") and "expected at most" in error
+    assert error.startswith("error: --bag: ") and "expected at most" in error
     assert messages[-1]["state"] == "failed" and "expected at most" in messages[-1]["message"]
     path.write_bytes(path.read_bytes()[:1000])
     assert "mcap recover" in refused("watch", "--model", model, "--bag", path, "--port", 0)
@@ -75,13 +75,13 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     for arguments, expected in (
         ("", "no source is given"),
         ("--bag a.bag --realsense", "--bag and --realsense is given"),
-        ("--folder a --color-topic /c", "color_topic is /c; it belongs to --bag"),
+        ("--folder a --color-topic /c", "--color-topic is /c; it belongs to --bag"),
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
         ("--folder a --segment sam", "segmenter is 'sam'"),
-        (f"--folder {frame} --answer-by gallery", "answer_by is gallery"),
-        (f"--folder {frame} --unknown-below 2", "unknown_below is 2"),
+        (f"--folder {frame} --answer-by gallery", "--answer-by is gallery"),
+        (f"--folder {frame} --unknown-below 2", "--unknown-below is 2"),
     ):
         assert expected in refused("watch", "--model", model, *arguments.split())
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    assert "error: realsense needs pyrealsense2" in refused("watch", "--model", model, "--realsense")
+    assert "error: --realsense needs pyrealsense2" in refused("watch", "--model", model, "--realsense")

@@ -255,7 +255,7 @@ def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Co
     assert [finding["code"] for finding in report["findings"]] == ["depth-unit"]
     assert "1000" in report["findings"][0]["advice"] and report["notes"]
     assert texts(*command, "--depth-scale", 100, status=1)[0].startswith("depth-unit: ")
-    assert "mesh_scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
+    assert "--mesh-scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
     files.color.unlink()
     assert f"{files.color} is missing" in refused(*command, "--json")
 
