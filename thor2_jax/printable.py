@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from thor2_jax.errors import InputError
 
-__all__ = ["check_name", "counted", "escape_characters", "find_name", "first_names", "normal_name"]
+__all__ = ["check_name", "escape_characters", "find_name", "first_names", "normal_name"]
 
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
@@ -51,11 +51,6 @@ def find_name(name: str, known: Collection[str]) -> str | None:
 def first_names(names: Sequence[str], most: int) -> str:
     """Return the first `most` names as a list in a sentence, with dots for further ones."""
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
-
-
-def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a number and a noun in the singular or plural (by default with an s), such as "1 view" or "2 views"."""
-    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def escape_characters(text: str, can_show: Callable[[str], bool] = str.isprintable) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import check_name, counted
+from thor2_jax.printable import check_name
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
@@ -89,7 +89,7 @@ def enroll(
     for reason in skipped:
         console.print(f"skipped: {reason}")
     for each, count in counts.items():
-        console.print(f"{each}: {counted(count, 'view')}")
+        console.print(f"views of {each}: {count}")
     if known.weak_rejection:
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
     enrolled = f"enrolled in {target.gallery or model}, which recognizes {known.gallery.summary}"

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from thor2_jax.printable import counted, escape_characters, first_names
+from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
 from training.cli.app import app, console, finish, show_help, show_progress
 
@@ -162,7 +162,7 @@ def _print_report(report: Mapping[str, Any]) -> None:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
         console.print(f"labels without pixels in the label image: {first_names(missing, MAX_LISTED)}")
     console.print(
-        f"{counted(speed['frames'], 'frame')}, {speed['frames_per_second']:.2f} a second with compilation; "
+        f"frames: {speed['frames']}, {speed['frames_per_second']:.2f} a second with compilation; "
         f"median {speed['median_seconds']:.2f} s a frame"
     )
     for text in page.answer_texts(report):

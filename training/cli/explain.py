@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.printable import counted, escape_characters
+from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, print_note
 
@@ -62,7 +62,7 @@ def explain(
             console.print(escape_characters(f"{explanation.title}: {directory / PAGE}"))
     if not explained:
         raise InputError("no instance could be explained; see above")
-    pages = f"{counted(explained, 'page')} in {out}"
+    pages = f"pages in {out}: {explained}"
     if segment == MODEL:  # enrolling does not accept labels that depend on the model
         finish(pages, "list the objects of the model", "objects", model=model, gallery=gallery)
     else:

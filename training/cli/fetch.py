@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.printable import counted
 from training.cli import options
 from training.cli.app import app, console, finish, show_help, show_progress
 
@@ -34,4 +33,4 @@ def ycb(
         meshes = fetch_ycb(options.split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
         console.print(name)
-    finish(f"{counted(len(meshes), 'mesh', 'meshes')} in {out}", "train on them", "train", meshes=out, out="run")
+    finish(f"meshes in {out}: {len(meshes)}", "train on them", "train", meshes=out, out="run")

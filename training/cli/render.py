@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.printable import counted
 from training.cli import options
 from training.cli.app import app, finish, show_progress
 
@@ -67,6 +66,5 @@ def render(
         dataset = render_dataset(job, out, pool, of_stage(progress, "render"))
         if crops is not None:
             render_crops(job, dataset, crops, pool, of_stage(progress, "render crops"))
-    views = f"{counted(len(dataset), 'view')} of {counted(len(dataset.classes), 'object')}"
-    views += f" ({dataset.manifest.left_out} left out) in {out}"
+    views = f"views in {out}: {len(dataset)} (objects: {len(dataset.classes)}, left out: {dataset.manifest.left_out})"
     finish(views, "train on them", "train", dataset=out, out="run")

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.printable import counted
 from training.baselines.job import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, main_fusion
 from training.evaluation.frame_pictures import FramePictures
@@ -131,8 +130,8 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     ]
     dataset, runs = report["dataset"], len(report["runs"])
     lead = (
-        f"{counted(report['speed']['frames'], 'frame')}, {counted(report['instances']['scored'], 'instance')} of known "
-        f"objects, {counted(runs, 'trained model')}. Dataset: {dataset['path']}"
+        f"Frames: {report['speed']['frames']:,}. Instances of known objects: {report['instances']['scored']:,}. "
+        f"Trained models: {runs}. Dataset: {dataset['path']}"
     )
     write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.model.fusion import DEFAULT_RULE
-from thor2_jax.printable import counted
 from training.evaluation.runs import Run, scratch_networks
 from training.evaluation.scores import summarize_runs
 
@@ -148,8 +147,8 @@ def _differences(
     size = ""
     if data["frames"] and data["instances"]:
         size = f" ({data['frames']:,} frames, {data['instances']:,} instances)"
-    frames, rows = counted(n_frames, "frame"), len(table["cells"])
-    sentences = [f"The published figures concern {data['concerns']}{size}; this evaluation has {frames}."]
+    rows = len(table["cells"])
+    sentences = [f"The published figures concern {data['concerns']}{size}. Number of frames here: {n_frames:,}."]
     if table["objects"] is None:
         sentences.append(f"Number of objects that are scored here: {n_objects}.")
     elif table["objects"] != n_objects:
@@ -157,8 +156,7 @@ def _differences(
     if n_rows < rows:
         sentences.append(f"{rows - n_rows} of the table's {rows} rows have no instance here.")
     models = "models of its own" if table["models"] is None else f"{table['models']} models"
-    here = counted(n_models, "model")
-    sentences.append(f"The publication uses {models}, this evaluation {here}, trained on other views and folds.")
+    sentences.append(f"The publication uses {models}. Models here: {n_models}, trained on other views and folds.")
     if any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"]):
         sentences.append(f"The publication fuses classifiers by the rule max, this table by {DEFAULT_RULE}.")
     return sentences

@@ -15,7 +15,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RecordedFrame, RGBDFrame, read_frame
-from thor2_jax.printable import counted, first_names
+from thor2_jax.printable import first_names
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
@@ -194,7 +194,7 @@ class FrameFolder(LabelledFrames):
         used = set(self.identifiers)
         left_out = [source.name for source in sources if source.name not in used]
         listed = first_names(left_out, MAX_LISTED)
-        self.note = f"{counted(len(left_out), 'frame')} without labels.json: {listed}" if left_out else ""
+        self.note = f"frames without labels.json: {len(left_out)} ({listed})" if left_out else ""
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame and the names in its labels.json, if it has one; there are no attributes."""

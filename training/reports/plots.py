@@ -15,7 +15,6 @@ from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.plot import PALETTE
-from thor2_jax.printable import counted
 from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RayCaster, camera_pose, render_view
@@ -121,7 +120,7 @@ def draw_accuracy(
         heights = [values[k] for values in accuracy.values()]
         bars = axes.bar(places, heights, width * 0.92, label=name, color=PALETTE[k % len(PALETTE)])
         axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=2 if crowded else 1, rotation=90 if crowded else 0)
-    ticks = [plain_text(f"{subset}\n{counted(counts[subset], 'instance')}") for subset in accuracy]
+    ticks = [plain_text(f"{subset}\ninstances: {counts[subset]}") for subset in accuracy]
     axes.set_xticks(range(len(accuracy)), ticks, **name_style())
     axes.set(ylim=(0, 1.15 if crowded else 1.08), yticks=np.arange(0, 1.01, 0.2), ylabel="accuracy")
     axes.spines[["top", "right"]].set_visible(False)

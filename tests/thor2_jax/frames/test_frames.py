@@ -205,6 +205,16 @@ def test_images_of_other_modes_are_refused(tmp_path: Path, read: Any, modes: tup
         assert_refused(problem, read, path)
 
 
+def test_lossy_labels_are_refused(tmp_path: Path) -> None:
+    mask = Image.fromarray(arrays()["labels"])
+    mask.save(tmp_path / "lossy", "JPEG")
+    mask.save(tmp_path / "lossy.tiff", "TIFF", compression="jpeg")
+    mask.save(tmp_path / "lossless.tiff", "TIFF", compression="tiff_lzw")
+    assert np.array_equal(read_labels(tmp_path / "lossless.tiff"), np.asarray(mask))
+    for name in ("lossy", "lossy.tiff"):
+        assert_refused(f"^labels: .*{name}.*JPEG", read_labels, tmp_path / name)
+
+
 def test_color_files_of_16_bit(tmp_path: Path) -> None:
     (tmp_path / "color.png").write_bytes(deep_png(12, 16))
     assert_refused("^color: .*;16", read_color, tmp_path / "color.png")

@@ -71,7 +71,7 @@ def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Pat
 def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Command) -> None:
     (frames / "001" / "labels.json").unlink()
     for command in (("enroll", "--replace", "--frames", frames), ("evaluate", "frames", frames)):
-        assert "1 frame without labels.json: 001" in printed(*command, "--model", model).replace("\n", " ")
+        assert "frames without labels.json: 1 (001)" in printed(*command, "--model", model).replace("\n", " ")
 
 
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:

@@ -276,7 +276,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Comma
     write_box(tmp_path / "meshes" / "box.ply", (0.06, 0.06, 0.06))
     command = ("render", "--meshes", tmp_path / "meshes", "--out", tmp_path / "views", "--azimuth-step", 180)
     for _ in range(2):  # it may be repeated
-        assert "6 views of 1 object (0 left out)" in printed(*command, "--polar-step", 90, "--workers", 1)
+        assert "views: 6 (objects: 1, left out: 0)" in printed(*command, "--polar-step", 90, "--workers", 1)
     assert "address is head:6379" in refused(*command, "--address", "head:6379")
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "'.[cluster]'" in refused(*command, "--engine", "ray")
