@@ -1,7 +1,6 @@
 """Random weights and images for the golden outputs of the image networks; needs NumPy only."""
 
 import zlib
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,11 +17,6 @@ def random_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
         return (0.1 * rng.standard_normal(shape, np.float32)).astype(np.float32)
     deviation = 0.2 if len(shape) == 3 else (2 / np.prod(shape[1:])) ** 0.5
     return np.float32(deviation) * rng.standard_normal(shape, np.float32)
-
-
-def random_tensors(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Return the random tensors of a model."""
-    return {name: random_tensor(name, shape) for name, shape in shapes.items()}
 
 
 def random_images(name: str, count: int, size: int) -> np.ndarray:

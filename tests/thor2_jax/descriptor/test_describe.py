@@ -67,14 +67,14 @@ def test_arguments_of_other_types_are_named() -> None:
 
 
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
-    """Clouds of all sizes with the same bucket and batch size share one compilation."""
+    """Clouds of all sizes with the same bucket and batch size, and all parameters, share one compilation."""
     config = thor2.DescriptorConfig(homology="closed_form", alpha=0.7)  # used by no other test
 
-    def compiled(*sizes: int, network: colornet.ColorNetwork = NETWORK) -> list[str]:
+    def compiled(*sizes: int, network: colornet.ColorNetwork = NETWORK, **given: thor2.Parameters) -> list[str]:
         caplog.clear()
         packed = thor2.PointClouds.pack([(np.random.default_rng(n).random((n, 3)), np.zeros((n, 3))) for n in sizes])
         with jax.log_compiles(), caplog.at_level(logging.WARNING):
-            jax.block_until_ready(thor2.describe(packed, network, config))
+            jax.block_until_ready(thor2.describe(packed, network, config, **given))
         lines = [record.getMessage() for record in caplog.records]
         names = [line.split()[4] for line in lines if line.startswith("Finished XLA compilation of")]
         return [name for name in names if "convert_element_type" not in name]  # compiled for each dtype and shape
@@ -86,6 +86,8 @@ def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
     larger = compiled(513, 2)
     assert larger and len(larger) == len(set(larger))
     assert compiled(1024, 900) == []
+    others = jax.tree.map(lambda a: 1.1 * a, thor2.Parameters.of(NETWORK, config))
+    assert compiled(5, 512, parameters=others) == []
 
 
 def clouds_of(count: int, capacity: int) -> thor2.PointClouds:

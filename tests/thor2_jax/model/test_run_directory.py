@@ -81,12 +81,6 @@ def test_an_existing_path_is_refused(saved: Path, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_record_that_is_not_json_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(TypeError):
-        save_run(dataclasses.replace(make_run(), record={"not JSON": object()}), tmp_path / "run")
-    assert list(tmp_path.iterdir()) == []
-
-
 def edited(**changes: Any) -> Callable[[Path], None]:
     def edit(path: Path) -> None:
         description = json.loads((path / "run.json").read_text())

@@ -56,9 +56,8 @@ def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode_image(np.ones((120, 160), kind))
         check_refused(post(http, files, **{field: small}), 422, field, "(120, 160)", "(240, 320)")
-    for count in (257, 65_535):
-        many = np.minimum(np.arange(240 * 320), count).astype(np.uint16).reshape(240, 320)
-        check_refused(post(http, files, labels=encode_image(many)), 422, "labels", f"{count} instances")
+    many = np.minimum(np.arange(240 * 320), 257).astype(np.uint16).reshape(240, 320)
+    check_refused(post(http, files, labels=encode_image(many)), 422, "labels", "257 instances")
 
 
 def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> None:
@@ -70,9 +69,7 @@ def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> 
 
 def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files) -> None:
     good = json.loads(files["intrinsics"])
-    values = (float("nan"), float("inf"), 0, -1, "600", None, 10**400, 10**3000)
-    texts = [json.dumps(good | {"fx": value}) for value in values]
-    texts += ["", "{", "[]", "{}", "[" * 2000, '{"fx":' * 500, '{"\\ud800": 1}', "fx: 0x" + "f" * 4000]
+    texts = "", '{"fx":' * 500, '{"\\ud800": 1}', "fx: 0x" + "f" * 4000, json.dumps(good | {"fx": 10**3000})
     for content in (*map(str.encode, texts), b"\xff\xfe\x00"):
         check_refused(post(http, files, intrinsics=content), 422, "intrinsics")
     check_refused(post(http, files, intrinsics=b" " * 5000), 413, "intrinsics", "5000")

@@ -20,7 +20,7 @@ from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TIN
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 sys.path.append(str(GOLDEN))
-from network_weights import random_images, random_tensor, random_tensors, sampled  # noqa: E402
+from network_weights import random_images, random_tensor, sampled  # noqa: E402
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -54,7 +54,8 @@ def assert_golden(name: str, outputs: list[Any]) -> None:
 def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int) -> None:
     """They have the random weights of their tensors' names, from a file."""
     model = nnx.eval_shape(lambda: create(rngs=nnx.Rngs(0)))
-    save_file(random_tensors(tensor_shapes(model)), tmp_path / "weights.safetensors")
+    tensors = {name: random_tensor(name, shape) for name, shape in tensor_shapes(model).items()}
+    save_file(tensors, tmp_path / "weights.safetensors")
     load_backbone(model, tmp_path / "weights.safetensors")
     model.eval()
     assert_golden(name, jax.tree.leaves(nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))))
