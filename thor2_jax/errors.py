@@ -1,15 +1,13 @@
-"""Invalid input: the exception, a prefix for its message, conversions of arguments, damaged files, missing packages."""
+"""Invalid input: the exception, a prefix for its message, arrays of any kind, damaged files, and missing packages."""
 
 import contextlib
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["InputError", "as_array", "as_path", "decoding", "needs_extra", "reason_of", "with_context"]
+__all__ = ["InputError", "as_array", "decoding", "needs_extra", "reason_of", "with_context"]
 
 MAX_MESSAGE = 1000
 """Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
@@ -34,13 +32,6 @@ def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") ->
         return np.asarray(values)
     except ValueError:
         raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
-
-
-def as_path(path: object, name: str) -> Path:
-    """Return the path of a file as a Path; a value of another type raises InputError."""
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"{name} is a {type(path).__name__}; expected a path")
-    return Path(path)
 
 
 def reason_of(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Atomic writes, digests, the check of output directories, files of arrays, and values in JSON and YAML files."""
+"""Paths, atomic writes, digests, checks of output directories, files of arrays, and values in JSON and YAML files."""
 
 import contextlib
 import errno
@@ -28,6 +28,7 @@ from colornet.files import (
 from thor2_jax.errors import InputError, reason_of
 
 __all__ = [
+    "as_path",
     "atomic_directory",
     "atomic_write",
     "check_output_directory",
@@ -51,6 +52,13 @@ __all__ = [
     "unpack_arrays",
     "write_text",
 ]
+
+
+def as_path(path: object, name: str) -> Path:
+    """Return the path of a file as a Path; a value of another type raises InputError."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{name} is a {type(path).__name__}; expected a path")
+    return Path(path)
 
 
 @contextlib.contextmanager

@@ -300,8 +300,7 @@ class Recognizer:
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame; their number may exceed the largest batch bucket."""
-        run = self.run
-        describe = functools.partial(describe_looks, network=run.network, config=run.config)
+        describe = functools.partial(describe_looks, network=self.run.network, config=self.run.config)
         return DescribedFrame(*compute_by_chunks(self.prepare(frame), self.chunk, describe))
 
     def recognize(

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from thor2_jax.errors import InputError, as_array, as_path, decoding, needs_extra
-from thor2_jax.files import open_file, read_npy
+from thor2_jax.errors import InputError, as_array, decoding, needs_extra
+from thor2_jax.files import as_path, open_file, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, check_camera, read_intrinsics, undistort
 
 __all__ = [

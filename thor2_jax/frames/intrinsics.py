@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, as_path, decoding, with_context
-from thor2_jax.files import parse_json, parse_yaml, read_file, read_npy
+from thor2_jax.errors import InputError, decoding, with_context
+from thor2_jax.files import as_path, parse_json, parse_yaml, read_file, read_npy
 
 __all__ = [
     "DEFAULT_DEPTH_SCALE",

@@ -130,7 +130,9 @@ class LiveView:
                 {"track": None, **one, "color": "#{:02x}{:02x}{:02x}".format(*note.paint)}
                 for one, note in zip(detections_as_json(detections), annotations, strict=True)
             ]
-            self._last = {**values, "milliseconds": milliseconds, "image": _picture(frame, annotations)}
+            picture = draw_instances(frame.color, frame.label_image, annotations)
+            image = base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode("ascii")
+            self._last = {**values, "milliseconds": milliseconds, "image": image}
             self.n_frames += 1
         self._times.append(time.perf_counter())
         steps = len(self._times) - 1
@@ -152,12 +154,6 @@ def _annotation(answer: Recognition, number: int) -> Annotation:
         return Annotation(answer.label, UNRECOGNIZED, "unknown")
     track = getattr(answer, "track", None)
     return Annotation(answer.label, COLORS[(number if track is None else track - 1) % len(COLORS)], answer.name)
-
-
-def _picture(frame: RGBDFrame, annotations: Sequence[Annotation]) -> str:
-    """Return the frame with its annotations, JPEG in base64."""
-    picture = draw_instances(frame.color, frame.label_image, annotations)
-    return base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode("ascii")
 
 
 _PAGE = Path(__file__).parent / "page"

@@ -48,16 +48,13 @@ def write_sample_recording(path: str | Path) -> None:
         for number, (scene, _) in enumerate(views):
             stamp = START + number * 10**9 // HERTZ
             header = {"header": {"stamp": ros_time(stamp), "frame_id": FRAME_ID}}
-            jpeg = {"format": "rgb8; jpeg compressed bgr8", "data": _encoded(scene.frame.color, "JPEG", quality=93)}
+            color = np.frombuffer(encode_image(scene.frame.color, "JPEG", quality=93), np.uint8)
+            jpeg = {"format": "rgb8; jpeg compressed bgr8", "data": color}
             # compressed_depth_image_transport puts 12 bytes before the PNG.
-            png = np.concatenate([np.zeros(12, np.uint8), _encoded(scene.frame.depth, "PNG")])
+            png = np.frombuffer(bytes(12) + encode_image(scene.frame.depth), np.uint8)
             bag.write_message(INFO, {**header, **_camera_info(scene.frame.intrinsics)}, stamp)
             bag.write_message(COLOR, {**header, **jpeg}, stamp)
             bag.write_message(DEPTH, {**header, "format": "16UC1; compressedDepth png", "data": png}, stamp)
-
-
-def _encoded(pixels: np.ndarray, kind: str, **options: Any) -> np.ndarray:
-    return np.frombuffer(encode_image(pixels, kind, **options), np.uint8)
 
 
 def _camera_info(camera: Intrinsics) -> dict[str, Any]:
