@@ -130,7 +130,7 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     gallery = tmp_path / "gallery"
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     text = printed("explain", *given, frame, "--out", tmp_path / "out")
-    assert " --instance 1 " in text and text.count("pages in ") == 1
+    assert " --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
     assert seen == [(0.9, "classifiers", gallery)] * 2
 
 
