@@ -136,13 +136,14 @@ def test_rendering_resumes(stops: Sequence[int], whole: Path, tmp_path: Path, mo
         with pytest.raises(InputError, match=MANIFEST) if stop < 22 else contextlib.nullcontext():
             ViewDataset.open(out)
         left, before = 0, files_of(out)
-        seen: list[tuple[int, int]] = []
-        render_dataset(JOB, out, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
+        seen: list[tuple[str, int, int]] = []
+        render_dataset(JOB, out, progress=lambda *step: seen.append(step[:3]))  # noqa: B023
         assert files_of(out) == files_of(whole)
         # Shards that were listed are not rendered again.
         stored = json.loads(before.get(MANIFEST, '{"views": 0}'))
-        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= stored["views"]]
-        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before) + 2 * ("surfaces" not in stored))
+        rendered = [("render", done, 12) for done in (0, 4, 6, 10, 12) if done >= stored["views"]]
+        assert seen == [("surfaces", done, 2) for done in range(3) if "surfaces" not in stored] + rendered
+        assert left == -2 * (2 * (len(rendered) - 1) + (MANIFEST not in before) + 2 * ("surfaces" not in stored))
 
 
 def changed(folder: Path) -> dict[str, int]:
