@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import runpy
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -177,10 +179,14 @@ def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.M
     assert_refused("object 3 has no view", sample_objects, [3], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
 
 
-def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
+def test_a_file_of_the_user_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "embedding.safetensors").write_text("a user's")
     assert_refused("embedding.safetensors", build_embedding, tmp_path / "embedding.safetensors")
     assert (tmp_path / "embedding.safetensors").read_text() == "a user's"
+    (tmp_path / "new.checkpoints").touch()
+    monkeypatch.setattr(sys, "argv", ["build", "--out", str(tmp_path / "new")])
+    with pytest.raises(SystemExit, match="^error: .*new.checkpoints"):
+        runpy.run_path(build.__file__, run_name="__main__")
 
 
 @pytest.mark.slow
