@@ -62,10 +62,6 @@ def test_views_depend_on_their_object_only() -> None:
     np.testing.assert_equal(again, one[2:])
 
 
-def test_each_object_has_one_label(views: Samples) -> None:
-    assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
-
-
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(normalized_views, "_random_axes", lambda *_: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1)))
     rendered = render_clouds({0: 0, 1: 10}, 3)
