@@ -38,7 +38,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
 from training.evaluation.answers import FrameAnswers, Rule, main_fusion
 from training.evaluation.job import answer_frames
-from training.evaluation.results import confidence_metrics, judged_confidences, split_known
+from training.evaluation.results import confidence_metrics, fuse_answers, judged_confidences, split_known
 from training.evaluation.runs import Run, load_runs
 from training.evaluation.scores import Floats, find_placements, placement_accuracy, steadiness, summarize_rows
 from training.objects.builtin_objects import builtin_objects
@@ -160,7 +160,7 @@ def _measure(
     scored = split_known([frame for frames in cameras for frame in frames], classes, by_camera.ravel())
     if not scored.known:
         raise InputError(f"frames: no instance is of a class of the runs, which have {', '.join(classes[:5])}, ...")
-    fused, others = scored.fuse(runs, rule)
+    fused, others = fuse_answers(scored.known, runs, rule), scored.fuse_unknown(runs, rule)
     chosen = title or main_fusion(fused, runs[0].answer_by)
     if len(fused.get(chosen, ())) < len(runs):
         raise InputError(f"fusion is {chosen}; expected one that all runs have, of {', '.join(fused)}")

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics import roc_auc_score
 
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import LOOKS, augmented_view, embed_looks
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from training.evaluation.scores import auroc
 from training.readers.frames import FrameFolder
 
 FOLDS = 4
@@ -107,9 +107,8 @@ def unknown_objects(instances: Instances) -> dict[str, float]:
             unknown_scores.append(answers(gallery, instances, np.flatnonzero((frame != half) & is_unknown))[1])
     known, right, unknown = (np.concatenate(parts) for parts in (known_scores, correct, unknown_scores))
     threshold = float(np.quantile(known[right], 0.05))
-    truth = np.concatenate([np.ones(len(known)), np.zeros(len(unknown))])
     return {
-        "auroc": float(roc_auc_score(truth, np.concatenate([known, unknown]))),
+        "auroc": auroc(np.concatenate([known, unknown]), np.arange(len(known) + len(unknown)) < len(known)),
         "threshold": threshold,
         "unknown_named": float((unknown >= threshold).mean()),
     }

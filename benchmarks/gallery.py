@@ -57,11 +57,6 @@ def queries_near(embeddings: NDArray[np.float16], count: int, seed: int = 1) -> 
     return queries / np.linalg.norm(queries, axis=1, keepdims=True)
 
 
-def peak_memory() -> float:
-    """Return the largest resident size of this process so far, GB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-
-
 def measure_search(options: argparse.Namespace) -> dict[str, Any]:
     """Return times, memory and recall of both searches."""
     report: dict[str, Any] = {"objects": options.objects, "size": SIZE, "queries": QUERIES, "nearest": NEAREST}
@@ -74,7 +69,7 @@ def measure_search(options: argparse.Namespace) -> dict[str, Any]:
         search: ExactSearch | IndexSearch = build(embeddings)
         row = {"build_seconds": time.perf_counter() - start, "build_processor_seconds": time.process_time() - processor}
         row["query_seconds"] = time_calls(lambda: search.nearest(queries, NEAREST), least=3).median  # noqa: B023
-        row["peak_gigabytes"] = peak_memory()
+        row["peak_gigabytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         index = search.nearest(many, NEAREST)[1]
         for count in (1, 10, 50, NEAREST):
             hits = [len(np.intersect1d(*rows)) / count for rows in zip(exact[:, :count], index[:, :count], strict=True)]

@@ -21,7 +21,6 @@ import math
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from benchmarks.cameras import (
     summarize,
 )
 from benchmarks.paper_report import markdown_table
+from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
@@ -223,13 +223,13 @@ class Table:
             return
         directories = []
         for seed in missing:
-            _report(f"{levers[0].name}: training with seed {seed}")
+            print_step(f"{levers[0].name}: training with seed {seed}")
             directories.append(self.train(levers[0], seed))
         runs = self._load(levers[0], directories)
 
         names = ", ".join(lever.name for lever in levers)
         cameras = CAMERAS[self.options.cameras]
-        answers = answers_by_camera(runs, self.frames, cameras, lambda camera: _report(f"{names}: {camera}"))
+        answers = answers_by_camera(runs, self.frames, cameras, lambda camera: print_step(f"{names}: {camera}"))
         for lever in levers:
             for seed, results in zip(missing, measure(runs, answers, lever.fusion, lever.rule), strict=True):
                 self._write_cell(lever, seed, results)
@@ -266,10 +266,6 @@ def _thor2(*arguments: object) -> None:
     command = [sys.executable, "-m", "training.cli", *map(str, arguments), "--quiet"]
     if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
         raise InputError(f"the command failed: {shlex.join(command)}")
-
-
-def _report(text: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
 
 
 def grouped(levers: Sequence[Lever]) -> list[list[Lever]]:

@@ -26,6 +26,7 @@ from typing import Any
 
 from benchmarks.paper_measurement import Dataset, compare_runs, recognition_seconds
 from benchmarks.paper_report import draw_claims, report_text
+from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, write_text
 from training.baselines.architectures import check_weights, crop_size, pretrained_files
@@ -109,7 +110,7 @@ class Comparison:
         costs = json.loads(file.read_bytes()) if file.is_file() else {}
         if method in costs:
             return
-        _report(f"{dataset}: {method}")
+        print_step(f"{dataset}: {method}")
         command = [sys.executable, "-m", "training.cli", *map(str, arguments), "--quiet"]
         start = time.perf_counter()
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -130,7 +131,7 @@ class Comparison:
         directory = self.out / name
         runs = load_runs([directory / "run"])
         dataset = self.datasets[name]
-        _report(f"{name}: evaluation")
+        print_step(f"{name}: evaluation")
         results = compare_runs(dataset, runs, directory)
         costs = json.loads((directory / "costs.json").read_bytes())
         timing = directory / "recognition.json"
@@ -175,10 +176,6 @@ def _datasets(options: argparse.Namespace) -> dict[str, Dataset]:
             raise InputError("frames has several folders of one name; expected different names")
         datasets["frames"] = Dataset("frames", folders)
     return datasets
-
-
-def _report(text: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:

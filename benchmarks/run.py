@@ -195,11 +195,8 @@ def main() -> None:
         "align_share": share,
     }
     result["stream"] = stream(clouds, 10_000 if options.quick else 100_000)
-    print(
-        "describe_stream: {clouds:,} clouds in {seconds:.1f} s, peak memory {peak_gib:.2f} GiB".format(
-            **result["stream"]
-        )
-    )
+    streamed = "describe_stream: {clouds:,} clouds in {seconds:.1f} s, peak memory {peak_gib:.2f} GiB"
+    print(streamed.format(**result["stream"]))
     try:
         agreement = peer_agrees(clouds[:8])
     except ImportError as error:

@@ -134,9 +134,8 @@ def main() -> None:
     report = json.loads(options.out.read_text()) if options.out.exists() else {}
     for group in options.groups:
         items = [item for folder in sorted(glob.glob(group)) for item in FrameFolder(folder)]
-        known = (
-            recognizer if recognizer and {n for i in items for n in i.truth.values()} & {*recognizer.classes} else None
-        )
+        names = {name for item in items for name in item.truth.values()}
+        known = recognizer if recognizer and names & {*recognizer.classes} else None
         report[Path(group).parent.name + "/" + Path(group).name] = figures = measure(items, segmenter, known)
         print(group, json.dumps(figures, indent=1))
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-__all__ = ["Timing", "time_calls"]
+__all__ = ["Timing", "print_step", "time_calls"]
 
 
 class Timing(NamedTuple):
@@ -30,3 +30,8 @@ def time_calls(function: Callable[[], Any], seconds: float = 2.0, least: int = 5
     while len(calls) < least or sum(calls) < seconds:
         calls.append(once())
     return Timing(first, statistics.median(calls))
+
+
+def print_step(text: str) -> None:
+    """Print what a long command does now, with the time of day."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)

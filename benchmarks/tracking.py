@@ -232,9 +232,8 @@ def main() -> None:
                 stored["tracks"][str(path)] = measure_tracks(Recognizer.load(path, unknown_below=0.0), frames)
                 write()
             print(path, json.dumps(stored["tracks"][str(path)]), flush=True)
-        missing = (
-            [seed for seed in range(options.scenes) if str(seed) not in stored["scenes"]] if options.meshes else []
-        )
+        seeds = range(options.scenes) if options.meshes else ()
+        missing = [seed for seed in seeds if str(seed) not in stored["scenes"]]
         if missing:
             recognizer = Recognizer.load(options.model[0])
             meshes = read_meshes(options.meshes, options.names, recognizer.run.classes)

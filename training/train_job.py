@@ -14,6 +14,7 @@ from thor2_jax.printable import normal_name
 from training.baselines.architectures import check_weights, crop_size, pretrained_files
 from training.baselines.image_baselines import check_backbone
 from training.baselines.job import check_baselines, train_baselines
+from training.baselines.thor import types_of_views
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
@@ -27,9 +28,6 @@ from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLab
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
-
-RENDER, RENDER_CROPS = "render", "render crops"
-"""Names of stages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +73,7 @@ class TrainJob:
         """The stages of the training of a run, see `Protocol.stages`; baselines are not included."""
         if self.meshes is None:
             return self.protocol.stages
-        return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if self.crop_size is not None else {}) | self.protocol.stages
+        return {"render": 1.0} | ({"render crops": 1.0} if self.crop_size is not None else {}) | self.protocol.stages
 
 
 def run_train_job(
@@ -243,6 +241,8 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     meshes = _find_meshes(job)
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
+    if "thor" in job.baselines:
+        types_of_views(source.record["job"] if source else vars(job.protocol))  # raises if there are too few
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         # Folds and batches are checked later again, since some views may have too few points.
@@ -254,9 +254,9 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
                 raise InputError(f"folds is {folds}; expected at most {n_views}, the number of views of class {name!r}")
         n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
         _check_batch_size(job.protocol, n_clouds)
-        source = render_dataset(rendering, job.out / VIEWS, workers, of_stage(progress, RENDER))
+        source = render_dataset(rendering, job.out / VIEWS, workers, progress)
         if size is not None:
-            render_crops(rendering, source, size, workers, of_stage(progress, RENDER_CROPS))
+            render_crops(rendering, source, size, workers, of_stage(progress, "render crops"))
     if labelled is not None:
         source = WithLabelledViews(labelled, job.protocol.config, source)
     assert source is not None

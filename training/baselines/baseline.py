@@ -154,16 +154,12 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         arrays, metadata = unpack_arrays(read_file(path))
         about = json.loads(metadata["about"])
         if about["format"] != BASELINE_FORMAT:
-            raise InputError(
-                f"model: {path} has format {about['format']!r}; expected {BASELINE_FORMAT}; train the baseline again"
-            )
+            raise ValueError(f"its format is {about['format']!r}; expected {BASELINE_FORMAT}")
         if about.pop("digest") != _digest(arrays, about):
             raise ValueError("its digest does not match")
         if about["classes"] != list(classes):
-            raise InputError(f"model: {path} has other classes than its run; train the baseline again")
+            raise ValueError("it has other classes than its run")
         return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
-    except InputError:
-        raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None
 

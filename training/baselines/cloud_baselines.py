@@ -100,13 +100,12 @@ def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
         indices = zip((getattr(tree, name) for tree in trees), root, strict=True)
         return np.concatenate([np.where(i < 0, -1, i + first) for i, first in indices]).astype(np.int32)
 
-    counts = np.concatenate([tree.value[:, 0] for tree in trees])
     return {
         "left": children("children_left"),
         "right": children("children_right"),
         "feature": np.concatenate([tree.feature for tree in trees]).astype(np.int16),
         "threshold": np.concatenate([tree.threshold for tree in trees]),
-        "shares": (counts / counts.sum(axis=1, keepdims=True)).astype(np.float32),
+        "shares": np.concatenate([tree.value[:, 0] for tree in trees]).astype(np.float32),
         "root": root,
     }
 

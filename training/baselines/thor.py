@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
+from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
@@ -35,7 +36,7 @@ from training.fitting.loop import Checkpoints, EpochMetrics
 from training.fitting.samples import sample_views
 from training.rendering.camera import view_angles
 
-__all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "load_thor", "view_types"]
+__all__ = ["VIEW_TYPES", "camera_types", "fit_thor", "load_thor", "types_of_views", "view_types"]
 
 ViewType = Literal["front", "side", "top"]
 VIEW_TYPES: tuple[ViewType, ...] = ("front", "side", "top")
@@ -134,15 +135,32 @@ def camera_types(azimuth: float, polar: float) -> tuple[ViewType, ...]:
     return tuple(name for name in VIEW_TYPES if fits[name])
 
 
+def types_of_views(job: Mapping[str, Any]) -> list[tuple[ViewType, ...]]:
+    """Return the view types of each view of an object, in the order of `view_angles`.
+
+    Args:
+        job: table with the steps of the views, such as `RenderJob.record`.
+
+    Raises:
+        InputError: a type has no view, or a step is invalid.
+    """
+    steps = job["azimuth_step"], job["polar_step"]
+    types = [camera_types(*angles) for angles in np.rad2deg(view_angles(*steps)).round(6).tolist()]
+    if missing := set(VIEW_TYPES).difference(*types):
+        raise InputError(
+            f"baselines: thor needs views from the {' and '.join(sorted(missing))}, and azimuth_step {steps[0]:g} with "
+            f"polar_step {steps[1]:g} gives none; choose smaller steps, or leave out thor"
+        )
+    return types
+
+
 def fit_thor(task: FitTask) -> StoredBaseline:
     """Fit the library, each classifier in the same way as the run's own; an interrupted fit resumes.
 
     Raises:
         InputError: as `fit`.
     """
-    job = task.source.record["job"]
-    degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
-    types = [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]  # by view number
+    types = types_of_views(task.source.record["job"])
     config = task.run.config
     samples, _ = sample_views(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)

@@ -63,7 +63,7 @@ def render(
     sources = scaled_meshes(find_meshes(meshes, names), mesh_scale)
     job = RenderJob(sources, azimuth_step, polar_step, augmentations, seed)
     with show_progress(quiet) as progress:
-        dataset = render_dataset(job, out, pool, of_stage(progress, "render"))
+        dataset = render_dataset(job, out, pool, progress)
         if crops is not None:
             render_crops(job, dataset, crops, pool, of_stage(progress, "render crops"))
     views = f"views in {out}: {len(dataset)} (objects: {len(dataset.classes)}, left out: {dataset.manifest.left_out})"

@@ -210,6 +210,8 @@ def train(
             fold = f"fold {run.record['fold']}: " if len(runs) > 1 else ""
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
+            if run.embedding is not None and run.surfaces is None:
+                console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
         finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
         written = "run written to" if runs else f"{finished}; the run is in"
         model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"

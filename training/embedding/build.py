@@ -17,7 +17,7 @@ import typer
 
 import colornet
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.distractors import ObjectSource, sample_objects, samples_record
@@ -68,5 +68,5 @@ def build_embedding(
 if __name__ == "__main__":
     try:
         typer.run(build_embedding)
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    except (InputError, OSError) as error:
+        raise SystemExit(f"error: {reason_of(error)}") from None

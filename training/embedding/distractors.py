@@ -155,7 +155,7 @@ def sample_objects(
     directory.mkdir(parents=True, exist_ok=True)
     chunks: dict[Path, Samples] = {}
     for file in tasks:
-        with contextlib.suppress(ValueError, KeyError):  # the file is missing or damaged
+        with contextlib.suppress(OSError, ValueError, KeyError):  # the file is missing or damaged
             chunks[file] = Samples.of_arrays(load_arrays(file))
     missing = {file: task for file, task in tasks.items() if file not in chunks}
     done = sum(len(tasks[file]) for file in chunks)

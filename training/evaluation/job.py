@@ -210,11 +210,10 @@ def _answer_first(load: Load, frames: LabelledFrames) -> tuple[LabelledFrame, Fr
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:
     recognizer = runs[0].recognizer
     described = recognizer.describe(item.frame)
-    has_baselines = any(run.baselines for run in runs)
-    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if has_baselines else None
-    values = [run.probabilities(item.identifier, described, inputs) for run in runs]
-    table = np.stack([values[index][name] for index, name in all_predictors(runs)], axis=1)  # [B, M, C]
     rows = {instance.label: row for row, instance in enumerate(described.usable)}
+    has_baselines = rows and any(run.baselines for run in runs)
+    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if has_baselines else None
+    values = [run.probabilities(item.identifier, described, inputs) for run in runs] if rows else []
     reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []
     for label, name in sorted(item.truth.items()):
@@ -224,7 +223,8 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
             answers.append(InstancePrediction(label, truth, reason=reason, position=position))
         else:
             occluded = described.usable[row].occluded
-            answers.append(InstancePrediction(label, truth, occluded, None, table[row], position))
+            probabilities = np.stack([values[index][name][row] for index, name in all_predictors(runs)])  # [M, C]
+            answers.append(InstancePrediction(label, truth, occluded, None, probabilities, position))
     return answers
 
 

@@ -97,10 +97,9 @@ class KnownAndUnknown(NamedTuple):
     placement: Integers
     unknown: list[InstancePrediction]
 
-    def fuse(self, runs: Sequence[Run], rule: Rule) -> tuple[Fused, Fused]:
-        """Return the fused predictions for the known objects, and for the unknown objects that could be described."""
-        described = [instance for instance in self.unknown if instance.probabilities is not None]
-        return fuse_answers(self.known, runs, rule), fuse_answers(described, runs, rule)
+    def fuse_unknown(self, runs: Sequence[Run], rule: Rule) -> Fused:
+        """Return the fused predictions for the unknown objects that could be described."""
+        return fuse_answers([each for each in self.unknown if each.probabilities is not None], runs, rule)
 
 
 def split_known(
@@ -160,11 +159,11 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
         {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
         for frame in scored.frames
     ]
-    fused = {rule: scored.fuse(runs, rule) for rule in RULES}
-    by_rule = {rule: known for rule, (known, _) in fused.items()}
+    by_rule = {rule: fuse_answers(scored.known, runs, rule) for rule in RULES}
+    unknown = scored.fuse_unknown(runs, DEFAULT_RULE)
     tables = scores.attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
-    by_run, unknown_by_run = (of_rule[main] for of_rule in fused[DEFAULT_RULE])
+    by_run, unknown_by_run = by_rule[DEFAULT_RULE][main], unknown[main]
     correct = {
         rule: {title: [p.class_index == truth for p in of_runs.values()] for title, of_runs in known.items()}
         for rule, known in by_rule.items()
@@ -209,8 +208,8 @@ def compute_results(kind: str, runs: Sequence[Run], frames: Sequence[FrameAnswer
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
         },
-        "confidence": _confidence(*fused[DEFAULT_RULE], truth),
-        "calibrated_confidence": _confidence(*fused["calibrated"], truth),
+        "confidence": _confidence(by_rule[DEFAULT_RULE], unknown, truth),
+        "calibrated_confidence": _confidence(by_rule["calibrated"], scored.fuse_unknown(runs, "calibrated"), truth),
         "placements": {
             "count": len(np.unique(placement)),
             "accuracy": of_runs(lambda each: scores.placement_accuracy(placement, each.class_index == truth)),

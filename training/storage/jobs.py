@@ -261,12 +261,10 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file.
 
     Raises:
-        ValueError: the file is missing or damaged.
+        OSError: the file cannot be read.
+        ValueError: the file is damaged.
     """
-    try:
-        arrays, metadata = unpack_arrays(read_file(path))
-    except OSError as error:
-        raise ValueError(str(error)) from None
+    arrays, metadata = unpack_arrays(read_file(path))
     if _arrays_digest(arrays) != metadata.get("sha256"):
         raise ValueError("its content is damaged")
     return arrays

@@ -40,7 +40,7 @@ import dataclasses
 import functools
 import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ from thor2_jax.files import check_output_directory, content_digest, read_file, r
 from thor2_jax.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
-from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
+from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.crops import CROPS, ViewCrops, read_crops
 from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
@@ -312,7 +312,7 @@ def render_dataset(
     job: RenderJob,
     out: str | Path,
     pool: WorkerPool = IN_PROCESS,
-    progress: Callable[[int, int], object] = lambda done, total: None,
+    progress: Progress = lambda stage, done, total, note: None,
 ) -> ViewDataset:
     """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
 
@@ -323,7 +323,8 @@ def render_dataset(
         job: the job.
         out: directory: new, empty, or with a dataset of the same job; created with its parents.
         pool: worker processes that render; they do not affect the result.
-        progress: called with (clouds done, total clouds) at the start and after each shard.
+        progress: called with ("surfaces", objects done, number of objects, name) if the surfaces are computed, then
+            with ("render", clouds done, total clouds, "") at the start and after each shard.
 
     Raises:
         InputError: `out` holds something else or views of another job (the message names the difference), or another
@@ -337,13 +338,13 @@ def render_dataset(
     with locked(out):
         manifest = _begin(out, record)
         done = {shard.file: shard for shard in manifest.shards}
-        progress(_clouds(done), total)
         digest = manifest.surfaces
         is_missing = digest is not None and intact_content(out, SURFACES_FILE, digest) is None
         if is_missing or not (digest or done):  # a dataset of an earlier version has shards and no surfaces
-            digest = write_checked(out / SURFACES_FILE, surfaces_of(job.read_meshes()).content)
+            digest = write_checked(out / SURFACES_FILE, surfaces_of(job.read_meshes(progress)).content)
             manifest = dataclasses.replace(manifest, surfaces=digest)
             manifest.write(out)
+        progress("render", _clouds(done), total, "")
         missing = [file for file in job.shards if file not in done]
         with contextlib.closing(pool(render_task, job.tasks(missing))) as results:
             for file, rendered in zip(missing, results, strict=True):
@@ -352,7 +353,7 @@ def render_dataset(
                     done[file] = _store(out / file, labels[name], job.copies * len(views), rendered)
                 shards = tuple(done[file] for file in job.shards if file in done)
                 dataclasses.replace(manifest, shards=shards).write(out)
-                progress(_clouds(done), total)
+                progress("render", _clouds(done), total, "")
     return ViewDataset.open(out)
 
 

@@ -37,8 +37,9 @@ from training.rendering.camera import (
     view_angles,
 )
 
-if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
+if TYPE_CHECKING:  # not needed by rendering processes; the first one imports JAX
     from thor2_jax.types import Cloud
+    from training.storage.jobs import Progress
 
 __all__ = [
     "COORDINATE_STEP",
@@ -245,9 +246,12 @@ class RenderJob:
             "shards": len(self.shards),
         }
 
-    def read_meshes(self) -> Iterator[TexturedMesh]:
-        """Read the mesh of each object, one at a time."""
-        return map(_read_mesh, self.meshes.values())
+    def read_meshes(self, progress: "Progress") -> Iterator[TexturedMesh]:
+        """Read the mesh of each object, one at a time, to compute its surface, while showing the progress."""
+        for number, (name, source) in enumerate(self.meshes.items()):
+            progress("surfaces", number, len(self.meshes), name)
+            yield _read_mesh(source)
+        progress("surfaces", len(self.meshes), len(self.meshes), "")
 
     def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
         """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh."""

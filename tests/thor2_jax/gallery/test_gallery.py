@@ -216,18 +216,23 @@ def test_exact_search_in_chunks_equals_one_product(monkeypatch: pytest.MonkeyPat
     assert ExactSearch(embeddings[:3]).nearest(queries, 20)[1].shape == (5, 3)
 
 
+@pytest.fixture
+def usearch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let one thread build an index: the views that several threads connect depend on how busy the machine is."""
+    index_type = pytest.importorskip("usearch.index").Index
+    monkeypatch.setattr(index_type, "add", functools.partialmethod(index_type.add, threads=1))
+
+
+@pytest.mark.usefixtures("usearch")
 def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
     assert_refused("search is 'faiss'", Gallery, "", search="faiss")
-    pytest.importorskip("usearch")
     queries = np.concatenate([views_around(k, 3, seed=2) for k in range(3)]).astype(np.float32)
     indexed = dataclasses.replace(gallery, search="usearch")
     np.testing.assert_allclose(indexed.scores(queries), gallery.scores(queries), atol=0.02)
 
 
-def test_recall_of_the_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    index_type = pytest.importorskip("usearch.index").Index
-    # The recall of an index that several threads have built depends on how busy the machine is.
-    monkeypatch.setattr(index_type, "add", functools.partialmethod(index_type.add, threads=1))
+@pytest.mark.usefixtures("usearch")
+def test_recall_of_the_index() -> None:
     rng = np.random.default_rng(0)
     centers = np.repeat(unit(rng.normal(size=(500, 32))), 10, axis=0)
     embeddings = unit(centers + 0.6 * unit(rng.normal(size=centers.shape))).astype(np.float16)
@@ -238,8 +243,8 @@ def test_recall_of_the_index(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(similarity, np.einsum("qd,qnd->qn", queries, embeddings[index]), atol=5e-3)
 
 
+@pytest.mark.usefixtures("usearch")
 def test_queries_that_the_index_answers_in_part_are_searched_exactly() -> None:
-    pytest.importorskip("usearch")
     rng = np.random.default_rng(0)
     embeddings = unit(rng.normal(size=(40, 16))).astype(np.float16)
     queries = unit(rng.normal(size=(3, 16))).astype(np.float32)

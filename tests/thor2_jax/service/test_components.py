@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from processes import HANG
+from prometheus_client import values
 from service_requests import calls, check_refused
 
 import thor2_jax as thor2
@@ -253,11 +254,16 @@ def test_large_files_stay_in_memory(
     assert recognize.await_args is not None and recognize.await_args.args[0] == large
 
 
-def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its other counts are kept."""
+def test_metrics_are_those_of_all_living_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The counters of a dead worker are kept."""
     monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
     monkeypatch.setattr(server.Multiprocess, "keep_subprocess_alive", lambda self: self.processes.clear())
-    for name in (f"gauge_{Metrics().in_progress._multiprocess_mode}_7.db", "counter_7.db"):
-        (tmp_path / name).touch()
+    for pid in (7, 8):
+        monkeypatch.setattr(values, "ValueClass", values.MultiProcessValue(lambda pid=pid: pid))
+        worker = Metrics()
+        for metric in (worker.ready_workers, worker.in_progress, worker.compilations):
+            metric.inc()
+    assert worker.count_ready_workers() == 2 and b"thor2_requests_waiting 2.0" in worker.text()
     server._Supervisor.keep_subprocess_alive(Mock(server._Supervisor, processes=[Mock(pid=7)]))
-    assert [path.name for path in tmp_path.iterdir()] == ["counter_7.db"]
+    assert worker.count_ready_workers() == 1 and b"thor2_requests_waiting 1.0" in worker.text()
+    assert b"thor2_compilations_after_warm_up_total 2.0" in worker.text()

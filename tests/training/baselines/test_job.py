@@ -114,7 +114,7 @@ def test_damaged_and_foreign_files_are_refused(trained: Path, tmp_path: Path) ->
     folder, whole = write_run(tmp_path / "run"), baseline_file(trained, "forest")
     file, content, stored = baseline_file(folder, "forest"), whole.read_bytes(), read_baseline(whole, NAMES)
     for write, message in (
-        (lambda: write_baseline(file, stored, ("a", "b"), 1.0), "has other classes"),
+        (lambda: write_baseline(file, stored, ("a", "b"), 1.0), r"cannot be read \(it has other classes"),
         (lambda: write_baseline(file, StoredBaseline({}, None), NAMES, 1.0), "does not match its run"),
         (lambda: file.write_bytes(content[:-9]), "cannot be read"),
         (lambda: file.write_bytes(content[:-1] + bytes([content[-1] ^ 1])), "cannot be read"),

@@ -5,6 +5,7 @@ import json
 import shlex
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -193,6 +194,11 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
     assert "nothing was trained" in printed(*command)
     assert "nothing was trained" not in printed(*command, "--baselines", "forest")
+    for surfaces in (None, object()):
+        record = {"dataset": {}, "held_out_accuracy": {}}
+        trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces)
+        monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
+        assert ("no surfaces" in printed(*command)) == (surfaces is None)
 
 
 @pytest.mark.usefixtures("small_descriptors", "weights")

@@ -93,6 +93,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--meshes meshes --out full", "full"),
         ("--dataset absent", "absent"),
         ("--meshes meshes --baselines templates", "templates needs a backbone"),
+        ("--meshes meshes --baselines thor --azimuth-step 180", "baselines: thor needs views from the side"),
         ("--dataset views --names names.json", "names is names.json"),
         ("--dataset views --polar-step 20", "--polar-step is 20"),
         ("--dataset views --embedding 9", "distractors"),

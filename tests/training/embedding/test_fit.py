@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import runpy
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -58,10 +60,6 @@ def test_views_depend_on_their_object_only() -> None:
     again = render_clouds({4: 20}, 2)
     assert [index for index, _ in one] == [3, 3, 4, 4]
     np.testing.assert_equal(again, one[2:])
-
-
-def test_each_object_has_one_label(views: Samples) -> None:
-    assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -177,10 +175,14 @@ def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.M
     assert_refused("object 3 has no view", sample_objects, [3], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
 
 
-def test_a_file_of_the_user_is_not_replaced(tmp_path: Path) -> None:
+def test_a_file_of_the_user_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "embedding.safetensors").write_text("a user's")
     assert_refused("embedding.safetensors", build_embedding, tmp_path / "embedding.safetensors")
     assert (tmp_path / "embedding.safetensors").read_text() == "a user's"
+    (tmp_path / "new.checkpoints").touch()
+    monkeypatch.setattr(sys, "argv", ["build", "--out", str(tmp_path / "new")])
+    with pytest.raises(SystemExit, match="^error: .*new.checkpoints"):
+        runpy.run_path(build.__file__, run_name="__main__")
 
 
 @pytest.mark.slow

@@ -280,6 +280,9 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     probabilities = [i.probabilities for i in answers.instances]
     np.testing.assert_allclose(probabilities[:3], np.stack([tops, tops2], axis=1)[:3], rtol=1e-6)
     assert probabilities[3:] == [None] * 3
+    recognizer.describe, recognizer.probabilities = lambda _: described(instances[3:], {}), None  # is not called
+    ((_, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
+    assert [i.probabilities for i in answers.instances] == [None] * 6
 
 
 def test_position_is_the_median_of_the_points() -> None:

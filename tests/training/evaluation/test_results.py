@@ -161,6 +161,7 @@ def test_results_match_numpy_and_sklearn() -> None:
     assert sum(report["reliability"]["answers"]) == 2 * len(described)
     assert 0 < report["confidence"]["THOR2"]["auroc_known"]["mean"] < 1
     assert report["speed"]["frames_per_second"] == pytest.approx(2)
+    assert report["rejection"]["threshold"]["runs"] == 0 and report["rejection"]["accuracy"]["runs"] == 2
     # These runs have no temperatures.
     assert report["accuracy"]["calibrated"][0]["cells"][0]["accuracy"] == {}
     assert report["calibrated_confidence"] == {} and report["temperatures"]["ce"]["runs"] == 0
@@ -207,20 +208,6 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     points = dict(zip(curve["kept"], curve["named"], strict=True))
     assert [points[0.0], points[0.33], points[0.5], points[0.95], points[1.0]] == pytest.approx([0, 0, 0, 1 / 3, 1 / 3])
     assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
-
-
-def test_results_of_one_instance() -> None:
-    incorrect = InstancePrediction(1, "mug", probabilities=np.eye(2, 3, dtype=np.float32))
-    for instance in (incorrect, InstancePrediction(1, "mug", reason="too few points")):
-        report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 1.0, [instance])])
-        assert report["instances"]["scored"] == 1 and report["published_tables"] == []
-        assert report["fusions"] == ["TOPS", "TOPS2", "THOR2"] and report["known_unknown"] is None
-        accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
-        assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
-        assert report["confusion"][2][3] == (instance.reason is not None)
-        assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
-        assert report["rejection"]["threshold"]["runs"] == 0
-        assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 def test_grouping_by_attributes() -> None:

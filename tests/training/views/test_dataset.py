@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from commands import Command
-from failures import Interrupted, full_disk
+from failures import Interrupted
 from refusals import assert_refused
 from rendered_objects import write_box
 from small_clouds import random_clouds
@@ -68,17 +68,6 @@ def copied(whole: Path, tmp_path: Path) -> Path:
 def resized(factor: float) -> TexturedMesh:
     ball = OBJECTS["tennis_ball"]
     return dataclasses.replace(ball, vertices=ball.vertices * factor)
-
-
-def test_files_of_a_dataset(whole: Path) -> None:
-    dataset = ViewDataset.open(whole)
-    names = [f"{label:04}-{number:04}.safetensors" for label in (0, 1) for number in (0, 1)]
-    assert [shard.file for shard in dataset.shards] == names
-    shards = [(shard.label, shard.views, shard.left_out) for shard in dataset.shards]
-    assert shards == [(0, 4, 0), (0, 2, 0), (1, 4, 0), (1, 2, 0)]
-    assert set(files_of(whole)) == {MANIFEST, SURFACES_FILE, *names}
-    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(6))
-    assert "time" not in (whole / MANIFEST).read_text()
 
 
 @pytest.mark.slow
@@ -136,13 +125,14 @@ def test_rendering_resumes(stops: Sequence[int], whole: Path, tmp_path: Path, mo
         with pytest.raises(InputError, match=MANIFEST) if stop < 22 else contextlib.nullcontext():
             ViewDataset.open(out)
         left, before = 0, files_of(out)
-        seen: list[tuple[int, int]] = []
-        render_dataset(JOB, out, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
+        seen: list[tuple[str, int, int]] = []
+        render_dataset(JOB, out, progress=lambda *step: seen.append(step[:3]))  # noqa: B023
         assert files_of(out) == files_of(whole)
         # Shards that were listed are not rendered again.
         stored = json.loads(before.get(MANIFEST, '{"views": 0}'))
-        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= stored["views"]]
-        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before) + 2 * ("surfaces" not in stored))
+        rendered = [("render", done, 12) for done in (0, 4, 6, 10, 12) if done >= stored["views"]]
+        assert seen == [("surfaces", done, 2) for done in range(3) if "surfaces" not in stored] + rendered
+        assert left == -2 * (2 * (len(rendered) - 1) + (MANIFEST not in before) + 2 * ("surfaces" not in stored))
 
 
 def changed(folder: Path) -> dict[str, int]:
@@ -253,23 +243,6 @@ def test_other_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / MANIFEST).write_text('{"format": 1}')
     assert_refused("manifest.json has format 1; expected 2", render_dataset, JOB, tmp_path)
     assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
-
-
-def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is room for a manifest, but not for a shard."""
-    replace = os.replace
-
-    def full_for_shards(source: Path, target: Path) -> None:
-        full_disk() if target.suffix == ".safetensors" else replace(source, target)
-
-    (copied / "0001-0000.safetensors").unlink()
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
-        patch.setattr(os, "replace", full_for_shards)
-        render_dataset(JOB, copied)
-    assert set(files_of(whole)) - set(files_of(copied)) == {"0001-0000.safetensors"}
-    assert_refused("3 of 4 shards", ViewDataset.open, copied)
-    render_dataset(JOB, copied)
-    assert files_of(copied) == files_of(whole)
 
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
