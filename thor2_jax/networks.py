@@ -30,12 +30,12 @@ __all__ = [
     "MLP",
     "THOR2",
     "Classifier",
+    "Compiled",
     "EmbeddingNetwork",
     "EmbeddingSizes",
     "Feature",
     "check_features",
     "class_cosines",
-    "compiled",
     "feature_of",
     "input_size",
     "model_arrays",
@@ -293,7 +293,7 @@ def projected_features(descriptors: Descriptors, statistics: jax.Array, version:
     return jnp.concatenate(parts, axis=1)
 
 
-class compiled:
+class Compiled:
     """The compiled `function(modules, inputs, *static)` as a function of the inputs, a pytree of arrays.
 
     Models of the same sizes share compiled programs. The weights are passed as a flat list and the graphs are no
@@ -319,7 +319,7 @@ class compiled:
         return self._call(inputs)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return compiled, self._arguments
+        return Compiled, self._arguments
 
 
 @lru_cache(maxsize=32)

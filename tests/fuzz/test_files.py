@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from image_files import encode_npy, png_file, png_of_zeros, with_checksums
 from refusals import assert_refused
 
-from thor2_jax.frames.frames import Intrinsics, encode_image, read_color, read_depth, read_intrinsics, read_labels
+from thor2_jax.frames.frames import Intrinsics, encode_image, read_color, read_depth, read_labels
+from thor2_jax.frames.intrinsics import read_intrinsics
 from thor2_jax.testing import damaged
 from training.baselines.baseline import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction

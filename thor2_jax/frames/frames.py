@@ -42,9 +42,7 @@ __all__ = [
     "read_color",
     "read_depth",
     "read_frame",
-    "read_intrinsics",
     "read_labels",
-    "stamp_name",
 ]
 
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
@@ -381,12 +379,6 @@ def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | N
     name = as_path(color, "color").stem
     intrinsics = read_intrinsics(path, int(name) if name.isdecimal() else None)
     return intrinsics if depth_scale is None else dataclasses.replace(intrinsics, depth_scale=depth_scale)
-
-
-def stamp_name(stamp: int) -> str:
-    """Return a time stamp in nanoseconds as text in seconds: the name of a recorded frame."""
-    seconds, nanoseconds = divmod(abs(stamp), 10**9)
-    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 @dataclasses.dataclass(frozen=True)

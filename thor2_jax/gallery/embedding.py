@@ -31,9 +31,9 @@ from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, describe_look
 from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.networks import (
+    Compiled,
     EmbeddingNetwork,
     EmbeddingSizes,
-    compiled,
     model_arrays,
     model_from_arrays,
     to_unit_length,
@@ -251,7 +251,7 @@ class Embedding:
 
     @functools.cached_property
     def _embed_looks(self) -> Callable[[LookDescriptors], jax.Array]:
-        return compiled(_embed_looks, [self._embedder])
+        return Compiled(_embed_looks, [self._embedder])
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
@@ -287,7 +287,7 @@ class Embedding:
         if self.sizes.views and self.references is not None:
             with jax.ensure_compile_time_eval():  # as in `_split`; keeps the views on the device
                 models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
-        return compiled(_class_probabilities, models, *static)
+        return Compiled(_class_probabilities, models, *static)
 
     @functools.cached_property
     def _content(self) -> bytes:

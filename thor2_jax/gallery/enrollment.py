@@ -233,10 +233,10 @@ class ObjectGallery:
         objects, references = self.gallery.objects.values(), self.gallery.references
         few = sum(len(views.clouds) < FEW for views in objects)
         if few:
-            return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
+            return f"enrolled objects with fewer than {FEW} views: {few} of {len(objects)}; add views from other sides"
         has_surfaces = all(views.surface is not None for views in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
-            return f"{len(objects)} objects are enrolled in a run without reference views; enroll more of them"
+            return f"objects enrolled in a run without reference views: {len(objects)}; enroll more of them"
         return ""
 
     def refresh(self) -> bool:

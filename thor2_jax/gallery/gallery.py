@@ -142,6 +142,10 @@ class Gallery:
         if self.search not in ("exact", "usearch"):
             raise InputError(f"search is {self.search!r}; expected 'exact' or 'usearch'")
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields without cached properties, to send the gallery to another process."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the objects, in the order of the scores."""

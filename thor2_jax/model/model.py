@@ -26,7 +26,7 @@ from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import EMBEDDING, MLP, THOR2, Classifier, Feature, compiled, feature_of
+from thor2_jax.networks import EMBEDDING, MLP, THOR2, Classifier, Compiled, Feature, feature_of
 
 __all__ = ["ColorTransform", "Model"]
 
@@ -157,7 +157,7 @@ class Model:
         """
         wanted = _check_answer_by(answer_by) or _check_answer_by(run.record.get("answer_by"))
         classifiers: dict[str, Classifier] = {
-            name: compiled(_fused_probabilities, [nnx.split(each)], name) for name, each in run.classifiers.items()
+            name: Compiled(_fused_probabilities, [nnx.split(each)], name) for name, each in run.classifiers.items()
         }
         if run.embedding_classifier is not None:
             classifiers[EMBEDDING] = run.embedding_classifier

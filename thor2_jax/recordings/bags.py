@@ -26,9 +26,9 @@ import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
 from thor2_jax.files import open_file, parse_yaml, read_file
-from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
+from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_name, stamp_of
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 __all__ = ["Bag"]

@@ -16,7 +16,7 @@ from thor2_jax.errors import InputError, decoding
 from thor2_jax.frames.frames import MAX_IMAGE_PIXELS, decode_image
 from thor2_jax.model.recognition import Detection
 
-__all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_of"]
+__all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_name", "stamp_of"]
 
 _COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "8uc3": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8uc4": "bgra"}
 """Encoding in lower case -> channels; the order of 8UC3 and 8UC4 is that of cv_bridge."""
@@ -35,6 +35,12 @@ def stamp_of(message: Any) -> int:
     """Return the time stamp of a message's header, nanoseconds; 0 if it was not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def stamp_name(stamp: int) -> str:
+    """Return a time stamp in nanoseconds as text in seconds: the name of a recorded frame."""
+    seconds, nanoseconds = divmod(abs(stamp), 10**9)
+    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def image_kind(message: Any) -> str:

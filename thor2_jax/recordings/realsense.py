@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, reason_of
-from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
+from thor2_jax.recordings.messages import stamp_name
 
 __all__ = ["RealSenseCamera"]
 

@@ -23,7 +23,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import compiled
+from thor2_jax.networks import Compiled
 from thor2_jax.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
@@ -292,7 +292,7 @@ def compiled_network(
     model: nnx.Module, inputs: Callable[..., tuple[Any, ...]], output: Callable[[Any], Any] = jax.nn.softmax
 ) -> Callable[[tuple[Any, ...]], jax.Array]:
     """Return a compiled function of a tuple of arrays: `output` of the network applied to `inputs` of the arrays."""
-    return compiled(_apply, [nnx.split(model)], inputs, output)
+    return Compiled(_apply, [nnx.split(model)], inputs, output)
 
 
 def in_batches(function: Callable[[tuple[Any, ...]], Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:

@@ -196,7 +196,7 @@ class FrameOptions:
 
     def open_bag(self) -> "Bag":
         """Return the recording, without opening it yet."""
-        from thor2_jax.frames.frames import read_intrinsics
+        from thor2_jax.frames.intrinsics import read_intrinsics
         from thor2_jax.recordings.bags import Bag
 
         assert self.bag is not None

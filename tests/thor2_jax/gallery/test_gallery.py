@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -229,6 +230,8 @@ def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
     queries = np.concatenate([views_around(k, 3, seed=2) for k in range(3)]).astype(np.float32)
     indexed = dataclasses.replace(gallery, search="usearch")
     np.testing.assert_allclose(indexed.scores(queries), gallery.scores(queries), atol=0.02)
+    received = pickle.loads(pickle.dumps(indexed))  # builds its index again
+    np.testing.assert_allclose(received.scores(queries), gallery.scores(queries), atol=0.02)
 
 
 @pytest.mark.usefixtures("usearch")
