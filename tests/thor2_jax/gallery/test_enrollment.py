@@ -55,9 +55,9 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
     assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ())).objects
-    assert "2 of 2 enrolled objects" in alone.weak_rejection
+    assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
-    assert alone.weak_rejection.startswith("1 of 2")
+    assert ": 1 of 2;" in alone.weak_rejection
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
     assert ObjectGallery(()).gallery.summary == "no object yet"
