@@ -1,4 +1,4 @@
-"""Camera poses against spherical coordinates, and views of a box."""
+"""Camera poses against spherical coordinates, and ray casting against Moeller and Trumbore in float64."""
 
 import math
 
@@ -9,7 +9,7 @@ from refusals import assert_refused
 from rendered_objects import full_image
 from segmentation_scenes import surface
 
-from thor2_jax.frames.frames import Intrinsics, backproject
+from thor2_jax.frames.frames import Intrinsics
 from training.rendering.camera import DISTANCE, Camera, RayCaster, camera_pose, pixel_rays, render_view, view_angles
 
 CAMERA = Camera.from_field_of_view(161, 121, 30.0)
@@ -46,20 +46,32 @@ def test_camera_pose(azimuth: float, polar: float) -> None:
     assert pose[3].tolist() == [0, 0, 0, 1] and (pose[2, 1] < 0 or polar in (0, math.pi))
 
 
-def test_a_view_lies_on_the_surface_and_crops_nothing_visible() -> None:
+def intersect_triangles(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Return the depth along each ray with the algorithm of Moeller and Trumbore in float64; 0 without a hit."""
+    nearest = np.full(len(rays), np.inf)
+    for a, b, c in shape.triangles:
+        p = np.cross(rays, c - a)
+        q = np.cross(origin - a, b - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / (p @ (b - a))
+            u, v, t = p @ (origin - a) * inverse, rays @ q * inverse, (c - a) @ q * inverse
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
+        nearest[hit] = t[hit]
+    return np.where(np.isinf(nearest), 0, nearest)
+
+
+def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     camera = Camera(161, 121, Intrinsics(300.0, 280.0, 60.0, 80.0))
-    centre, sides = (0.02, -0.01, 0.03), (0.06, 0.05, 0.12)
-    shape = trimesh.creation.box(sides)
-    shape.apply_translation(centre)
-    pose, caster = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6), RayCaster([surface(shape, RED)])
-    view = render_view(caster, pose, camera)
+    shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
+    shape.apply_translation([0.02, -0.01, 0.03])
+    pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)
+    view = render_view(RayCaster([surface(shape, RED)]), pose, camera)
     assert view.depth.size < camera.width * camera.height / 2
     _, depth = full_image(view, camera)
-    hits = caster.cast(pose[:3, 3], pixel_rays(camera.intrinsics, camera.height, camera.width, pose))
-    assert np.array_equal(depth.ravel() > 0, hits.mesh == 0)
-    points = backproject(depth / 1000, camera.intrinsics)[depth > 0] @ pose[:3, :3].T + pose[:3, 3]
-    # Depth is rounded to millimetres.
-    np.testing.assert_allclose(np.abs((points - centre) / sides).max(axis=1), 0.5, atol=0.012)
+    rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
+    expected = intersect_triangles(shape, pose[:3, 3], rays).reshape(depth.shape)
+    assert np.array_equal(depth > 0, expected > 0)
+    assert np.abs(depth - expected * 1000).max() <= 0.501
 
 
 def test_an_object_outside_the_image_leaves_it_empty() -> None:
