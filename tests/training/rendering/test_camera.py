@@ -60,13 +60,15 @@ def intersect_triangles(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.nda
     return np.where(np.isinf(nearest), 0, nearest)
 
 
-def test_matches_another_intersector_and_crops_nothing_visible() -> None:
+@pytest.mark.parametrize(("azimuth", "polar", "distance"), [(2.0, 1.9, 0.6), (0.0, 2.5, 0.02)])
+def test_matches_another_intersector_and_crops_nothing_visible(azimuth: float, polar: float, distance: float) -> None:
+    """The camera may be inside the object."""
     camera = Camera(161, 121, Intrinsics(300.0, 280.0, 60.0, 80.0))
     shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
     shape.apply_translation([0.02, -0.01, 0.03])
-    pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)
+    pose = camera_pose(azimuth, polar, np.array([0.0, 0.01, 0.05]), distance)
     view = render_view(RayCaster([surface(shape, RED)]), pose, camera)
-    assert view.depth.size < camera.width * camera.height / 2
+    assert (view.depth.size < camera.width * camera.height / 2) == (distance > 0.1)
     _, depth = full_image(view, camera)
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
     expected = intersect_triangles(shape, pose[:3, 3], rays).reshape(depth.shape)
