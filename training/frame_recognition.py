@@ -68,8 +68,9 @@ class FrameAnswer:
             line["depth_gap"] = self.recorded.gap / 1e9
         if self.error is not None:
             return {**line, "error": self.error}
-        plain = [dataclasses.asdict(answer) for answer in self.recognitions]
-        return {**line, "instances": plain if self.recorded is None else detections_as_json(self.detections)}
+        if self.recorded is not None:
+            return {**line, "instances": detections_as_json(self.detections)}
+        return {**line, "instances": [dataclasses.asdict(answer) for answer in self.recognitions]}
 
 
 def recognize_frames(

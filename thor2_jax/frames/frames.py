@@ -254,7 +254,7 @@ def decode_image(
 def encode_image(image: NDArray[Any] | Image.Image, kind: str = "PNG", **options: Any) -> bytes:
     """Return the content of an image file with these pixels; the options are those of Pillow."""
     stream = io.BytesIO()
-    Image.fromarray(np.asarray(image)).save(stream, kind, **options)
+    (image if isinstance(image, Image.Image) else Image.fromarray(image)).save(stream, kind, **options)
     return stream.getvalue()
 
 

@@ -92,7 +92,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
             raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")
         stored = [stored[name] for name in names]
     if len(stored) != len(names):
-        raise InputError(f"poses: length of {path} is {len(stored)}; expected {len(names)}, one pose for each frame")
+        raise InputError(f"poses: their number in {path} is {len(stored)}; expected {len(names)}, one for each frame")
     return [
         check_pose(pose, f"poses: {path}: the pose of frame {name}") for name, pose in zip(names, stored, strict=True)
     ]
