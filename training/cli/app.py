@@ -120,8 +120,8 @@ app = typer.Typer(
 )
 # A closed stream is None, and its file descriptor would go to the next file that is opened.
 sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
-# Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, which are
-# therefore at least 72 wide: the terminal breaks their lines. Names of objects may look like markup.
+# Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so
+# tables are at least 72 wide, and the terminal breaks their lines. Names of objects may look like markup.
 WIDTH = max(shutil.get_terminal_size().columns, 72) if sys.stdout.isatty() else 160
 console = Console(width=WIDTH, markup=False, emoji=False)
 
