@@ -41,6 +41,8 @@ class TrainJob:
             are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`; their instances are used as views of their classes, too.
+            A run with an embedding also enrolls those of classes without a mesh: a few views are recognized better by
+            comparison with each other than by networks that were fitted on them.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         baselines: any of `BASELINES`.
         weights: folder of pretrained weights for the image networks; None trains them from scratch.
@@ -113,8 +115,10 @@ def run_train_job(
     stages = job.stages if stages is None else stages
     shown = numbered(progress, stages)
     source = _open_views(job, labelled, shown)
+    enrolled = source.without_mesh if isinstance(source, WithLabelledViews) else {}
     if job.leave_out:
         source = WithoutClasses(source, job.leave_out)
+        enrolled = {name: views for name, views in enrolled.items() if name in source.classes}
     sources = {job.out: source}
     if job.sequences is not None:
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
@@ -130,7 +134,8 @@ def run_train_job(
     for directory, views in sources.items():
         if job.sequences is not None:
             shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), stages)
-        runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown)
+        is_done = is_finished(directory)
+        runs[directory] = [] if is_done else train_run(views, directory, job.protocol, shown, enrolled)
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:

@@ -4,6 +4,7 @@ RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with 
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
 RUN/surfaces.safetensors              surfaces of the classes, if all were trained from meshes
+RUN/gallery/                          with an embedding: the labelled real views, enrolled
 RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
@@ -28,7 +29,10 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
+from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
 from thor2_jax.networks import EMBEDDING, MLP, Feature
@@ -130,7 +134,11 @@ def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> 
 
 
 def train_run(
-    source: ViewSource, out: str | Path, settings: Protocol, progress: Progress = lambda stage, done, total, note: None
+    source: ViewSource,
+    out: str | Path,
+    settings: Protocol,
+    progress: Progress = lambda stage, done, total, note: None,
+    enrolled: Mapping[str, Sequence[PreparedInstance]] | None = None,
 ) -> list[TrainedRun]:
     """Train the classifiers and the embedding of each fold and write the run directories; resume if interrupted.
 
@@ -142,6 +150,7 @@ def train_run(
         out: run directory: new, empty, or of the same training, interrupted; the folds are written to `out`/fold-0, ...
         settings: everything else that determines the runs.
         progress: called with the `stages` of the settings.
+        enrolled: class -> views that a run with an embedding also enrolls, in its gallery.
 
     Returns:
         The run of each fold, loaded from its directory.
@@ -191,7 +200,8 @@ def train_run(
         runs = []
         for fold in range(settings.folds):
             held_out = None if parts == 1 else fold_of == fold
-            runs.append(_Fold(settings, source, out, fold, samples, label, view, held_out, progress).train())
+            of_fold = _Fold(settings, source, out, fold, samples, label, view, held_out, progress, enrolled or {})
+            runs.append(of_fold.train())
         wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")
@@ -214,6 +224,7 @@ class _Fold(NamedTuple):
     view: NDArray[np.integer[Any]]
     held_out: NDArray[np.bool_] | None
     progress: Progress
+    enrolled: Mapping[str, Sequence[PreparedInstance]]
 
     @property
     def scratch(self) -> Path:
@@ -226,7 +237,7 @@ class _Fold(NamedTuple):
         if not (directory / RUN_FILE).is_file():
             run = self.fit_classifiers()
             if jax.process_index() == 0:
-                _publish(self.complete_run(run), self.scratch / "run", directory)
+                _publish(self.complete_run(run), self.scratch / "run", directory, self.enrolled)
             wait_for_all("published")
         return load_run(directory)
 
@@ -327,12 +338,19 @@ def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, in
     return {"kept_epochs": dict(best_epochs), "held_out_accuracy": held_out, "curves": curves}
 
 
-def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
-    """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
+def _publish(
+    run: TrainedRun, complete: Path, directory: Path, enrolled: Mapping[str, Sequence[PreparedInstance]]
+) -> None:
+    """Write a run and its enrolled views to `complete` and move the files into `directory`; run.json is moved last."""
     shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed in this function
     save_run(run, complete)
-    for name in ("", "weights"):
-        (directory / name).mkdir(exist_ok=True)
+    if enrolled and run.embedding is not None:
+        objects = ObjectGallery(run.classes, run.embedding)
+        objects.open(complete / GALLERY_DIRECTORY)
+        views = {name: enrolled_views(run.embedding, each, "frames") for name, each in enrolled.items()}
+        objects.add(views, extend=True)
     files = [path for path in complete.rglob("*") if path.is_file()]
     for path in sorted(files, key=lambda path: path.name == RUN_FILE):
-        path.rename(directory / path.relative_to(complete))
+        place = directory / path.relative_to(complete)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(place)

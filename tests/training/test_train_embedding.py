@@ -15,6 +15,7 @@ from small_clouds import brick_and_stick
 from small_runs import SMALL_CONFIG
 
 from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
@@ -133,15 +134,21 @@ def test_invalid_and_changed_distractors_are_refused(whole: Whole) -> None:
     assert_refused("there are 9 objects", dataclasses.replace, DISTRACTORS, procedural=9)
 
 
-def test_folds_of_embeddings_share_their_distractors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folds_share_distractors_and_enroll_given_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("THOR2_CACHE", "off")
     sample = mock.Mock(wraps=distractors.sample_normalized)
     monkeypatch.setattr(distractors, "sample_normalized", sample)
     stages: dict[str, None] = {}
+    views = [PreparedInstance(1, xyz, rgb, np.zeros(len(xyz), bool)) for xyz, rgb in CLOUDS[CLASSES[1]]]
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
-    runs = train(tmp_path / "run", short, progress=lambda stage, *values: stages.setdefault(stage))
+    seen, enrolled = (lambda stage, *values: stages.setdefault(stage)), {CLASSES[1]: views}
+    runs = train(tmp_path / "run", short, progress=seen, enrolled=enrolled)
     assert list(stages) == list(short.stages)
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
     assert sample.call_count == 1
+    for fold in range(2):
+        recognizer = Recognizer.load(tmp_path / f"run/fold-{fold}")
+        assert recognizer.model.answers_by() == "both" and recognizer.classes == CLASSES
+        assert {name: len(each.clouds) for name, each in recognizer.gallery.objects.items()} == {CLASSES[1]: 8}

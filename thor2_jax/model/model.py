@@ -216,7 +216,8 @@ class Model:
         of earlier versions). For a class with an output of the classifiers, it is measured on held-out views and stored
         in the run, or 0 in runs without it. For other objects, and for all names if the gallery alone answers, it
         depends on the number of enrolled views or has one value for objects with a surface, see
-        `Gallery.unknown_below`.
+        `Gallery.unknown_below`. For a class that has views, too, it is the value that `Gallery.combine` computes where
+        both the classifiers and the gallery are at their thresholds.
 
         Args:
             answer_by: source of the answers, see `answers_by`.
@@ -226,9 +227,9 @@ class Model:
         thresholds = self.gallery.of_gallery(self.gallery.unknown_below[None])[0]
         if self.answers_by(answer_by) == "gallery":
             return thresholds
-        return np.where(
-            self.gallery.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds
-        )
+        c = self.calibration.unknown_below if self.calibration else 0.0
+        m = (1 - c) * thresholds / (1 - thresholds)
+        return np.where(self.gallery.has_output, (c + m) / (1 + m) if c else 0.0, thresholds)
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
         """Return an instance with its colours corrected by `color_transform`."""

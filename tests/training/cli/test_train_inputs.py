@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
+from training import train_job
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_descriptors")
 TINY = ("--embedding", 0, "--orientation-copies", 0, "--classifiers", "ce", "--epochs", 1, "--batch-size", 4, "--quiet")
@@ -35,7 +37,9 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     run = tmp_path / "run"
     command = ("train", "--frames", frames / "0", frames / "1", "--out", run, *TINY)
-    out = printed(*command)
+    with mock.patch.object(train_job, "train_run", wraps=train_job.train_run) as trained:
+        out = printed(*command)
+    assert list(trained.call_args.args[-1]) == ["brick", "book"]  # whose views are enrolled if there is an embedding
     assert out.count("skipped: ") == 1 and "1: instance 7" in out
     record: Any = load_run(run).record["dataset"]
     assert record["views"] == 4 * 9 and record["frames"]["instances"] == {"brick": 2, "book": 2}
@@ -52,7 +56,9 @@ def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed:
     """The brick has a mesh and frames, the box a mesh, the book frames."""
     run = tmp_path / "run"
     command = ("--meshes", meshes, "--frames", frames, "--out", run, *STEPS, *TINY)
-    assert run_thor2("train", *command) == 0
+    with mock.patch.object(train_job, "train_run", wraps=train_job.train_run) as trained:
+        assert run_thor2("train", *command) == 0
+    assert list(trained.call_args.args[-1]) == ["book"]
     record: Any = load_run(run).record["dataset"]
     assert {entry["name"] for entry in record["job"]["objects"]} == {"box", "brick"}
     assert record["frames"]["instances"] == {"brick": 2, "book": 2}
