@@ -117,8 +117,10 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
 
 def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
     figure, axes = _figure()
+    figure.set_layout_engine("compressed")  # The label of a flat cloud was cut off.
     instance = explanation.instance
     plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
+    axes.locator_params(axis="x", nbins=3)  # The numbers of a narrow cloud overlapped.
     _color_bar(figure, axes, explanation)
     caption = f"The {len(instance.points)} points of the object as the camera sees them, in the same colours."
     return ExplanationPicture("cloud", "decided", "What decided, on the points", caption, figure)
@@ -163,13 +165,13 @@ def loss_text(explanation: Explanation, loss: float) -> str:
 def change_text(change: Change) -> str:
     """Return a change in words.
 
-    >>> change_text(Change("extent", (0.9, 1.0, 1.25), 0.25, "bowl", -0.1))
+    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", -0.1))
     'longest side -10 %, middle side +0 %, shortest side +25 %'
     """
     if change.kind == "color":
-        return "red {:+.0f}, green {:+.0f}, blue {:+.0f} (of 255)".format(*change.values)
+        return "red {:+z.0f}, green {:+z.0f}, blue {:+z.0f} (of 255)".format(*change.values)
     percent = [100 * (factor - 1) for factor in change.values]
-    return "longest side {:+.0f} %, middle side {:+.0f} %, shortest side {:+.0f} %".format(*percent)
+    return "longest side {:+z.0f} %, middle side {:+z.0f} %, shortest side {:+z.0f} %".format(*percent)
 
 
 def _changes(explanation: Explanation) -> ExplanationPicture:

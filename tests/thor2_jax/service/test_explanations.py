@@ -212,6 +212,9 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
     requests[1].fulfill(json=ANSWER)
     for text in ("2.5", "red +20", "rises by 0.10"):
         expect(page.locator("#why-status")).to_contain_text(text)
+    page.route("**/v1/why", answered("/v1/why", json=ANSWER | {"margin": -0.04}))
+    page.get_by_role("button", name="Why?").click()
+    expect(page.locator("#why-status")).to_contain_text(": 0.0. ")
     shown = page.locator("#why-pictures canvas")
     expect(shown).to_have_count(2)
     assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
