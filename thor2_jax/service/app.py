@@ -162,8 +162,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         async with service.admit(partial(read_form, request, schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
             return await service.why(files, admitted)
 
-    arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
-    responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
+    responses = {200: {"content": {NPZ: schemas.ARRAYS}}, **error_responses(408, 413, 415, 422, 429, 503, 504)}
     body = {"requestBody": schemas.CLOUDS_BODY}
 
     @routes.post("/v1/describe", response_model=schemas.DescribeAnswer, responses=responses, openapi_extra=body)

@@ -205,9 +205,7 @@ class Service:
                     body = await read_body()
                 yield request, body
         except TimeoutError:
-            if "upload" in request.seconds:
-                raise RequestError(504) from None
-            raise RequestError(408, "body") from None
+            raise (RequestError(504) if "upload" in request.seconds else RequestError(408, "body")) from None
         finally:
             self._in_progress -= 1
             self.metrics.in_progress.dec()

@@ -45,8 +45,7 @@ def check_answers(run: Path, frame: thor2.RGBDFrame) -> list[float | None]:
     answers = recognize(engine.model, instances, results)
     assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
     assert engine.model.names == recognizer.classes
-    unusable = [instance for instance in instances if instance.reason is not None]
-    assert {answer.name for answer in recognize(engine.model, unusable, [])} == {None}
+    assert {a.name for a in recognize(engine.model, [i for i in instances if i.reason is not None], [])} == {None}
     given = [answer for answer in answers if answer.confidence is not None]
     confidences = [
         calibrated_confidence(engine.model, answer, one.inference) for answer, one in zip(given, results, strict=True)
