@@ -320,7 +320,7 @@ def test_errors_name_the_argument(recognizer: Recognizer) -> None:
 def test_texts_of_a_tall_photo_and_of_a_flat_cloud_are_inside(explanation: Explanation) -> None:
     """The titles touched the border of a photo with a ratio of sides of 1.2, and the label of an axis was cut off."""
     points = explanation.instance.points
-    flat = (points - points.min(axis=0)) / np.ptp(points, axis=0) * [0.144, 0.037, 0.03] - [0.5, 0.055, -1]
+    flat = (points - points.min(axis=0)) / np.ptp(points, axis=0) * [0.144, 0.03744, 0.03] - [0.5, 0.055, -1]
     instance = dataclasses.replace(explanation.instance, points=flat.astype(np.float32))
     labels = np.where(np.arange(len(FRAME.labels))[:, None] < 58, FRAME.labels, 0)
     tall = dataclasses.replace(FRAME, labels=labels)
