@@ -347,9 +347,8 @@ def _recognitions(response: httpx.Response) -> tuple[list[Recognition], NDArray[
 
 
 def _recognition(instance: Mapping[str, Any]) -> Recognition:
-    fields = {name: value for name, value in instance.items() if name not in ("top", "unrecognized")}
     top = {classifier: [(c["name"], c["probability"]) for c in best] for classifier, best in instance["top"].items()}
-    return Recognition(**fields, top=top, reason=instance["unrecognized"])
+    return _known({**instance, "top": top, "reason": instance["unrecognized"]}, Recognition)
 
 
 def _label_image(label_map: Mapping[str, Any]) -> NDArray[np.int32]:
@@ -372,7 +371,7 @@ def _model(response: httpx.Response) -> ServiceModel:
 def _known(values: Mapping[str, Any], kind: type[T]) -> T:
     """Return a record; entries that only later versions of the service have are ignored."""
     names = [field.name for field in dataclasses.fields(cast(Any, kind))]
-    return kind(**{name: values[name] for name in names})
+    return kind(**{name: values[name] for name in names if name in values})
 
 
 def _generation(response: httpx.Response) -> int:

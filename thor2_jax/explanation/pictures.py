@@ -40,11 +40,11 @@ class ExplanationPicture:
 
 
 def _figure(width: float = 5.2, height: float = 4.4, rows: int = 1, columns: int = 1, **options: Any) -> Any:
-    """Return a figure, whose size is in inches, and its axes; the other arguments are those of `subplots`.
+    """Return a figure, whose size is in inches, and its axes; the other arguments are a layout and those of `subplots`.
 
     With 130 pixels per inch, a picture of the default size is legible on a telephone, too.
     """
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout=options.pop("layout", "constrained"))
     return figure, figure.subplots(rows, columns, **options)
 
 
@@ -98,8 +98,8 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     colored = plot.attribution_colors(explanation.attributions.values).to_rgba(np.where(high > -low, high, low))
     shown[known] = colored[:, :3]
     wide = color.shape[1] > 1.5 * color.shape[0]
-    figure = Figure(figsize=(5.2, 5.4 if wide else 3.8), layout="compressed")
-    first, second = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
+    shape = (5.4, 2, 1) if wide else (3.8, 1, 2)
+    figure, (first, second) = _figure(5.2, *shape, layout="compressed")
     first.imshow(color)
     second.imshow(shown)
     first.set_title("the object", fontsize=10)
@@ -116,9 +116,10 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
 
 
 def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
-    figure, axes = _figure()
+    figure, axes = _figure(layout="compressed")  # Otherwise the label of a flat cloud is cut off.
     instance = explanation.instance
     plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
+    axes.locator_params(axis="x", nbins=3)  # More numbers of a narrow cloud overlap.
     _color_bar(figure, axes, explanation)
     caption = f"The {len(instance.points)} points of the object as the camera sees them, in the same colours."
     return ExplanationPicture("cloud", "decided", "What decided, on the points", caption, figure)
@@ -163,13 +164,13 @@ def loss_text(explanation: Explanation, loss: float) -> str:
 def change_text(change: Change) -> str:
     """Return a change in words.
 
-    >>> change_text(Change("extent", (0.9, 1.0, 1.25), 0.25, "bowl", -0.1))
+    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", -0.1))
     'longest side -10 %, middle side +0 %, shortest side +25 %'
     """
     if change.kind == "color":
-        return "red {:+.0f}, green {:+.0f}, blue {:+.0f} (of 255)".format(*change.values)
-    percent = [100 * (factor - 1) for factor in change.values]
-    return "longest side {:+.0f} %, middle side {:+.0f} %, shortest side {:+.0f} %".format(*percent)
+        return "red {:+d}, green {:+d}, blue {:+d} (of 255)".format(*map(round, change.values))
+    percent = [round(100 * (factor - 1)) for factor in change.values]
+    return "longest side {:+d} %, middle side {:+d} %, shortest side {:+d} %".format(*percent)
 
 
 def _changes(explanation: Explanation) -> ExplanationPicture:

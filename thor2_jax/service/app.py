@@ -41,7 +41,7 @@ __all__ = ["create_app"]
 WHY_SECONDS = 90.0
 """Shortest deadline of an explanation, since explanations wait for one another."""
 
-FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
+FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 500, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
 
 
@@ -136,10 +136,10 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; a frame without labels is segmented."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
-            prepared, _, recognitions = await service.recognize(files, admitted)
+            model, prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
-            knows=service.engine.model.gallery.summary,
+            knows=model.gallery.summary,
             label_map=prepared.label_map,
             adaptation=adaptation_answer(service.engine.adaptation),
             timings=admitted.milliseconds(),
@@ -149,8 +149,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
         async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
-            recognized = await service.recognize(files, admitted, with_label_map=True)
-            arguments = service.engine.model, *recognized, admitted.milliseconds()
+            arguments = *await service.recognize(files, admitted, with_label_map=True), admitted.milliseconds()
             content = await run_in_threadpool(lambda: explained_frame(*arguments).model_dump_json())
         return Response(content, media_type="application/json")
 
@@ -163,8 +162,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         async with service.admit(partial(read_form, request, schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
             return await service.why(files, admitted)
 
-    arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
-    responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
+    responses = {200: {"content": {NPZ: schemas.ARRAYS}}, **error_responses(408, 413, 415, 422, 429, 503, 504)}
     body = {"requestBody": schemas.CLOUDS_BODY}
 
     @routes.post("/v1/describe", response_model=schemas.DescribeAnswer, responses=responses, openapi_extra=body)
@@ -215,7 +213,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         """Return the metrics in the Prometheus text format."""
         return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    @routes.get("/v1/objects", responses=error_responses(500))
+    @routes.get("/v1/objects", responses=error_responses(500, 507))
     async def objects() -> schemas.ObjectsAnswer:
         """Return the objects that the model can recognize, with their views."""
         known = service.known_objects()

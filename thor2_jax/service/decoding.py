@@ -86,39 +86,42 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
     except MultiPartException as error:
         raise RequestError(400, "body", error.message) from None
     try:
-        fields: dict[str, bytes] = {}
+        parsers: dict[str, Callable[[], Any]] = {}
         for name in schema["properties"]:
-            values = received.getlist(name)
-            if not values and name not in schema["required"]:
-                continue
-            if len(values) != 1:
-                raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
-            fields[name] = await values[0].read() if isinstance(values[0], UploadFile) else values[0].encode()
+            given = received.getlist(name)
+            values = [await value.read() if isinstance(value, UploadFile) else value.encode() for value in given]
+            if values or name in schema["required"]:
+                parsers[name] = partial(_parse_field, name, values)
     finally:
         await received.close()
-    parsers = {name: partial(_PARSERS[name], name, fields[name]) for name in fields if name in _PARSERS}
-    return {**fields, **_parse_fields(parsers)}
+    return _parse_fields(parsers)
 
 
-def _parse_name(_: str, content: bytes) -> str:
+def _parse_field(name: str, values: list[bytes]) -> Any:
+    if len(values) != 1:
+        raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
+    # A valid name has at most 4000 bytes; decoding and quoting a long one completely would take time.
+    return _PARSERS[name](name, values[0][:4004].decode(errors="surrogateescape")) if name in _PARSERS else values[0]
+
+
+def _parse_name(_: str, text: str) -> str:
     with field_errors("name"):
-        # A valid name has at most 4000 bytes; decoding and quoting a long one completely would take time.
-        return check_name(content[:4004].decode(errors="surrogateescape"))
+        return check_name(text)
 
 
-def _parse_flag(field: str, content: bytes) -> bool:
-    if content.lower() not in (b"true", b"1", b"false", b"0"):
-        raise RequestError(422, field, f"{field} must be true or false.")
-    return content.lower() in (b"true", b"1")
+def _parse_flag(field: str, text: str) -> bool:
+    if text.lower() not in ("true", "1", "false", "0"):
+        raise RequestError(422, field, f"{field} is {text[:40]!r}; expected true or false.")
+    return text.lower() in ("true", "1")
 
 
-def _parse_number(field: str, content: bytes) -> int:
-    if not re.fullmatch(rb"[0-9]{1,18}", content):
-        raise RequestError(422, field, f"{field} is not a number; expected a whole number of at most 18 digits.")
-    return int(content)
+def _parse_number(field: str, text: str) -> int:
+    if not re.fullmatch("[0-9]{1,18}", text):
+        raise RequestError(422, field, f"{field} is {text[:40]!r}; expected a whole number of at most 18 digits.")
+    return int(text)
 
 
-_PARSERS: dict[str, Callable[[str, bytes], Any]] = {
+_PARSERS: dict[str, Callable[[str, str], Any]] = {
     "name": _parse_name,
     "instance": _parse_number,
     "extend": _parse_flag,

@@ -30,7 +30,7 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
 from thor2_jax.surface_evidence import compile_comparison
 
-__all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine"]
+__all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine", "recognize"]
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ class Batcher:
 
 
 class InferenceEngine:
-    """A trained run on the device. Not thread-safe, except for `recognize`.
+    """A trained run on the device. Not thread-safe.
 
     Attributes:
         objects: the enrolled objects. Change a copy of them in another thread, and call `refresh` in this one.
@@ -180,16 +180,22 @@ class InferenceEngine:
             model = dataclasses.replace(model, color_transform=self.adaptation.transform)
         return [model.corrected(instance) for instance in instances]
 
-    def refresh(self) -> None:
-        """Read the gallery again if a process has changed it; if it cannot be read, the gallery in memory is unchanged.
+    def read_gallery(self) -> None:
+        """Read the gallery again if a process has changed it.
 
         The gallery is not read again if it was empty at the start and `teach` is not set, since clouds are not embedded
         then.
+
+        Raises:
+            InputError, OSError: the gallery cannot be read; the one in memory is unchanged.
         """
-        if not self._embeds:
-            return
-        try:
+        if self._embeds:
             self.objects.refresh()
+
+    def refresh(self) -> None:
+        """Read the gallery again as `read_gallery`; if it cannot be read, log the error."""
+        try:
+            self.read_gallery()
             self._last_error = ""
         except (InputError, OSError) as error:
             if str(error) != self._last_error:
@@ -227,22 +233,22 @@ class InferenceEngine:
             compile_comparison(batch.inference.samples)
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
-    def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
-        """Return a recognition per instance of a frame; `results` belong to the usable instances in order."""
-        if not results:
-            return [Recognition(instance.label, reason=instance.reason) for instance in instances]
-        inference = jax.tree.map(lambda *rows: np.stack(rows), *[result.inference for result in results])
-        model = self.model
-        source = model.answers_by()  # A change of the gallery may change it.
-        if source == "classifiers":
-            inference = inference._replace(embeddings=None)
-        elif source == "gallery":
-            inference = inference._replace(probabilities={})
-        return answers(model, instances, inference)
-
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain answers for clouds of `n_points` points."""
         return [(batch_points([n_points]), kind) for kind in dict.fromkeys(explained_by_classifiers(self.model))]
+
+
+def recognize(model: Model, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
+    """Return a recognition per instance of a frame; `results` belong to the usable instances in order."""
+    if not results:
+        return [Recognition(instance.label, reason=instance.reason) for instance in instances]
+    inference = jax.tree.map(lambda *rows: np.stack(rows), *[result.inference for result in results])
+    source = model.answers_by()  # A change of the gallery may change it.
+    if source == "classifiers":
+        inference = inference._replace(embeddings=None)
+    elif source == "gallery":
+        inference = inference._replace(probabilities={})
+    return answers(model, instances, inference)
 
 
 def _padded_batch(n_clouds: int) -> int:

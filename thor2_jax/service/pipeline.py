@@ -21,9 +21,10 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, ObjectGallery, enrolled_object, views_to_embed
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
+from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.answers import why_answer
-from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine
+from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine, recognize
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,
@@ -204,9 +205,7 @@ class Service:
                     body = await read_body()
                 yield request, body
         except TimeoutError:
-            if "upload" in request.seconds:
-                raise RequestError(504) from None
-            raise RequestError(408, "body") from None
+            raise (RequestError(504) if "upload" in request.seconds else RequestError(408, "body")) from None
         finally:
             self._in_progress -= 1
             self.metrics.in_progress.dec()
@@ -215,11 +214,12 @@ class Service:
 
     async def recognize(
         self, files: dict[str, bytes], request: AdmittedRequest, with_label_map: bool = False
-    ) -> tuple[PreparedRequest, list[CloudResult], list[Recognition]]:
+    ) -> tuple[Model, PreparedRequest, list[CloudResult], list[Recognition]]:
         """Recognize the frame in `files` (the arguments of `decoding.decode_frame`).
 
         Returns:
-            The frame with corrected colours, the results of its usable instances, and a recognition of each instance.
+            The model that gave the answers, which another request may replace meanwhile, the frame with corrected
+            colours, the results of its usable instances, and a recognition of each instance.
 
         Raises:
             RequestError: as `preparation.prepare_frame`.
@@ -229,9 +229,10 @@ class Service:
         corrected = self.engine.correct(prepared.instances, observe=True)
         results = await self._infer(corrected, request)
         self.engine.refresh()
+        model = self.engine.model
         # Comparing the instances with the surfaces of enrolled objects takes milliseconds.
-        recognitions = await asyncio.to_thread(self.engine.recognize, corrected, results)
-        return dataclasses.replace(prepared, instances=corrected), results, recognitions
+        recognitions = await asyncio.to_thread(recognize, model, corrected, results)
+        return model, dataclasses.replace(prepared, instances=corrected), results, recognitions
 
     async def why(self, fields: dict[str, Any], request: AdmittedRequest) -> WhyAnswer:
         """Explain the answer for one instance of a frame, one request after the other.
@@ -337,7 +338,7 @@ class Service:
     def known_objects(self) -> ObjectGallery:
         """Return the objects that the model can recognize, as stored on disk; raise RequestError as `change`."""
         with self._gallery_errors(500, "gallery"):
-            self.engine.objects.refresh()
+            self.engine.read_gallery()
         return self.engine.objects
 
     async def _prepare(self, request: AdmittedRequest, function: Prepare, *arguments: Any) -> PreparedRequest:

@@ -310,7 +310,8 @@ UNDO_FORM = _form(
 
 _CLOUDS = CloudsBody.model_json_schema()
 _CLOUDS["properties"]["clouds"]["items"] = _CLOUDS.pop("$defs")["CloudBody"]  # References cannot be resolved.
-_ARRAYS = {"type": "string", "format": "binary"}
+ARRAYS = {"schema": {"type": "string", "format": "binary"}}
+"""OpenAPI media type of npz files."""
 
-CLOUDS_BODY = {"required": True, "content": {"application/json": {"schema": _CLOUDS}, NPZ: {"schema": _ARRAYS}}}
+CLOUDS_BODY = {"required": True, "content": {"application/json": {"schema": _CLOUDS}, NPZ: ARRAYS}}
 """OpenAPI schema of the body of /v1/describe."""

@@ -56,24 +56,24 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     Raises:
         InputError: the run cannot be read, or the address is in use.
     """
-    settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
-    loggers = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
-    config = uvicorn.Config(
-        functools.partial(_create_worker, settings, workers),
-        factory=True,
-        workers=workers,
-        loop="asyncio",  # uvloop raises an error for each answer to a connection that was reset.
-        http=TimedConnection,
-        ws="none",
-        access_log=False,
-        server_header=False,
-        # Browsers revalidate each file of the page and transfer it only if it changed.
-        headers=list(page_headers("'self'", "no-cache").items()),
-        log_config={**LOGGING_CONFIG, "loggers": LOGGING_CONFIG["loggers"] | loggers},
-        timeout_graceful_shutdown=int(settings.deadline) + 5,
-        timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
-    )
     with listening(host, port) as (listener, url):
+        settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
+        loggers = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
+        config = uvicorn.Config(
+            functools.partial(_create_worker, settings, workers),
+            factory=True,
+            workers=workers,
+            loop="asyncio",  # uvloop raises an error for each answer to a connection that was reset.
+            http=TimedConnection,
+            ws="none",
+            access_log=False,
+            server_header=False,
+            # Browsers revalidate each file of the page and transfer it only if it changed.
+            headers=list(page_headers("'self'", "no-cache").items()),
+            log_config={**LOGGING_CONFIG, "loggers": LOGGING_CONFIG["loggers"] | loggers},
+            timeout_graceful_shutdown=int(settings.deadline) + 5,
+            timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
+        )
         if workers == 1:
             config.load()
             log.info("listening at %s", url)

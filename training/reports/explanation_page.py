@@ -99,7 +99,7 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     check, name = explanation.attributions, explanation.name
     if explanation.scores.unit == "log-odds":
         answer = (
-            f"The classifiers' log-odds of {name} are {check.margin:.1f}. Log-odds compare a class with the others "
+            f"The classifiers' log-odds of {name} are {check.margin:z.1f}. Log-odds compare a class with the others "
             "together, as if the object were one of them: 0 is even, 2.2 means 90 %, 4.6 means 99 %."
         )
     else:
@@ -128,7 +128,7 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
 def _similarity_text(name: str, other: str | None, lead: float) -> str:
     """Return the lead of a name; it is negative if surfaces decided against the most similar object."""
     if other is None:
-        return f"The similarity to {name} (cosine) is {lead:.2f}, and no other object is enrolled."
+        return f"The similarity to {name} (cosine) is {lead:z.2f}, and no other object is enrolled."
     degree = "as similar (in cosine, to within 0.005) as"
     if abs(lead) >= 0.005:
         degree = f"{abs(lead):.2f} {'less' if lead < 0 else 'more'} similar (in cosine) than"

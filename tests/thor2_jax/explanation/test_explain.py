@@ -21,10 +21,10 @@ from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
 from thor2_jax.explanation import attributions
-from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
+from thor2_jax.explanation.changes import Change, apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
-from thor2_jax.explanation.pictures import main_pictures
+from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
@@ -254,6 +254,7 @@ def test_changed_extents_keep_the_other_sides() -> None:
     shifted = changed_instance(INSTANCE, "color", np.array([0.1, 0, -1]), axes)
     np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(INSTANCE.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
+    assert " -0 " not in change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", -0.1))
 
 
 @pytest.mark.slow
@@ -316,9 +317,14 @@ def test_errors_name_the_argument(recognizer: Recognizer) -> None:
     assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), FRAME, 3)
 
 
-def test_titles_of_the_photo_of_a_tall_object_are_inside(explanation: Explanation) -> None:
-    """The titles touched the border of a picture whose sides have a ratio of 1.2."""
+def test_texts_of_a_tall_photo_and_of_a_flat_cloud_are_inside(explanation: Explanation) -> None:
+    """The titles touched the border of a photo with a ratio of sides of 1.2, and the label of an axis was cut off."""
+    points = explanation.instance.points
+    flat = (points - points.min(axis=0)) / np.ptp(points, axis=0) * [0.144, 0.03744, 0.03] - [0.5, 0.055, -1]
+    instance = dataclasses.replace(explanation.instance, points=flat.astype(np.float32))
     labels = np.where(np.arange(len(FRAME.labels))[:, None] < 58, FRAME.labels, 0)
-    picture = next(main_pictures(explanation, dataclasses.replace(FRAME, labels=labels)))
-    with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
-        assert (np.asarray(image)[:2] == 255).all()
+    tall = dataclasses.replace(FRAME, labels=labels)
+    photo, cloud, *_ = main_pictures(dataclasses.replace(explanation, instance=instance), tall)
+    for picture, border in ((photo, np.s_[:2]), (cloud, np.s_[:, :2])):
+        with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
+            assert (np.asarray(image)[border] == 255).all(), picture.title

@@ -29,7 +29,7 @@ from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.pipeline import Service
-from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
+from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
@@ -68,15 +68,6 @@ def pool() -> Iterator[PreparationPool]:
     pool.close()
 
 
-def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
-    assert pool.submit(FAR, math.sqrt, 4.0).result(HANG) == 2.0
-    with pytest.raises(RequestError) as error:
-        pool.submit(FAR, prepare_clouds, b"damaged", True).result(HANG)
-    assert (error.value.status, error.value.field) == (422, "body")
-    with pytest.raises(RuntimeError, match="math domain error"):
-        pool.submit(FAR, math.sqrt, -1.0).result(HANG)
-
-
 def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
@@ -91,6 +82,8 @@ def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch
     idle.process.join()
     pool._idle.put(idle)  # The pool does not notice the death of an idle process.
     assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
+    with pytest.raises(RuntimeError, match="math domain error"):
+        pool.submit(FAR, math.sqrt, -1.0).result(HANG)
 
 
 def many(frame: thor2.RGBDFrame) -> np.ndarray:
@@ -125,7 +118,8 @@ def frame_request(files: Files) -> Callable[[httpx.AsyncClient], Any]:
     return lambda client: client.post("/v1/recognize", files=files)
 
 
-NOTHING = PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
+MODEL = Mock(**{"gallery.summary": "no objects"})
+NOTHING = MODEL, PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
 
 
 @pytest.fixture

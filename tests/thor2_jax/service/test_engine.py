@@ -21,7 +21,7 @@ from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import ColorTransform
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.service.answers import adaptation_answer, calibrated_confidence
-from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.engine import InferenceEngine, recognize
 from thor2_jax.service.settings import Settings
 
 from .conftest import write_run
@@ -42,10 +42,10 @@ def check_answers(run: Path, frame: thor2.RGBDFrame) -> list[float | None]:
     instances = [prepare_instance(frame, label, engine.model.run.config.sigma_s) for label in frame.instances]
     usable = [instance for instance in instances if instance.reason is None]
     results = engine.infer(usable)
-    answers = engine.recognize(instances, results)
+    answers = recognize(engine.model, instances, results)
     assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
     assert engine.model.names == recognizer.classes
-    assert {answer.name for answer in engine.recognize([i for i in instances if i.reason is not None], [])} == {None}
+    assert {a.name for a in recognize(engine.model, [i for i in instances if i.reason is not None], [])} == {None}
     given = [answer for answer in answers if answer.confidence is not None]
     confidences = [
         calibrated_confidence(engine.model, answer, one.inference) for answer, one in zip(given, results, strict=True)

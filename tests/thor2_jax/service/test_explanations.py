@@ -122,7 +122,7 @@ def test_released_slices_are_the_occurring_levels() -> None:
 
 BLANK = [base64.b64encode(encode_image(np.zeros((200, width), np.uint8))).decode() for width in (600, 300)]
 ANSWER = {
-    **{"label": 3, "name": "a", "explained_name": "a", "unit": "log-odds", "margin": 2.5, "timings": {}},
+    **{"label": 3, "name": "a", "explained_name": "a", "unit": "log-odds", "margin": -0.04, "timings": {}},
     **{"loss_without_most_attributed_tenth": 1.25, "mean_loss_without_random_tenth": -0.1},
     "changes": ["red +20, green +0, blue -3 (of 255): b"],
     "pictures": [{"title": "What decided", "caption": "Orange speaks for a.", "png": png} for png in BLANK],
@@ -210,7 +210,7 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
     wait_until(page, lambda: len(requests) == 2)  # the message stays until it is answered
     assert b'name="instance"\r\n\r\n3\r\n' in (requests[1].request.post_data_buffer or b"")
     requests[1].fulfill(json=ANSWER)
-    for text in ("2.5", "red +20", "rises by 0.10"):
+    for text in (": 0.0. ", "red +20", "rises by 0.10"):
         expect(page.locator("#why-status")).to_contain_text(text)
     shown = page.locator("#why-pictures canvas")
     expect(shown).to_have_count(2)

@@ -1,6 +1,7 @@
 """The web page in headless Chromium."""
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -38,7 +39,9 @@ def test_sample_is_outlined_and_named_with_details(open_page: Open) -> None:
     buttons, count = page.locator("#objects button"), len(np.unique(labels)) - 1
     expect(buttons).to_have_count(count)
     expect(page.get_by_role("status")).to_contain_text(f"{count} objects")
-    assert set(page.locator("#objects .name").all_inner_texts()) <= set(CLASSES)
+    names = page.locator("#objects .name bdi").all_inner_texts()
+    assert set(names) <= set(CLASSES) and len(names) == count
+    assert re.search("\u2068.+\u2069 [<>]?[0-9.]+\u00a0%", " ".join(tag[0] for tag in page.evaluate("window.tags")))
     overlay = page.locator("#overlay")
     drawn = pixels(overlay)
     across = drawn.shape[1] / labels.shape[1]

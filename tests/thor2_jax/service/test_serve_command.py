@@ -53,6 +53,10 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
     assert f"--{name} is " in error and value in error
 
 
+def test_a_url_is_no_host(run_dir: Path, serve: Command) -> None:
+    assert "--host http://localhost, which" in serve("--model", run_dir, "--host", "http://localhost", "--port", "0")
+
+
 def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Settings(tmp_path).segmenter == "table"
     assert_refused("segmenter is 'sam'; expected one of table", Settings, tmp_path, segmenter="sam")

@@ -161,7 +161,7 @@ function objectButton(instance, color) {
       },
     },
     swatch,
-    element("span", { className: "name" }, ...breakable(name ?? "unknown object")),
+    element("span", { className: "name" }, breakable(name ?? "unknown object")),
     element("span", { className: "confidence" }, name === null ? "" : percent(confidenceOf(instance))),
     element("span", { className: invites ? "facts invitation" : "facts hint" }, facts),
   );
@@ -197,7 +197,7 @@ function select(label, byUser = false) {
   overlay.select(label);
   const instance = frame.instances.find((one) => one.label === label);
   const { name } = instance;
-  byId("answer").replaceChildren(...breakable(name ?? "unknown object"), name === null ? "" : ` ${percent(confidenceOf(instance))}`);
+  byId("answer").replaceChildren(breakable(name ?? "unknown object"), name === null ? "" : ` ${percent(confidenceOf(instance))}`);
   showDetails(instance, loaded.model, loaded.regions);
   showNaming(instance, loaded.model, frame.files);
   showWhy(instance);

@@ -76,7 +76,7 @@ function topFive(instance, classifier, isCompared) {
     const cell = element("td", { colSpan: 2 }, bar);
     cell.setAttribute("aria-hidden", "true");
     return [
-      element("tr", {}, element("th", { scope: "row" }, ...breakable(name)), element("td", {}, percent(probability))),
+      element("tr", {}, element("th", { scope: "row" }, breakable(name)), element("td", {}, percent(probability))),
       element("tr", { className: "bar" }, cell),
     ];
   });
@@ -139,7 +139,7 @@ function showSlices({ slices }, model, regions) {
   });
   byId("slices").replaceChildren(...drawings.map(({ item }) => item));
   const empty = slices.flatMap(({ strips }, k) => (strips.length ? [] : [k]));
-  byId("empty-slices").textContent = empty.length ? `Without points: slice ${empty.join(", ")}.` : "";
+  byId("empty-slices").textContent = empty.length ? `Without points: ${empty.length > 1 ? "slices" : "slice"} ${empty.join(", ")}.` : "";
   for (const { shape, colors, image, strips } of drawings) {
     const pixels = imagePixels(image);
     keepDrawn(shape, (context, width, height) => {

@@ -48,8 +48,8 @@ export function percent(probability) {
 /** Return the calibrated confidence of an instance if it has one. */
 export const confidenceOf = ({ confidence, details }) => details?.calibrated_confidence ?? confidence;
 
-/** Split a name at its underscores, so that a line can break there. */
-export const breakable = (name) => name.split(/(?<=_)/).flatMap((piece) => [piece, element("wbr")]);
+/** Split a name at its underscores, so that a line can break there; Arabic names do not move the text beside them. */
+export const breakable = (name) => element("bdi", {}, ...name.split(/(?<=_)/).flatMap((piece) => [piece, element("wbr")]));
 
 /** Create an element with properties and children. */
 export function element(tag, properties = {}, ...children) {

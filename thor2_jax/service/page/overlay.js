@@ -152,7 +152,7 @@ export class Overlay {
     this.instances.forEach(({ label }, k) => place(k, `${label}`, LABEL_COSTS));
     this.instances.forEach((instance, k) => {
       const { name } = instance;
-      place(k, name === null ? "unknown" : small ? name : `${name} ${percent(confidenceOf(instance))}`, NAME_COSTS);
+      place(k, name === null ? "unknown" : small ? name : `\u2068${name}\u2069 ${percent(confidenceOf(instance))}`, NAME_COSTS);
     });
   }
 

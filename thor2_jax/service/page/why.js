@@ -28,6 +28,8 @@ async function pictureOf({ title, caption, png }, number) {
 }
 
 function summary({ name, explained_name, unit, margin, changes, ...answer }) {
+  const digits = unit === "log-odds" ? 1 : 2;
+  const value = (Number(margin.toFixed(digits)) + 0).toFixed(digits); // not -0.00
   const [worst, random] = [answer.loss_without_most_attributed_tenth, answer.mean_loss_without_random_tenth];
   const what = unit === "log-odds" ? "Log-odds (0 is even, 4.6 means 99\u00a0%)" : "Lead in similarity over other objects";
   const subject = name === null ? `Most probable, though unknown: ${explained_name}. ` : "";
@@ -36,7 +38,7 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
     : "No small change of colour or side lengths gives another name.";
   const change = (loss) => `${loss < -0.005 ? "rises" : "falls"} by ${Math.abs(loss).toFixed(2)}`;
   const fall = `Without the tenth of the points that speaks most for the name, it ${change(worst)}; without a random tenth, it ${change(random)}.`;
-  return `${subject}${what}: ${margin.toFixed(unit === "log-odds" ? 1 : 2)}. ${fall} ${found}`;
+  return `${subject}${what}: ${value}. ${fall} ${found}`;
 }
 
 /** Return the response of /v1/why; while the service compiles explanations, show this and repeat the request. */
