@@ -18,6 +18,7 @@ from small_runs import assert_same_answers
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError, _recognitions
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import parse_intrinsics
 from thor2_jax.segmentation.table import segment_table
 
@@ -42,6 +43,17 @@ def test_recognize_matches_the_library(
     assert "30" in answer["instances"][1]["unrecognized"] and answer["label_map"] is None
     assert set(answer["timings"]) == {"upload", "decode", "clouds", "device", "total"}
     assert answer["timings"]["total"] >= answer["timings"]["decode"] + answer["timings"]["clouds"] > 0
+    images = {**files, "color": encode_image(frame.color, "JPEG")}
+    of_jpeg = http.post("/v1/recognize", files=images)
+    assert of_jpeg.status_code == 200 and len(of_jpeg.json()["instances"]) == 4
+
+
+def test_frames_without_instances_or_depth(http: httpx.Client, files: Files) -> None:
+    empty = encode_image(np.zeros((240, 320), np.uint8))
+    assert http.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
+    blind = encode_image(np.zeros((240, 320), np.uint16))
+    instances = http.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
+    assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
 
 
 def test_a_frame_without_labels_is_segmented(
