@@ -4,7 +4,7 @@ RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with 
 RUN/embedding.safetensors             with distractors: the embedding, which also classifies
 RUN/references.safetensors            its reference views, for galleries
 RUN/surfaces.safetensors              surfaces of the classes, if all were trained from meshes
-RUN/gallery/                          with an embedding: the labelled real views, enrolled
+RUN/gallery/                          with an embedding: labelled views of classes without a mesh, enrolled
 RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
