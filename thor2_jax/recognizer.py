@@ -28,6 +28,7 @@ from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criteri
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import as_path
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
@@ -165,7 +166,7 @@ class Recognizer:
             chunk: see `Recognizer`.
         """
         recognizer = cls(load_run(run_dir), unknown_below, rule, answer_by=answer_by, search=search, chunk=chunk)
-        directory = Path(run_dir) / GALLERY_DIRECTORY if gallery is None else Path(gallery)
+        directory = Path(run_dir) / GALLERY_DIRECTORY if gallery is None else as_path(gallery, "gallery")
         recognizer.objects.open(directory, reembed=reembed)
         return recognizer
 
@@ -261,7 +262,7 @@ class Recognizer:
             The estimate, whose `transform` is now part of `model`.
 
         Raises:
-            InputError: the frames have different sizes, or fewer than `adaptation.estimate.MIN_INSTANCES` usable
+            InputError: a frame has no labels, or the frames have fewer than `adaptation.estimate.MIN_INSTANCES` usable
                 instances. Nothing changes.
         """
         _check_frames(frames)

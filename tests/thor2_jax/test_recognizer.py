@@ -113,8 +113,10 @@ def test_arguments_that_are_no_frames_are_named(recognizer: Recognizer) -> None:
     assert_refused(r"frames\[0\]: frame is a int", recognizer.enroll, "new", [(2, frame)])
     assert_refused(r"frames\[0\]: frame is a tuple", recognizer.enroll, "new", [(frame, 2, 3)])
     assert_refused(r"frames\[1\]: frame is a str", recognizer.adapt, [frame, "frame.png"])
+    assert_refused(r"^frames\[0\]: labels is None", recognizer.adapt, [dataclasses.replace(frame, labels=None)])
     assert_refused(r"frames\[0\]: instance is '2'", recognizer.enroll, "new", [(frame, "2")])
     assert_refused("run is a str", Recognizer, "run")
+    assert_refused("^model is 'a.x00b'; expected a path", Recognizer.load, "a\0b")
 
 
 def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:

@@ -161,20 +161,13 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
         sigma_s: scaled units per metre, see `DescriptorConfig`.
 
     Raises:
-        InputError: the frames have different sizes.
+        InputError: a frame is of another type, or has no labels; the message has its number.
     """
     instances: list[PreparedInstance] = []
-    first = ""
     for number, frame in enumerate(frames):
         with with_context(f"frames[{number}]"):
             check_frame(frame)
-        size = f"{frame.depth.shape[1]} x {frame.depth.shape[0]}"
-        first = first or size
-        if size != first:
-            raise InputError(
-                f"frames[{number}] has {size} pixels; expected {first}, as the first: adapt to one camera at a time"
-            )
-        instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
+            instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
     return instances
 
 

@@ -377,8 +377,7 @@ def read_frame(
 def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read the intrinsics of the frame with this colour file; arguments and exceptions as `read_frame`."""
     name = as_path(color, "color").stem
-    intrinsics = read_intrinsics(path, int(name) if name.isdecimal() else None)
-    return intrinsics if depth_scale is None else dataclasses.replace(intrinsics, depth_scale=depth_scale)
+    return read_intrinsics(path, int(name) if name.isdecimal() else None).with_depth_scale(depth_scale)
 
 
 @dataclasses.dataclass(frozen=True)

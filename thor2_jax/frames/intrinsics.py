@@ -69,6 +69,16 @@ def _is_number(value: Any) -> bool:
     return is_real and bool(abs(value) <= LARGEST_INTRINSIC)
 
 
+def _checked_number(name: str, value: Any, least: float = 1 / LARGEST_INTRINSIC) -> Any:
+    """Return a number; raise InputError with its name if it is out of range.
+
+    Focal lengths and depth scales below the default of `least` would make points infinite.
+    """
+    if not _is_number(value) or value < least:
+        raise InputError(f"{name} is {value!r}; expected a number from {least:.0e} to {LARGEST_INTRINSIC:.0e}")
+    return value
+
+
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
     """A pinhole camera, with or without lens distortion; pixel centres have integer coordinates.
@@ -99,17 +109,18 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         for name in (*_PINHOLE, "depth_scale"):
-            # Smaller positive numbers would make points infinite.
-            value, least = getattr(self, name), -LARGEST_INTRINSIC if name in ("cx", "cy") else 1 / LARGEST_INTRINSIC
-            if not _is_number(value) or value < least:
-                raise InputError(
-                    f"intrinsics.{name} is {value!r}; expected a number from {least:.0e} to {LARGEST_INTRINSIC:.0e}"
-                )
+            least = -LARGEST_INTRINSIC if name in ("cx", "cy") else 1 / LARGEST_INTRINSIC
+            _checked_number(f"intrinsics.{name}", getattr(self, name), least)
         for name in ("width", "height"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, Integral) or isinstance(value, bool) or value <= 0):
                 raise InputError(f"intrinsics.{name} is {value!r}; expected a positive integer, in pixels")
         object.__setattr__(self, "distortion", _coefficients(self.distortion))
+
+    def with_depth_scale(self, depth_scale: float | None) -> "Intrinsics":
+        """Return the camera with another depth scale (None: with its own); raise InputError if it is out of range."""
+        scale = self.depth_scale if depth_scale is None else _checked_number("depth_scale", depth_scale)
+        return dataclasses.replace(self, depth_scale=scale)
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
@@ -268,14 +279,13 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
     if "cam_K" in values:
         return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number"), ()
     if "intrinsic_matrix" in values:
-        try:
-            matrix = np.asarray(values["intrinsic_matrix"], dtype=object).reshape(3, 3)
-        except ValueError:
+        matrix = np.asarray(values["intrinsic_matrix"], dtype=object).ravel()
+        if matrix.size != 9 or any(matrix[[2, 5]]):  # with cx and cy there, it is given row by row
             raise InputError(
                 f"intrinsics.intrinsic_matrix is {str(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, 0, "
                 "cx, cy, 1"
-            ) from None
-        return matrix.T, scale, ()
+            )
+        return matrix.reshape(3, 3).T, scale, ()
     if "ppx" in values or "ppy" in values:
         scale = _units_per_metre(scale, 1, 1, "metres per depth unit, such as 0.001, since ppx and ppy are given")
         return _pinhole_matrix(values, "ppx", "ppy"), scale, _supported(values.get("model"), values.get("coeffs"))
@@ -356,9 +366,11 @@ def _parse(content: bytes) -> Any:
     if is_npy:
         with decoding("intrinsics is a damaged NPY file", "a 3 x 3 matrix"):
             return read_npy(io.BytesIO(content), MAX_TEXT_BYTES)
+    words = re.sub(rb"#.*|,", b" ", content).split()
+    if not words:
+        raise InputError(f"intrinsics has no content; expected {expected}")
     try:
-        words = re.sub(rb"#.*|,", b" ", content).split()
-        return np.array([float(word) for word in words]) if words else None
+        return np.array([float(word) for word in words])
     except ValueError:
         with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
             # OpenCV's FileStorage writes a directive and tags that YAML parsers reject.

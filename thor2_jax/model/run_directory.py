@@ -32,6 +32,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import (
+    as_path,
     atomic_directory,
     check_output_directory,
     content_digest,
@@ -99,7 +100,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         InputError: the path exists and is not an empty directory.
         OSError: the directory cannot be written; nothing is left behind.
     """
-    path = Path(path).resolve()
+    path = as_path(path, "out").resolve()
     check_output_directory(path)
     with atomic_directory(path) as unfinished:
         colornet.save(run.network, unfinished / "network.npz")
@@ -135,7 +136,7 @@ def load_run(path: str | Path) -> TrainedRun:
         InputError: the path is not a run directory, a file is damaged, the format or the descriptor version is not
             supported, or the files do not belong together. The message names the file.
     """
-    path = Path(path).absolute()
+    path = as_path(path, "model").absolute()
     description = read_description(path)
     try:
         config = DescriptorConfig.of_record(description["descriptor_config"])

@@ -11,7 +11,6 @@ Its last record, the footer, contains the position of the index; without an inde
 
 import bz2
 import contextlib
-import dataclasses
 import functools
 import io
 import itertools
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
-from thor2_jax.files import open_file, parse_yaml, read_file
+from thor2_jax.files import as_path, open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_name, stamp_of
@@ -91,7 +90,7 @@ class Bag:
         """
         if not 0 < max_gap <= MAX_GAP:
             raise InputError(f"max_gap is {max_gap}; expected a positive number of seconds, at most {MAX_GAP:g}")
-        self.path = Path(path)
+        self.path = as_path(path, "bag")
         self.intrinsics: Intrinsics | None = intrinsics
         self._wanted, self._depth_scale, self._max_gap = topics or Topics(), depth_scale, max_gap
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
@@ -217,13 +216,14 @@ class Bag:
             raise self._truncation()
         first = {topic: message for topic in images for _, message, _ in itertools.islice(self._messages(topic), 1)}
         kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}
+        types |= {t: f"{types[t]} without messages" for t in images if t not in first}
+        types |= {t: f"{types[t]}, {m.encoding!r}" for t, m in first.items() if hasattr(m, "encoding")}
         with with_context(f"bag: {self.path}"):
             self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
             if self.intrinsics is None:
                 with with_context(str(self.topics.camera)):
                     self.intrinsics = _camera(first[self.topics.camera], str(self.topics.color))
-        if self._depth_scale is not None:
-            self.intrinsics = dataclasses.replace(self.intrinsics, depth_scale=self._depth_scale)
+        self.intrinsics = self.intrinsics.with_depth_scale(self._depth_scale)
         color, depth = (first[topic].header.frame_id for topic in (self.topics.color, self.topics.depth))
         self.frame_id = str(color)
         if color != depth:

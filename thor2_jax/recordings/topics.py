@@ -44,7 +44,7 @@ def choose_topics(
     Args:
         wanted: requested names of topics; topics that are None are chosen.
         kinds: topic -> "color", "depth", "camera" or "other", for all topics with messages.
-        types: topic -> message type, for all topics; used in error messages.
+        types: topic -> message type and what else is known of its content, for all topics; used in error messages.
         needs_camera: whether intrinsics are needed.
 
     Raises:
@@ -73,8 +73,7 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
         if topic not in types:
             raise InputError(f"{option} is {wanted}; expected one of the recording's topics: {_listed(types)}")
         if kinds.get(topic) != kind:
-            holds = types[topic] if topic in kinds else f"{types[topic]} without messages"
-            raise InputError(f"{option} is {wanted}, which holds {holds}; expected {_EXPECTED[kind]}")
+            raise InputError(f"{option} is {wanted}, which holds {types[topic]}; expected {_EXPECTED[kind]}")
         return topic
     candidates = [topic for topic, held in kinds.items() if held == kind]
     if kind == "depth":

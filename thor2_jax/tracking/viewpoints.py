@@ -56,9 +56,8 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(
-            f"{argument} has shape {matrix.shape}; expected a matrix [4, 4] of finite numbers, from camera to world"
-        )
+        given = "NaN or infinity" if matrix.shape == (4, 4) else f"shape {matrix.shape}"
+        raise InputError(f"{argument} has {given}; expected a matrix [4, 4] of finite numbers, from camera to world")
     rotation = matrix[:3, :3]
     deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max())
     if deviation > MAX_DEVIATION or np.linalg.det(rotation) < 0:

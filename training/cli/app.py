@@ -224,10 +224,14 @@ def main() -> None:
 
 
 def _with_options(message: str) -> str:
-    """Return a message with the given options in place of the arguments that they set: --max-gap, not max_gap."""
+    """Return a message with the given options in place of the arguments that they set: --max-gap, not max_gap.
+
+    Only the first word that is an argument is replaced: a second one is part of the value, such as a path.
+    """
     options = {argument.split("=")[0] for argument in sys.argv if argument.startswith("--")}
     names = {option[2:].replace("-", "_"): option for option in options}
-    return re.sub(r"(^| and |: )(\w+)(?=:? )", lambda match: match[1] + names.get(match[2], match[2]), message)
+    names |= {"segmenter": "--segment"} if "--segment" in options else {}
+    return re.sub(r"(^| and |: )(\w+)(?=:? )", lambda match: match[1] + names.pop(match[2], match[2]), message)
 
 
 def _check_not_empty(arguments: list[str]) -> None:

@@ -76,7 +76,8 @@ class _Answers:
         self.failures: list[str] = []
         self.has_unknown = False
         if given.out is not None:
-            resumable = {name.split("/")[0] for name in frames} if several else result_files.RESULT_FILES
+            resumable = {name.split("/")[0] for name in frames} if several else {*result_files.RESULT_FILES}
+            resumable |= {path.name for path in (given.coco, given.bop, given.rerun, given.out_bag) if path}
             check_output_directory(given.out, resumable=resumable)
             for name in frames if several else [""]:
                 result_files.check_no_foreign_results(given.out / name)

@@ -282,7 +282,8 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
     """
     if not path.is_dir():
         if name is None:
-            raise InputError(f"name is missing; mesh {path} is one file")
+            problem = "is one file, which needs a NAME" if path.exists() else "does not exist"
+            raise InputError(f"mesh {path} {problem}")
         return {name: path}
     own = path.resolve().name
     if any(file.stem.lower() == "textured" for file in path.iterdir()) or name == own:

@@ -121,8 +121,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         InputError: a path is not a directory or contains no frame, a frame is given twice, or `depth_scale` is out of
             range.
     """
-    if depth_scale is not None:
-        Intrinsics(1.0, 1.0, 0.0, 0.0, depth_scale)
+    Intrinsics(1.0, 1.0, 0.0, 0.0).with_depth_scale(depth_scale)  # raises once, not for every frame
     located: list[tuple[Path, FrameSource]] = []  # folder of each frame, and the frame
     for path in paths:
         path = named_path(path)
@@ -143,7 +142,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 name = folder.name if folder == path else folder.relative_to(path).as_posix()
                 of_path.append((folder, frame_files(folder).source(name, depth_scale)))
         if not of_path:
-            raise InputError(f"frames: {path} has no {' or '.join(FILE_NAMES['color'])}; expected a folder of frames")
+            raise InputError(f"frames: {path} has no {', '.join(FILE_NAMES['color'])}; expected frames or a BOP split")
         located += of_path
     sources = [source for _, source in located]
     if len({source.name for source in sources}) == len(sources):
@@ -238,9 +237,7 @@ def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -
 
 def _read_bop(dataset: BOP, depth_scale: float | None) -> RGBDFrame:
     frame = dataset.read(0)[0] if dataset.has_labels(0) else dataset.unlabelled(0)
-    if depth_scale is None:
-        return frame
-    return dataclasses.replace(frame, intrinsics=dataclasses.replace(frame.intrinsics, depth_scale=depth_scale))
+    return dataclasses.replace(frame, intrinsics=frame.intrinsics.with_depth_scale(depth_scale))
 
 
 def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[FrameSource], list[str]]:

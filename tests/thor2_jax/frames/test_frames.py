@@ -163,8 +163,9 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
 
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
 def test_missing_files_and_values_that_are_no_path(files: dict[str, Path], name: str) -> None:
-    for value in (10**6, [files[name]]):
-        assert_refused(f"^{name} is a (int|list); expected a path$", read_frame, **files | {name: value})
+    for value in (10**6, [files[name]], "a\0b"):
+        assert_refused(rf"^{name} is (a int|a list|'a\\x00b'); expected a path", read_frame, **files | {name: value})
+    assert_refused("^depth_scale is '1'", read_frame, **files, depth_scale="1")
     files[name].unlink()
     with pytest.raises(FileNotFoundError, match=str(files[name])):
         read_frame(**files)
@@ -215,12 +216,9 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
         assert_refused(f"^labels: .*{name}.*JPEG", read_labels, tmp_path / name)
 
 
-def test_color_files_of_16_bit(tmp_path: Path) -> None:
-    (tmp_path / "color.png").write_bytes(deep_png(12, 16))
-    assert_refused("^color: .*;16", read_color, tmp_path / "color.png")
-
-
-def test_color_files_with_an_alpha_channel_and_jpeg(tmp_path: Path) -> None:
+def test_color_files_with_an_alpha_channel_of_16_bit_and_jpeg(tmp_path: Path) -> None:
+    (tmp_path / "c.png").write_bytes(deep_png(12, 16))
+    assert_refused("^color: .*;16", read_color, tmp_path / "c.png")
     rgba = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
     Image.fromarray(rgba).save(tmp_path / "c.png")
     np.testing.assert_array_equal(read_color(tmp_path / "c.png"), rgba[..., :3])

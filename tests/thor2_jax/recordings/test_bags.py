@@ -19,6 +19,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.recordings import bags
 from thor2_jax.recordings.bags import Bag
+from thor2_jax.recordings.detection_files import MessageBag
 from thor2_jax.recordings.topics import Topics
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
@@ -84,6 +85,16 @@ def test_depth_that_is_not_aligned(tmp_path: Path) -> None:
         assert len(bag.notes) == 1 and "aligned" in bag.notes[0]
         (recorded,) = bag.frames()
         assert_refused("160 x 120 pixels and color 320 x 240", recorded.read)
+
+
+def test_messages_describe_the_content_of_topics(tmp_path: Path) -> None:
+    with bag_writer(tmp_path / "a.mcap") as write:
+        write(COLOR, image(FRAMES[0].color[..., 0], "mono8"), START)
+    assert_refused(rf"{COLOR} \(sensor_msgs/msg/Image, 'mono8'\)", Bag(tmp_path / "a.mcap").__enter__)
+    with MessageBag(tmp_path / "b.mcap", {COLOR: "sensor_msgs/msg/Image", "/name": "std_msgs/msg/String"}) as bag:
+        bag.write_message("/name", {"data": "robot"}, START)
+    for topic, content in ((COLOR, "sensor_msgs/msg/Image without messages"), ("/name", "std_msgs/msg/String")):
+        assert_refused(f"holds {content}; expected 8-bit", Bag(tmp_path / "b.mcap", Topics(topic)).__enter__)
 
 
 def test_streams_out_of_step(tmp_path: Path) -> None:
@@ -218,6 +229,7 @@ def test_no_recording(tmp_path: Path) -> None:
     (tmp_path / "x.bag").mkdir()
     message = "damaged or of another format.*metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
     assert_refused(message, Bag(tmp_path / "x.bag").__enter__)
+    assert_refused("^bag is 'a.x00b'; expected a path", Bag, "a\0b")
 
 
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

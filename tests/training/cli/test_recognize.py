@@ -62,8 +62,9 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     one = write_frame_files(tmp_path / "one", small_frame())
     two = write_frame_files(tmp_path / "more" / "deep" / "two", small_frame(1))
     shutil.move(two / "mask.png", two / "labels.png")
-    (tmp_path / "names.json").write_text(json.dumps({"14": "mug", "21": "bowl", "5": "plate"}))
-    tables = ("--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv", "--names", tmp_path / "names.json")
+    coco_file, names_file = tmp_path / "out" / "coco.json", tmp_path / "names.json"
+    names_file.write_text(json.dumps({"14": "mug", "21": "bowl", "5": "plate"}))
+    tables = ("--coco", coco_file, "--bop", tmp_path / "bop.csv", "--names", names_file)
     outputs = (*tables, "--out", tmp_path / "out")
     command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
     out, err = texts(*command)
@@ -74,12 +75,12 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
         assert overlay.size == (120, 90)
     results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
     names = [one["name"] for path in results for one in json.loads(path.read_text())]
-    coco = json.loads((tmp_path / "coco.json").read_text())
+    coco = json.loads(coco_file.read_text())
     lines = (tmp_path / "bop.csv").read_text().splitlines()[1:]
     expected = [{"mug": 14, "bowl": 21, "plate": 5}[name] for name in names]
     assert [entry["category_id"] for entry in coco] == [int(line.split(",")[2]) for line in lines] == expected
-    (tmp_path / "names.json").write_text(json.dumps({"14": "another"}))
-    assert f"has no number in {tmp_path / 'names.json'}: {len(names)}" in texts(*command)[1]
+    names_file.write_text(json.dumps({"14": "another"}))
+    assert f"has no number in {names_file}: {len(names)}" in texts(*command)[1]
 
 
 def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +100,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     write_frame_files(Path("frames/two"), small_frame(1))
     Path("frames/names.json").write_text("{}")
     save_run(untrained_run((), ()), Path("gallery-only"))
-    Path("damaged.json").write_text("[")
+    Path("poses").write_text("[")
     unit, double = np.eye(4).tolist(), (2 * np.eye(4)).tolist()
     for name, poses in {"few": [unit], "other": {"one": unit}, "scaled": [unit, double]}.items():
         Path(f"{name}.json").write_text(json.dumps(poses))
@@ -114,10 +115,10 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         *((f"frames --bop {path}", f"bop: {path} is not a file") for path in no_files),
         ("frames --coco x --bop x", "coco and --bop are x"),
         ("frames --out frames", "expected a new or empty directory"),
-        ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
-        ("frames --segment sam --out out", "error: segmenter is 'sam'; expected one of table, model"),
+        ("frames --depth-scale 1e-300", "error: --depth-scale is 1e-300"),
+        ("frames --segment sam --out out", "error: --segment is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
-        ("frames --out out --track --poses damaged.json", "damaged.json is invalid"),
+        ("frames --out out --track --poses poses", "error: --poses: poses is invalid"),
         ("frames --out out --track --poses few.json", "few.json is 1; expected 2"),
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),

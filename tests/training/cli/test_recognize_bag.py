@@ -148,7 +148,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("--max-gap 1e300", "--max-gap is 1e+300"),
         ("--every 99999999999999999999", "'--every'"),
         ("--out-bag in.mcap/a.mcap", "a.mcap: Not a directory"),
-        ("--depth-scale 0", "depth_scale is 0"),
+        ("--depth-scale 0", "error: --depth-scale is 0"),
         ("--max-gap 0.001 --out-bag out", "expected at most 0.001 s"),
         ("--rerun a.mcap", "the suffix .rrd"),
     ):

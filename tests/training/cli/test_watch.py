@@ -78,7 +78,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("--folder a --color-topic /c", "--color-topic is /c; it belongs to --bag"),
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
-        ("--folder a --segment sam", "segmenter is 'sam'"),
+        ("--folder a --segment sam", "error: --segment is 'sam'"),
         (f"--folder {frame} --answer-by gallery", "--answer-by is gallery"),
         (f"--folder {frame} --unknown-below 2", "--unknown-below is 2"),
     ):
