@@ -210,8 +210,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         labelled: instances of the frames.
     """
     known = dict.fromkeys([*names, *(labelled.views if labelled else ())])
-    missing = sorted(set(job.leave_out) - set(known))
-    if missing:
+    if missing := sorted(set(job.leave_out) - set(known)):
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
     if not classes:

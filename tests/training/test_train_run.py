@@ -81,7 +81,8 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     def progress(stage: str, done: int, total: int, note: str) -> None:
         stages.append((stage, done, total))
         if stage != "describe":
-            assert "loss" in note and "accuracy" in note and "samples/s" in note
+            assert "loss" in note and "accuracy" in note
+            assert ("samples/s" in note) == (done % 3 != 1)  # the first step of an epoch is not timed
 
     run, record = train(tmp_path / "run", progress=progress), load_run(tmp_path / "run").record
     assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",) and record == run.record

@@ -70,12 +70,14 @@ def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
 @contextlib.contextmanager
 def _bars() -> Iterator[Progress]:
     tasks: dict[str, progress.TaskID] = {}
-    name = progress.TextColumn("{task.description}", markup=False)
-    # On a narrow terminal, the note is cut, not the bar and the numbers.
+    console = Console(stderr=True)
+    # On a narrow terminal, the note is cut, then the bar, then the name, not the numbers.
+    name_column = Column(no_wrap=True, max_width=max(console.width - 37, 1))
+    name = progress.TextColumn("{task.description}", markup=False, table_column=name_column)
     note = progress.TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
-    times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
-    columns = name, progress.BarColumn(20), progress.MofNCompleteColumn(), *times, note
-    with progress.Progress(*columns, console=Console(stderr=True), expand=True) as bars:
+    numbers = progress.MofNCompleteColumn(table_column=Column(no_wrap=True)), progress.TimeElapsedColumn()
+    columns = name, progress.BarColumn(20), *numbers, progress.TimeRemainingColumn(), note
+    with progress.Progress(*columns, console=console, expand=True) as bars:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:
@@ -103,12 +105,12 @@ def _lines() -> Progress:
             return
         printed, following = (stage, done), now + SECONDS_PER_LINE
         elapsed = now - start
-        parts = [f"{done:,} of {total:,}", note]
+        parts = [f"{done:,} of {total:,}"]
         if elapsed >= 1:
             parts.append(f"{elapsed:.0f} s")
             if first < done < total:
                 parts.append(f"about {elapsed * (total - done) / (done - first):.0f} s left")
-        print(f"{stage}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+        print(f"{stage}: {', '.join(filter(None, [*parts, note]))}", file=sys.stderr, flush=True)
 
     return show
 
