@@ -116,7 +116,6 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
     for bad, folds, message in (
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
-        ({"mug": STICK}, 1, "views of 1 classes"),
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
     ):

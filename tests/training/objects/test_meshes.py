@@ -275,18 +275,6 @@ def test_names_files(tmp_path: Path) -> None:
     assert_refused("absent.json is missing", read_names, tmp_path / "absent.json")
 
 
-def test_scans_against_trimesh(shared: Path) -> None:
-    paths = find_meshes(shared / "data" / "meshes")
-    for name in ("025_mug", "056_tennis_ball"):
-        mesh = load_mesh(paths[name])
-        reference = trimesh.load_scene(paths[name], process=False).to_mesh()
-        np.testing.assert_allclose(mesh.vertices[mesh.faces], reference.triangles, atol=1e-9)
-        # trimesh samples the texture at the vertices.
-        vertex_colors = np.asarray(reference.visual.to_color().vertex_colors)[:, :3].astype(int)
-        at_corner = mesh.colors_at(np.arange(len(mesh.faces)), np.zeros((len(mesh.faces), 2))).astype(int)
-        assert np.median(np.abs(at_corner - vertex_colors[reference.faces[:, 0]])) <= 2
-
-
 def test_meshes_in_other_units(tmp_path: Path) -> None:
     box, large = (write_box(tmp_path / f"{side:g}.glb", (side, side / 2, side / 4)) for side in (0.2, 200))
     expected, scaled = load_mesh(box), load_mesh(large, 0.001)
