@@ -15,6 +15,7 @@ from training.baselines.architectures import check_weights, crop_size, pretraine
 from training.baselines.image_baselines import check_backbone
 from training.baselines.job import check_baselines, train_baselines
 from training.baselines.thor import types_of_views
+from training.fitting.samples import check_classes
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
@@ -124,6 +125,8 @@ def run_train_job(
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
     for directory, views in sources.items():
         _check_batch_size(job.protocol, sum(shard.views for shard in views.shards))
+        if job.protocol.classifiers:
+            check_classes(views)
         if not is_finished(directory):
             check_out(directory)
             if job.crop_size is not None:
@@ -215,14 +218,15 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         labelled: instances of the frames.
     """
     known = dict.fromkeys([*names, *(labelled.views if labelled else ())])
-    missing = sorted(set(job.leave_out) - set(known))
-    if missing:
+    if missing := sorted(set(job.leave_out) - set(known)):
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
     if not classes:
         raise InputError(f"leave_out has {', '.join(known)}, all objects; expected at least one that is trained")
     if job.protocol.distractors is not None:
         job.protocol.distractors.check(classes)
+    if len(classes) < 2 and (labelled or job.protocol.classifiers):
+        raise InputError(f"the objects are {classes[0]}; expected at least two; add another one")
     if labelled is None:
         return
     folded: dict[str, str] = {}
@@ -237,8 +241,6 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
                 f"frames: {name!r} has one usable instance; expected at least two: label it in another frame, "
                 "or leave it out (leave_out)"
             )
-    if len(classes) < 2:
-        raise InputError(f"frames: the objects are {', '.join(classes) or 'none'}; expected at least two")
 
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:

@@ -81,7 +81,8 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     def progress(stage: str, done: int, total: int, note: str) -> None:
         stages.append((stage, done, total))
         if stage != "describe":
-            assert "loss" in note and "accuracy" in note and "samples/s" in note
+            assert "loss" in note and "accuracy" in note
+            assert ("samples/s" in note) == (done % 3 != 1)  # the first step of an epoch is not timed
 
     run, record = train(tmp_path / "run", progress=progress), load_run(tmp_path / "run").record
     assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",) and record == run.record
@@ -115,7 +116,6 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
     for bad, folds, message in (
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
-        ({"mug": STICK}, 1, "views of 1 classes"),
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
     ):

@@ -71,7 +71,7 @@ class Augmentations:
 
     def __post_init__(self) -> None:
         if not 1 <= self.copies <= MAX_COPIES:
-            raise InputError(f"augmentations.copies is {self.copies}; expected an integer from 1 to {MAX_COPIES}")
+            raise InputError(f"copies is {self.copies}; expected an integer from 1 to {MAX_COPIES}")
 
     def __bool__(self) -> bool:
         return any(getattr(self, name) for name in KINDS)

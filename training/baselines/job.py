@@ -15,7 +15,7 @@ from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_fo
 from training.baselines.image_baselines import fit_image_network, fit_templates, load_image_network, load_templates
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
-from training.storage.jobs import Progress
+from training.storage.jobs import Progress, add_prefix
 from training.views.normalized_views import ViewSource
 
 __all__ = ["CLOUD_BASELINES", "TITLES", "TrainedBaseline", "check_baselines", "load_baselines", "train_baselines"]
@@ -106,10 +106,11 @@ def train_baselines(
                 f"dataset: the views with digest {source.digest[:12]} are not those that {directory} was trained on; "
                 "give the dataset of that run"
             )
+        shown = progress if run.record["folds"] == 1 else add_prefix(progress, f"fold {run.record['fold']}")
         for name in names:
             file = baseline_file(directory, name)
             if not file.is_file():
-                task, start = FitTask(name, source, run, directory, weights, progress), time.perf_counter()
+                task, start = FitTask(name, source, run, directory, weights, shown), time.perf_counter()
                 fitted = _METHODS[name][0](task)
                 write_baseline(file, fitted, run.classes, time.perf_counter() - start)
                 # Checkpoints, including those of earlier versions.

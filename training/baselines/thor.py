@@ -178,10 +178,12 @@ def fit_thor(task: FitTask) -> StoredBaseline:
 
         context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
         checkpoints = Checkpoints(task.scratch / f"{name}-{k}")
-        return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
+        return fit(samples, context, task.options, checkpoints, held_of_type, report, rows=rows)[0]
 
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
+        # A class is trained on the held-out views of a type if it has no others.
+        held_of_type = held_out & np.isin(samples.label, samples.label[rows[~held_out[rows]]])
         for k in range(1, config.n_slices + 1):
             model = fit_classifier(name, rows, k)
             arrays |= model_arrays(model, f"{name}-{k}/")

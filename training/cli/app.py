@@ -23,16 +23,15 @@ from contextlib import AbstractContextManager
 from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
-from rich import progress
+from rich import progress, table
 from rich.console import Console
-from rich.table import Column
 
 from thor2_jax import __version__
 from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
-__all__ = ["app", "console", "finish", "main", "option_arguments", "print_note", "show_help", "show_progress"]
+__all__ = ["Table", "app", "console", "finish", "main", "option_arguments", "print_note", "show_help", "show_progress"]
 
 MAX_BYTES = 2**30
 
@@ -70,12 +69,14 @@ def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
 @contextlib.contextmanager
 def _bars() -> Iterator[Progress]:
     tasks: dict[str, progress.TaskID] = {}
-    name = progress.TextColumn("{task.description}", markup=False)
-    # On a narrow terminal, the note is cut, not the bar and the numbers.
-    note = progress.TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
-    times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
-    columns = name, progress.BarColumn(20), progress.MofNCompleteColumn(), *times, note
-    with progress.Progress(*columns, console=Console(stderr=True), expand=True) as bars:
+    terminal = Console(stderr=True)
+    # On a narrow terminal, the note is cut, then the bar, then the name, not the numbers.
+    name_column = table.Column(no_wrap=True, max_width=max(terminal.width - 37, 1))
+    name = progress.TextColumn("{task.description}", markup=False, table_column=name_column)
+    note = progress.TextColumn("{task.fields[note]}", markup=False, table_column=table.Column(ratio=1, no_wrap=True))
+    numbers = progress.MofNCompleteColumn(table_column=table.Column(no_wrap=True)), progress.TimeElapsedColumn()
+    columns = name, progress.BarColumn(20), *numbers, progress.TimeRemainingColumn(), note
+    with progress.Progress(*columns, console=terminal, expand=True) as bars:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:
@@ -103,12 +104,12 @@ def _lines() -> Progress:
             return
         printed, following = (stage, done), now + SECONDS_PER_LINE
         elapsed = now - start
-        parts = [f"{done:,} of {total:,}", note]
+        parts = [f"{done:,} of {total:,}"]
         if elapsed >= 1:
             parts.append(f"{elapsed:.0f} s")
             if first < done < total:
                 parts.append(f"about {elapsed * (total - done) / (done - first):.0f} s left")
-        print(f"{stage}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+        print(f"{stage}: {', '.join(filter(None, [*parts, note]))}", file=sys.stderr, flush=True)
 
     return show
 
@@ -124,6 +125,14 @@ sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.std
 # tables are at least 72 wide, and the terminal breaks their lines. Names of objects may look like markup.
 WIDTH = max(shutil.get_terminal_size().columns, 72) if sys.stdout.isatty() else 160
 console = Console(width=WIDTH, markup=False, emoji=False)
+
+
+class Table(table.Table):
+    """A table that folds words that are longer than a column; by default, rich cuts them."""
+
+    def __init__(self, *names: str, title: str | None = None) -> None:
+        super().__init__(*(table.Column(name, overflow="fold") for name in names), title=title)
+
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that only training imports; recognition and the service do not need them (docs/install.md)."""

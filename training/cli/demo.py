@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from training.cli import options
-from training.cli.app import app, console, finish, show_progress
+from training.cli.app import Table, app, console, finish, show_progress
 
 
 @app.command()

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
-from training.cli.app import app, console, finish, show_help, show_progress
+from training.cli.app import Table, app, console, finish, show_help, show_progress
 
 evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."

@@ -4,11 +4,10 @@ import dataclasses
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from thor2_jax.printable import escape_characters
 from training.cli import options
-from training.cli.app import app, console, finish
+from training.cli.app import Table, app, console, finish
 
 
 @app.command()

@@ -213,7 +213,8 @@ def train(
             if run.embedding is not None and run.surfaces is None:
                 console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
         finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
+        objects = f" (objects: {len(runs[0].classes)})" if runs else ""
         written = "run written to" if runs else f"{finished}; the run is in"
         model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
         frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
-        finish(f"{written} {directory}", "recognize a frame", "recognize", "--model", model, *frame)
+        finish(f"{written} {directory}{objects}", "recognize a frame", "recognize", "--model", model, *frame)

@@ -219,8 +219,7 @@ class Distractors:
 
     def check(self, classes: Sequence[str]) -> None:
         """Raise InputError if a distractor has the name of a class."""
-        shared = sorted(set(self.meshes) & set(classes))
-        if shared:
+        if shared := sorted(set(self.meshes) & set(classes)):
             raise InputError(
                 f"distractors: {shared[0]!r} is also a class; expected other objects; remove its mesh from one of the "
                 "two folders"

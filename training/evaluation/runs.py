@@ -230,8 +230,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         for sequence in dict.fromkeys(map(sequence_of, frames))
     }
     loaded = {path: load_runs([path]) for path in dict.fromkeys(paths[0] for paths in directories.values() if paths)}
-    missing = [sequence for sequence, paths in directories.items() if not paths]
-    if missing:
+    if missing := [sequence for sequence, paths in directories.items() if not paths]:
         raise InputError(
             f"model: {directory} has no run for {', '.join(missing)}; train the missing ones with "
             "`thor2 train --sequences`"

@@ -80,7 +80,7 @@ class EpochMetrics:
         epoch: number of the epoch, from 1.
         loss: mean training loss of the epoch so far.
         accuracy: training accuracy of the epoch so far, with dropout.
-        samples_per_second: training rate of the epoch so far, without its first step, which may compile.
+        samples_per_second: training rate of the epoch so far, without its first step, which may compile; 0 after it.
         held_out_accuracy: accuracy on the held-out set after the epoch; None during the epoch or without the set.
     """
 
@@ -96,7 +96,8 @@ def fit_progress(progress: Progress, stage: str, epochs: int) -> Callable[[int, 
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:
         note = f"epoch {metrics.epoch}/{epochs}, loss {metrics.loss:.3f}, accuracy {metrics.accuracy:.3f}"
-        progress(stage, done, total, f"{note}, {metrics.samples_per_second:,.0f} samples/s")
+        rate = f", {metrics.samples_per_second:,.0f} samples/s" if metrics.samples_per_second else ""
+        progress(stage, done, total, note + rate)
 
     return show
 

@@ -69,7 +69,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
         return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
     if visual.kind != "texture":
-        raise InputError("no texture and no vertex colours")
+        raise InputError("no texture and no vertex colours; export the mesh with its colours")
     material = visual.material
     if isinstance(material, PBRMaterial):
         image, factor = material.baseColorTexture, material.baseColorFactor
@@ -142,10 +142,10 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
         mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
     longest = mesh.longest_side
     if not MIN_SIDE <= longest <= MAX_SIDE:
-        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
+        unit, factor = (" (is it in millimetres?)", 0.001) if longest > MAX_SIDE else ("", 1000)
         raise InputError(
             f"mesh {path}: longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the "
-            "mesh, for instance by --mesh-scale 0.001"
+            f"mesh, for instance by --mesh-scale {factor:g}"
         )
     return mesh
 
@@ -158,7 +158,7 @@ def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | 
 def read_mesh(path: Path) -> TexturedMesh:
     """Return the mesh in the unit of its file, of any size; raise InputError as `load_mesh`."""
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}")
+        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
     import trimesh
@@ -188,7 +188,7 @@ def read_mesh(path: Path) -> TexturedMesh:
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
                 parts.append(_part(geometry, transform))
         if not parts:
-            raise InputError("no faces")
+            raise InputError("no faces; expected triangles, not points alone")
         mesh = merge_meshes(parts)
         # The bounds of an object are those of its faces.
         used, faces = np.unique(mesh.faces, return_inverse=True)
@@ -201,7 +201,7 @@ def read_mesh(path: Path) -> TexturedMesh:
         raise InputError(f"mesh {path}: {error}") from error
     # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
     except Exception as error:
-        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)})") from error
+        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)}); export or copy it again") from error
     return mesh
 
 
@@ -241,11 +241,10 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
     folder, names = Path(folder), read_names(names) if isinstance(names, Path) else names
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
-    requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         name = entry.name if entry.is_dir() else entry.stem
-        if requested is not None and name not in requested:  # scans that are not requested are not checked
+        if names is not None and name not in names.values():  # scans that are not requested are not checked
             continue
         path = _mesh_in(entry) if entry.is_dir() else entry if entry.suffix.lower() in MESH_SUFFIXES else None
         if path is not None and scans.setdefault(name, path) != path:
@@ -254,8 +253,7 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = Non
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
         return _named(folder, scans)
-    unknown = sorted(set(names.values()) - set(scans))
-    if unknown:
+    if unknown := sorted(set(names.values()) - set(scans)):
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
     return _named(folder, {name: scans[names[name]] for name in sorted(names)})
 
@@ -286,10 +284,9 @@ def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
             raise InputError(f"mesh {path} {problem}")
         return {name: path}
     own = path.resolve().name
-    if any(file.stem.lower() == "textured" for file in path.iterdir()) or name == own:
-        mesh = _mesh_in(path)
-        if mesh is not None:
-            return _named(path.resolve().parent, {name or own: mesh})
+    is_object = name == own or any(file.stem.lower() == "textured" for file in path.iterdir())
+    if is_object and (mesh := _mesh_in(path)) is not None:
+        return _named(path.resolve().parent, {name or own: mesh})
     meshes = find_meshes(path)
     if name is None:
         return meshes

@@ -169,8 +169,7 @@ def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mappin
     Raises:
         InputError: the records differ; the message names the first different field and both values.
     """
-    difference = _first_difference("", stored, json.loads(json.dumps(requested)))
-    if difference:
+    if difference := _first_difference("", stored, json.loads(json.dumps(requested))):
         field, old, new = difference
         raise InputError(
             f"out: {directory} was written with {field} {_shown(old)}, not {_shown(new)}; "

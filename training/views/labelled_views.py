@@ -96,8 +96,7 @@ def read_instances(
                         crops.setdefault(name, []).append(rgbd_crop(item.frame, of_object[-1].label, crop_size))
             except InputError as error:
                 skipped.append((name, str(error)))
-    empty = [name for name, of_object in views.items() if not of_object]
-    if empty:
+    if empty := [name for name, of_object in views.items() if not of_object]:
         reason = next(reason for name, reason in skipped if name == empty[0])
         raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
     if not views:

@@ -374,8 +374,7 @@ def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
             raise InputError(f"sequences: {table} has the sequence {sequence!r}; expected a relative path")
         if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
             raise InputError(f"sequences: {table}: {sequence} is {names!r}; expected a list of names")
-        missing = sorted(set(names) - set(source.classes))
-        if missing:
+        if missing := sorted(set(names) - set(source.classes)):
             raise InputError(f"sequences: {table}: the views have no class {', '.join(missing)}, named by {sequence}")
         sources[sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
     if not sources:

@@ -9,15 +9,16 @@ import pytest
 from commands import Command
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import save_trained_run
+from small_runs import random_classifier, save_trained_run
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.types import Cloud
-from training.baselines import cloud_baselines, job
+from training.baselines import cloud_baselines, job, thor
 from training.baselines.baseline import (
+    FitTask,
     StoredBaseline,
     baseline_file,
     baseline_inputs,
@@ -86,20 +87,35 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
 
 
 def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    label, view, marks = np.repeat([0, 1], 20), np.tile(np.arange(20), 2), list[Any]()
+    label, view, marks, stages = np.repeat([0, 1], 20), np.tile(np.arange(20), 2), list[Any](), list[str]()
 
     def interrupted(task: Any) -> Any:
         marks.append(task.held_out(label, view))
+        task.progress("grow forest", 1, 1, "")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(job, "_METHODS", {"forest": (interrupted, None)})
     for folds, fold in ((5, 3), (1, 0)):
         folder = write_run(tmp_path / f"{folds}", folds, fold)
         with pytest.raises(KeyboardInterrupt):
-            train_baselines(folder, SOURCE, ["forest"])
+            train_baselines(folder, SOURCE, ["forest"], lambda stage, *_: stages.append(stage))
         assert not list((folder / "baselines").glob("*.safetensors"))
     np.testing.assert_array_equal(marks[0], fold_of_views(label, view, NAMES, 5, 0) == 3)
-    assert marks[0].sum() == 8 and not marks[1].any()
+    assert marks[0].sum() == 8 and not marks[1].any() and stages == ["fold 3: grow forest", "grow forest"]
+
+
+def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All views of a class from above are held out, as can happen to a few random ones."""
+    above, trained = np.array(["top" in types for types in thor.types_of_views(SOURCE.record["job"])]), list[Any]()
+
+    def fit(samples: Any, *args: Any, rows: Any) -> Any:
+        trained.append(set(samples.label[rows[~args[3][rows]]]))
+        return random_classifier(64, 2, 0), 1
+
+    monkeypatch.setattr(thor, "fit", fit)
+    monkeypatch.setattr(FitTask, "held_out", lambda task, label, view: (label == 1) & above[view])
+    train_baselines(write_run(tmp_path / "run"), SOURCE, ["thor"])
+    assert trained == [{0, 1}] * 3
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: Command) -> None:

@@ -45,7 +45,6 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("recognize", "--help"),
         ("trian", "--help"),
         ("train --out o --no-such-option", "--help"),
-        ("evaluate frames", "--help"),
         ("evaluate coco d", "--help"),
         ("render --meshes m --out o --engine slurm", "--help"),
         ("recognize --model m f --workers 0", "(given: 0)"),
@@ -99,8 +98,9 @@ def test_version_and_help(printed: Command) -> None:
 
 def test_a_narrow_terminal_cuts_no_column(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
-    code = "import sys; sys.stdout.isatty = lambda: True; from training.cli.app import console; print(console.width)"
-    assert run_python("-c", code).stdout == "72\n"
+    code = "import sys; sys.stdout.isatty = lambda: True; from training.cli.app import *; print(console.width)"
+    width, *table = run_python("-c", code + "; console.print(Table('CE+TOPS+TOPS2'), width=12)").stdout.splitlines()
+    assert width == "72" and "".join(table).count("TOPS") == 2 and "…" not in "".join(table)
 
 
 def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkey
     assert "\x1b" not in err and "\r" not in err
     assert lines[0] == "describe: 0 of 40, views" and lines[-1] == "fit: 7 of 9"
     assert len(lines) == 2 + 40 // 5  # one at the start of each stage, and one every five seconds
-    assert "20 of 40" in lines[4] and "20 s left" in lines[4]
+    assert lines[4] == "describe: 20 of 40, 20 s, about 20 s left, views"
 
 
 def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,17 +240,19 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
 
 
 def test_a_narrow_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The note is cut, not the bar, the stage and the numbers."""
+    """The note is cut, then the bar and the name of the stage, not the numbers."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", "80")
-    for stage, done, total, note in (
-        ("render [red]", 3, 10, "of [/x]"),
-        ("stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2),
+    long = "stage 3 of 9: fold 0: describe for the embedding"
+    for width, stage, done, total, note in (
+        (80, "render [red]", 3, 10, "of [/x]"),
+        (80, "stage 4 of 5: fit networks", 20, 104, "epoch 2/2, loss 5.407, accuracy 0.338, 7,336 samples/s" * 2),
+        (50, long, 11720, 12960, ""),
     ):
+        monkeypatch.setenv("COLUMNS", f"{width}")
         with show_progress() as show:
             show(stage, done, total, note)
         err = capsys.readouterr().err
-        assert "━" in err and stage in err and f"{done}/{total}" in err and note[:7] in err
+        assert "━" in err and stage[: width - 38] in err and f"{done}/{total}" in err and note[:7] in err
 
 
 def test_the_running_stage_is_within_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

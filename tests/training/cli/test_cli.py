@@ -196,7 +196,7 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "nothing was trained" not in printed(*command, "--baselines", "forest")
     for surfaces in (None, object()):
         record = {"dataset": {}, "held_out_accuracy": {}}
-        trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces)
+        trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces, classes=())
         monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
         assert ("no surfaces" in printed(*command)) == (surfaces is None)
 
@@ -207,7 +207,7 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *STEPS, *options)
     shutil.copytree(views, tmp_path / "run" / "views")
     out = printed(*arguments)
-    assert "fold 0: tops" in out and "fold 1: tops" in out
+    assert "fold 0: tops" in out and "fold 1: tops" in out and "(objects: 3)" in out
     # Views in a finished run directory may be a dataset of the user, and are kept.
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
@@ -252,6 +252,7 @@ def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: 
         ("{}", "has no sequence"),
         ('{"c": ["dragon"]}', "no class dragon"),
         ('{"c": "mug"}', "c is 'mug'"),
+        ('{"d": ["cereal_box_blue", "soup_can_red"], "c": ["mug_white"]}', "add objects to mug_white"),
         ('{"c": []}', "c is []"),
         ('{"../c": ["mug_white"]}', "'../c'"),
         ('{"/c": ["mug_white"]}', "'/c'"),

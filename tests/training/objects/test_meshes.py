@@ -121,7 +121,7 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
         (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
         (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
         (colored(QUAD * 1000), "longest side 100 .*millimetres"),
-        (colored(QUAD * 0), "longest side 0"),
+        (colored(QUAD * 1e-4), "longest side 1e-05;.*--mesh-scale 1000$"),
         (colored(QUAD + [[np.nan], [0], [0], [0]]), "1 vertices are not finite"),
         (colored(QUAD + [[np.inf], [0], [0], [0]]), "1 vertices are not finite"),
     ):
@@ -273,18 +273,6 @@ def test_names_files(tmp_path: Path) -> None:
         (tmp_path / file).write_text(content)
         assert_refused(f"names file {tmp_path / file}.*{message}", read_names, tmp_path / file)
     assert_refused("absent.json is missing", read_names, tmp_path / "absent.json")
-
-
-def test_scans_against_trimesh(shared: Path) -> None:
-    paths = find_meshes(shared / "data" / "meshes")
-    for name in ("025_mug", "056_tennis_ball"):
-        mesh = load_mesh(paths[name])
-        reference = trimesh.load_scene(paths[name], process=False).to_mesh()
-        np.testing.assert_allclose(mesh.vertices[mesh.faces], reference.triangles, atol=1e-9)
-        # trimesh samples the texture at the vertices.
-        vertex_colors = np.asarray(reference.visual.to_color().vertex_colors)[:, :3].astype(int)
-        at_corner = mesh.colors_at(np.arange(len(mesh.faces)), np.zeros((len(mesh.faces), 2))).astype(int)
-        assert np.median(np.abs(at_corner - vertex_colors[reference.faces[:, 0]])) <= 2
 
 
 def test_meshes_in_other_units(tmp_path: Path) -> None:
