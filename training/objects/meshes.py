@@ -145,7 +145,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
         unit, factor = (" (is it in millimetres?)", 0.001) if longest > MAX_SIDE else ("", 1000)
         raise InputError(
             f"mesh {path}: longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the "
-            f"mesh, for instance by --mesh-scale {factor:g}"
+            f"mesh, for instance by --mesh-scale {scale * factor:g}"
         )
     return mesh
 

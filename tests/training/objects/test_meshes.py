@@ -281,7 +281,7 @@ def test_meshes_in_other_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(scaled.vertices, expected.vertices, atol=1e-6)
     np.testing.assert_array_equal(scaled.corner_colors, expected.corner_colors)
     assert read_mesh(large).longest_side == pytest.approx(200)
-    assert_refused(f"{large}: longest side 200.*--mesh-scale 0.001", load_mesh, large)
+    assert_refused(f"{large}: longest side 200.*--mesh-scale 0.001$", load_mesh, large)
     assert scaled_meshes({"box": box}, 1.0) == {"box": box}
     doubled = scaled_meshes({"box": box}, 2.0)["box"]
     assert isinstance(doubled, TexturedMesh)
