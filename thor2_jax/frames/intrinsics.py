@@ -119,8 +119,9 @@ class Intrinsics:
 
     def with_depth_scale(self, depth_scale: float | None) -> "Intrinsics":
         """Return the camera with another depth scale (None: with its own); raise InputError if it is out of range."""
-        scale = self.depth_scale if depth_scale is None else _checked_number("depth_scale", depth_scale)
-        return dataclasses.replace(self, depth_scale=scale)
+        if depth_scale is None:
+            return self
+        return dataclasses.replace(self, depth_scale=_checked_number("depth_scale", depth_scale))
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
