@@ -66,13 +66,6 @@ class _Box(NamedTuple):
     bottom: int
 
 
-class _Mask(NamedTuple):
-    """An instance's mask within its box."""
-
-    box: _Box
-    pixels: NDArray[np.bool_]
-
-
 class _Lettering(NamedTuple):
     """A label's text, font and size; `start` is its position relative to the corner of a box of width x height."""
 
@@ -133,22 +126,24 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
         labels: [H, W] integers; 0 is background, every other number an instance.
         annotations: annotations of labels that occur in `labels`.
     """
-    masks = [_crop(labels, annotation.label) for annotation in annotations]
+    masks = [labels == annotation.label for annotation in annotations]
+    places = [ndimage.find_objects(mask.view(np.uint8))[0] for mask in masks]
     diagonal = math.hypot(*labels.shape)
     thickness = max(1, round(diagonal / 350))
     # Letters grow more slowly than the picture, since large pictures are usually viewed enlarged.
     size = max(11, round(14 * (diagonal / 800) ** 0.75))
     pixels = color.copy()
-    for mask, annotation in zip(masks, annotations, strict=True):
-        _draw_outline(pixels, mask, annotation.paint, thickness)
+    for mask, place, annotation in zip(masks, places, annotations, strict=True):
+        _draw_outline(pixels[place], mask[place], annotation.paint, thickness)
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)
     covered = np.pad(labels != 0, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     placed: list[tuple[_Box, _Lettering, Paint]] = []
-    for mask, annotation in zip(masks, annotations, strict=True):
+    for mask, (rows, columns), annotation in zip(masks, places, annotations, strict=True):
         lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
         if lettering is not None:
-            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            target = _Box(columns.start, rows.start, columns.stop, rows.stop)
+            box = _place(lettering, target, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
             _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
     for box, lettering, paint in placed:  # after all leaders, since these may cross a label
@@ -173,20 +168,12 @@ def _text(answer: Recognition) -> str:
     return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
 
 
-def _crop(labels: NDArray[Any], label: int) -> _Mask:
-    mask = labels == label
-    rows, columns = ndimage.find_objects(mask.view(np.uint8))[0]
-    return _Mask(_Box(columns.start, rows.start, columns.stop, rows.stop), mask[rows, columns])
-
-
-def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
+def _draw_outline(pixels: NDArray[np.uint8], mask: NDArray[np.bool_], paint: Paint, thickness: int) -> None:
     """Draw a coloured line along the inner edge of the mask and a thin black or white one beside it."""
-    left, top, right, bottom = mask.box
-    within = ndimage.binary_erosion(mask.pixels, iterations=thickness)
+    within = ndimage.binary_erosion(mask, iterations=thickness)
     core = ndimage.binary_erosion(within, iterations=max(1, thickness // 3))
-    target = pixels[top:bottom, left:right]
-    target[mask.pixels & ~within] = paint
-    target[within & ~core] = _ink(paint)
+    pixels[mask & ~within] = paint
+    pixels[within & ~core] = _ink(paint)
 
 
 def _ink(paint: Paint) -> Paint:
@@ -252,10 +239,9 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
     return _Box(x, y, x + width, y + height)
 
 
-def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: Paint, thickness: int) -> None:
+def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: NDArray[np.bool_], paint: Paint, thickness: int) -> None:
     """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
-    row, column = np.nonzero(mask.pixels)
-    row, column = row + mask.box.top, column + mask.box.left
+    row, column = np.nonzero(mask)
     from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
     nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
     start = int(from_column[nearest]), int(from_row[nearest])

@@ -79,7 +79,7 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
         (np.zeros((6, 7), int), r"shape \(6, 7\)"),
         (np.zeros((6, 8)), "type float64"),
         (np.zeros((6, 8), bool), "type bool"),
-        (np.full((6, 8), -1), "label -1"),
+        (np.full((6, 8), -1), "value -1"),
     ],
 )
 def test_labels_that_are_not_labels(result: Any, message: str) -> None:
