@@ -134,9 +134,6 @@ class Intrinsics:
         if isinstance(values, Intrinsics):
             return values
         if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, (str, bytes)):
-            shape = values.shape if isinstance(values, np.ndarray) else np.asarray(values, dtype=object).shape
-            if shape not in ((3, 3), (9,)):
-                raise InputError(f"intrinsics is a {type(values).__name__} of shape {shape}; expected a 3 x 3 matrix")
             return cls.of_matrix(values)
         if hasattr(values, "distortion_model"):  # a CameraInfo message
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
@@ -177,7 +174,7 @@ class Intrinsics:
             skew = None
         if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
             shown = " ".join(str(matrix).split())
-            raise InputError(f"intrinsics is {shown[:200]}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
+            raise InputError(f"intrinsics is {shown[:200]}; expected a 3 x 3 matrix fx, 0, cx, 0, fy, cy, 0, 0, 1")
         return cls(fx, fy, cx, cy, depth_scale, width, height, distortion)
 
 

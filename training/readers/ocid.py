@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file, read_table
+from thor2_jax.files import as_path, read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, path_ends, sequence_of
 
@@ -66,10 +66,11 @@ class OCID(LabelledFrames):
                 images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        value = read_table(Path(names), (dict, list))
+        names = as_path(names, "names")
+        value = read_table(names, (dict, list))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
-            self._names, listed = _names_of_vlg(Path(names), value)
+            self._names, listed = _names_of_vlg(names, value)
             images = [
                 (sequence, image)
                 for sequence, image in images
@@ -78,7 +79,7 @@ class OCID(LabelledFrames):
             if not images:
                 raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
         else:
-            self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in images))
+            self._names = _names_in_order(names, value, dict.fromkeys(sequence for sequence, _ in images))
         self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in images]
         self.sources = [image for _, image in images]
 
@@ -225,13 +226,13 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
         axes = [fields.index(name) for name in "xyz"]
         width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
         (encoding,) = header["DATA"]
+        if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
+            raise ValueError
     except (KeyError, IndexError, ValueError, TypeError, OverflowError):
-        raise InputError(f"{path}: its header does not describe points with x, y and z") from None
-    if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
         raise InputError(
-            f"{path}: its header has {width} x {height} points with fields of {counts} numbers; "
-            "expected at least one point and one number for each axis"
-        )
+            f"{path}: its header does not describe points with x, y and z; expected WIDTH x HEIGHT points with one "
+            "number for each axis"
+        ) from None
     data, n = content[start:], width * height
     if encoding == "binary":
         if len(data) < n * record.itemsize:
