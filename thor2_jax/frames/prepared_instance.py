@@ -202,7 +202,7 @@ def _window(
     row, column = np.divmod(pixels, frame.depth.shape[1])
     top, left = max(row.min() - MARGIN, 0), max(column.min() - MARGIN, 0)
     here = slice(top, row.max() + MARGIN + 1), slice(left, column.max() + MARGIN + 1)
-    # What lies outside the image follows at least `MARGIN` pixels wide; elsewhere, nothing so far from the mask is read.
+    # Where the window ends inside the image, its padding is farther from the mask than what is read.
     labels = np.pad(frame.label_image[here].astype(np.int64), MARGIN, constant_values=OUTSIDE)
     depth = np.pad(frame.depth_m[here], MARGIN)
     return labels, depth, (row - top + MARGIN) * labels.shape[1] + column - left + MARGIN

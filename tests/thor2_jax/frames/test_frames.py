@@ -50,16 +50,12 @@ BAD_INTRINSICS: list[tuple[Any, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("values", "problem"), BAD_INTRINSICS)
-def test_intrinsics_that_are_no_mapping_of_positive_numbers(values: Any, problem: str) -> None:
-    assert_refused(f"^intrinsics{problem}", Intrinsics.of, values)
-
-
-def test_intrinsics_of_numbers_of_any_kind_and_other_entries() -> None:
+def test_intrinsics_are_a_mapping_of_numbers_of_any_kind() -> None:
     """The principal point may lie outside the image."""
     values = {"fx": np.int64(500), "fy": np.float32(501), "cx": -20, "cy": 2.5, "depth_scale": 5, "name": "left"}
     assert Intrinsics.of(values) == Intrinsics(500, 501, -20, 2.5, 5)
-    assert_refused("^intrinsics.fx is nan", Intrinsics, math.nan, 501, -20, 2.5)
+    for bad, problem in BAD_INTRINSICS:
+        assert_refused(f"^intrinsics{problem}", Intrinsics.of, bad)
 
 
 # Frames
@@ -136,10 +132,8 @@ def test_largest_number_of_instances() -> None:
     labels = np.arange(MAX_INSTANCES + 1, dtype=np.int32).reshape(7, -1)
     frame = RGBDFrame(**{**arrays(*labels.shape), "labels": labels})
     assert frame.instances == tuple(range(1, MAX_INSTANCES + 1))
-    np.testing.assert_array_equal(np.concatenate(list(frame.instance_pixels.values())), frame.instances)
     more = dataclasses.replace(frame, labels=labels + 1)
-    for of_frame in (lambda: more.instances, lambda: more.instance_pixels):
-        assert_refused(f"labels has {MAX_INSTANCES + 1} instances", of_frame)
+    assert_refused(f"labels has {MAX_INSTANCES + 1} instances", getattr, more, "instances")
 
 
 # Files

@@ -8,11 +8,9 @@ import pytest
 from refusals import assert_refused
 from scipy import ndimage
 from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.frames.outliers import voxel_downsample
 from thor2_jax.frames.prepared_instance import (
     MIN_POINTS,
     PreparedInstance,
@@ -55,18 +53,6 @@ def test_intrinsics_with_which_points_are_too_far_apart() -> None:
     frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
     absurd = dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0))
     assert_refused("^intrinsics place the points of an instance too far apart", instance_clouds, absurd)
-
-
-def test_points_are_voxel_means_of_backprojected_pixels() -> None:
-    rng = np.random.default_rng(1)
-    depth = (700 + np.arange(WIDTH) // 4 + rng.integers(-2, 3, (HEIGHT, WIDTH))).astype(np.uint16)
-    frame = frame_of(depth, patch((1, 50, 110, 60, 150)))
-    points = backproject(frame.depth_m, CAMERA)[frame.label_image == 1]
-    cloud, expected = only(frame), voxel_downsample(points, points, 0.003)[0]
-    assert (cloud.points.dtype, cloud.colors.dtype) == (np.float32, np.uint8)
-    distance = cdist(cloud.points, expected)
-    assert distance.min(axis=1).max() < 1e-6
-    assert len(set(distance.argmin(axis=1))) == len(cloud.points) >= 0.9 * len(expected)
 
 
 def test_colors_stay_with_their_points() -> None:
@@ -159,18 +145,6 @@ def box_depth(rotation: np.ndarray, sides: np.ndarray, centre: np.ndarray) -> np
     ends = np.stack([(sign * sides / 2 - start) / direction for sign in (-1, 1)])
     enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
     return np.where(enters < leaves, enters, 0)
-
-
-@pytest.mark.parametrize(
-    ("turn", "distance"),
-    [*(((0, 0), d) for d in (0.3, 1.5, 2.4)), *((t, 0.8) for t in ((60, 0), (-60, 0), (0, -60), (40, 40), (65, 20)))],
-)
-def test_every_point_of_a_plane_is_kept(turn: tuple[int, int], distance: float) -> None:
-    normal = Rotation.from_euler("xy", turn, degrees=True).apply([0, 0, 1])
-    depth = distance * normal[2] / (RAYS @ normal)
-    labels = patch((1, 70, 170, 110, 210))
-    cloud = only(frame_of(depth, labels))
-    assert count_lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -58,6 +58,9 @@ def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
     assert item.truth == {3: "mug", 5: "banana"}
     without_third = OCID(tmp_path, write_names(tmp_path, {"seq36": ["mug", "bowl"]}))
     assert_refused(f"{folder / 'label' / STEM}.png.*label 5;", without_third.__getitem__, 0)
+    cloud = folder / "pcd" / f"{STEM}.pcd"
+    cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
+    assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", without_third.__getitem__, 0)
 
 
 def test_the_order_of_the_dataset(tmp_path: Path) -> None:
@@ -99,13 +102,6 @@ def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
         assert dict(item.truth) == {3: "mug", 5: "bowl_1"}
 
 
-def test_a_cloud_of_another_size(tmp_path: Path) -> None:
-    cloud = write_ocid(tmp_path) / "pcd" / f"{STEM}.pcd"
-    cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
-    dataset = OCID(tmp_path, write_names(tmp_path))
-    assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", dataset.__getitem__, 0)
-
-
 def test_the_camera_against_least_squares_of_numpy() -> None:
     rng = np.random.default_rng(1)
     points = backproject(rng.uniform(0.5, 1.5, (12, 17)), CAMERA) + rng.normal(0, 1e-4, (12, 17, 3))
@@ -142,17 +138,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     output = printed(*command, "--out", tmp_path / "report")
     assert "instances scored: 4" in output
     assert "Published table 3" in output and "Published table 1" not in output
-    page = (tmp_path / "report" / "report.html").read_text()
-    assert "Models: run." in page and "banana (unknown object)" in page
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"banana": 1}
-    tables = report["accuracy"]["max"]
-    cells = {(*table["by"], *cell["where"].values()): cell for table in tables for cell in table["cells"]}
-    accuracy = {where: (cell["instances"], cell["accuracy"]["TOPS"]["mean"]) for where, cell in cells.items()}
-    assert accuracy[()] == (4, 0.75)
-    assert accuracy["camera", "lower"] == (2, 1.0) and accuracy["camera", "upper"] == (2, 0.5)
-    assert accuracy["camera", "place", "lower", "table"] == (2, 1.0)
-    assert accuracy["camera", "type", "upper", "mixed"] == (2, 0.5)
+    tables = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
+    by_camera = {cell["where"]["camera"]: cell["accuracy"]["TOPS"]["mean"] for cell in tables["camera",]}
+    assert by_camera == {"lower": 1.0, "upper": 0.5} and {("camera", "place"), ("camera", "type")} < tables.keys()
     names.unlink()
     assert refused(*command) == f"error: {names}: No such file or directory"
 
@@ -225,16 +215,12 @@ DAMAGED_HEADERS = (
     (b"DATA", b"DATE"),
     (b"FIELDS x y z", b"FIELDS x y w"),
     (b"SIZE 4", b"SIZE 3"),
-    (b"SIZE 4", b"SIZE four"),
-    (b"TYPE F", b"TYPE X"),
     (b"TYPE F F F U U\n", b""),
     (b"COUNT 1", b"COUNT 2"),
-    (b"COUNT 1", b"COUNT 0"),
     (b"COUNT 1 1 1 1 1", b"COUNT 1 1 1 1 9999999999999999999999"),
     (b"WIDTH 3", b"WIDTH 0"),
     (b"WIDTH 3", b"WIDTH"),
     (b"HEIGHT 2", b"HEIGHT 3"),
-    (b"HEIGHT 2\n", b""),
 )
 
 
@@ -244,7 +230,6 @@ def test_damaged_clouds(tmp_path: Path) -> None:
         ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
         ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
         ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
-        ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
         *((data, *each, "") for data in ("ascii", "binary") for each in DAMAGED_HEADERS),
     ):
         path = write_cloud(tmp_path / "cloud.pcd", data, old, new)

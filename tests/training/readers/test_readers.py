@@ -40,7 +40,6 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     write_uwis(tmp_path, "219", "000010", MUG, seed=1)
     write_uwis(tmp_path, "219", "000002", MUG, seed=2)
     (tmp_path / "README.md").write_text("nothing to read")
-    (tmp_path / "names.json").write_text("{}")
     dataset = UWISOccluded(tmp_path)
     items = list(dataset)
     assert [item.identifier for item in items] == ["219/000002", "219/000010", "1000/000000"] == dataset.identifiers
