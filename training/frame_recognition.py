@@ -52,10 +52,7 @@ class FrameAnswer:
     @property
     def segmentation_failure(self) -> str:
         """Why the frame has no instance if its depth is unusable, for segmented frames; otherwise an empty string."""
-        if self.frame is None or self.recognitions:
-            return ""
-        depth = self.frame.depth_m
-        if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+        if self.frame is None or self.recognitions or self.frame.has_usable_depth:
             return ""
         wanted = f"from {MIN_DEPTH} to {MAX_DEPTH} m"
         return f"segment: nothing was found, since no pixel has depth {wanted}: {unit_question(self.frame)}"

@@ -124,11 +124,13 @@ class RGBDFrame:
 
     @cached_property
     def has_usable_depth(self) -> bool:
-        """Whether any pixel of an instance has a depth from `MIN_DEPTH` to `MAX_DEPTH`.
+        """Whether any pixel of an instance has a depth from `MIN_DEPTH` to `MAX_DEPTH`; without instances, any pixel.
 
         Raises InputError as `label_image`.
         """
-        return bool(((self.depth_m >= MIN_DEPTH) & (self.depth_m <= MAX_DEPTH) & (self.label_image != 0)).any())
+        counts = self.label_image != 0
+        usable = (self.depth_m >= MIN_DEPTH) & (self.depth_m <= MAX_DEPTH)
+        return bool((usable & counts if counts.any() else usable).any())
 
     @cached_property
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:

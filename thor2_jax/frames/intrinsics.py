@@ -141,14 +141,7 @@ class Intrinsics:
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
             values = values["intrinsic"]
-        parts = _parts(values)
-        if parts is None:
-            shown = ", ".join(map(str, list(values)[:8])) or "no entry"
-            raise InputError(
-                f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
-                "intrinsic_matrix"
-            )
-        matrix, scale, distortion = parts
+        matrix, scale, distortion = _parts(values)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
         width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
         return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
@@ -267,10 +260,13 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
+def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any]:
     """Return a camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion.
 
-    The entries of a mapping determine its format; the result is None if no format has them.
+    The entries of a mapping determine its format.
+
+    Raises:
+        InputError: no format has these entries, or one is missing or invalid.
     """
     scale: Any = values.get("depth_scale")
     model = values.get("distortion_model")
@@ -295,7 +291,11 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
         if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale, _supported(model, values.get("distortion"))
-    return None
+    shown = ", ".join(map(str, list(values)[:8])) or "no entry"
+    raise InputError(
+        f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
+        "intrinsic_matrix"
+    )
 
 
 def _pinhole_matrix(values: Mapping[Any, Any], column: str, row: str) -> list[Any]:

@@ -21,7 +21,6 @@ from thor2_jax.adaptation.estimate import (
     MIN_INSTANCES,
     PRIOR,
     adaptation_criterion,
-    entropy,
     estimate_transform,
     evenly_spread,
     gallery_classifier,
@@ -61,12 +60,6 @@ def test_a_transform_follows_its_formula() -> None:
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
 def test_a_damaged_transform_is_refused(stored: object) -> None:
     assert_refused("color_transform", Recognizer, dataclasses.replace(run(), record={"color_transform": stored}))
-
-
-def test_entropy_counts_what_the_classes_lack() -> None:
-    p = np.array([[0.2, 0.3, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 0.5, 0]])
-    expected = [scipy_entropy([*row, 1 - sum(row)]) for row in p]
-    np.testing.assert_allclose(entropy(jnp.asarray(p)), expected, atol=1e-5)
 
 
 def test_the_objective_is_the_entropy_of_the_answers() -> None:
@@ -114,14 +107,11 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
 
 
-def test_too_few_instances_are_refused_with_their_number() -> None:
+def test_instances_are_spread_evenly_and_too_few_are_refused() -> None:
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(instances(1)[0], reason="too few points")]
+    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
     message = f"9 usable instances; expected at least {MIN_INSTANCES}: .* unusable ones .1.; .* too few points"
     assert_refused(message, estimate_transform, few, none_is_known)
-
-
-def test_instances_are_spread_evenly() -> None:
-    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
 def frame(seed: int, shape: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from image_files import deep_png, write_frame_files
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import (
@@ -119,15 +118,6 @@ def test_instances_and_their_pixels(kind: Any, shape: tuple[int, int]) -> None:
         np.testing.assert_array_equal(pixels, np.flatnonzero(labels == label))
 
 
-def test_a_frame_without_labels() -> None:
-    frame = RGBDFrame(**arrays() | {"labels": None})
-    assert frame.labels is None and frame.depth_m.shape == (5, 7)
-    for read in ("label_image", "instance_pixels", "instances"):
-        assert_refused(r"^labels is None;", getattr, frame, read)
-    labelled = dataclasses.replace(frame, labels=arrays()["labels"])
-    assert labelled.instances == RGBDFrame(**arrays()).instances
-
-
 def test_largest_number_of_instances() -> None:
     labels = np.arange(MAX_INSTANCES + 1, dtype=np.int32).reshape(7, -1)
     frame = RGBDFrame(**{**arrays(*labels.shape), "labels": labels})
@@ -152,7 +142,9 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
     assert frame.depth.dtype == np.uint16 and frame.intrinsics == dataclasses.replace(CAMERA, depth_scale=5000)
     del files["labels"]
     frame = read_frame(**files)
-    assert frame.labels is None and frame.intrinsics == CAMERA
+    assert frame.labels is None and frame.intrinsics == CAMERA and frame.depth_m.shape == (5, 7)
+    for read in ("label_image", "instance_pixels", "instances"):
+        assert_refused(r"^labels is None;", getattr, frame, read)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
@@ -175,16 +167,6 @@ def test_damaged_images_and_other_formats(files: dict[str, Path], name: str) -> 
         assert_refused(f"^{name}: {files[name]} [^<>]*$", read_frame, **files)  # without the name of an object
 
 
-def test_images_with_an_invalid_checksum_are_refused(tmp_path: Path) -> None:
-    """Even if their pixels can be decoded."""
-    text = PngInfo()
-    text.add_text("Title", "scene")
-    whole = encode_image(np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2, pnginfo=text)
-    for place in range(8, len(whole) - 12):  # all but the signature and the chunk that ends the file
-        (tmp_path / "l.png").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        assert_refused("^labels: .*l.png ", read_labels, tmp_path / "l.png")
-
-
 @pytest.mark.parametrize(
     ("read", "modes", "problem"),
     [
@@ -204,8 +186,9 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
     mask = Image.fromarray(arrays()["labels"])
     mask.save(tmp_path / "lossy", "JPEG")
     mask.save(tmp_path / "lossy.tiff", "TIFF", compression="jpeg")
-    mask.save(tmp_path / "lossless.tiff", "TIFF", compression="tiff_lzw")
-    assert np.array_equal(read_labels(tmp_path / "lossless.tiff"), np.asarray(mask))
+    deep = np.array([[0, 255], [256, 65535]], np.uint16)
+    Image.fromarray(deep).save(tmp_path / "lossless.tiff", "TIFF", compression="tiff_lzw")
+    np.testing.assert_array_equal(read_labels(tmp_path / "lossless.tiff"), deep)
     for name in ("lossy", "lossy.tiff"):
         assert_refused(f"^labels: .*{name}.*JPEG", read_labels, tmp_path / name)
 
@@ -228,15 +211,3 @@ def test_depth_files_of_32_bit(tmp_path: Path, value: int) -> None:
     depth[0, 0] = value
     Image.fromarray(depth).save(tmp_path / "d.tiff")
     assert_refused(rf"^depth: .*has values from .*{value}.*; expected 0 to 65535$", read_depth, tmp_path / "d.tiff")
-
-
-def test_label_files_of_16_bit_and_of_indexed_colors(tmp_path: Path) -> None:
-    labels = np.array([[0, 1, 2], [254, 255, 65535]], np.uint16)
-    Image.fromarray(labels).save(tmp_path / "l.png")
-    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), labels)
-    indices = labels.astype(np.uint8)
-    image = Image.fromarray(indices, mode="L").copy()
-    image.putpalette(list(np.random.default_rng(0).integers(0, 256, 768)))
-    assert image.mode == "P"
-    image.save(tmp_path / "l.png")
-    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), indices)

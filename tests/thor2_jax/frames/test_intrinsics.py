@@ -3,7 +3,6 @@
 import io
 import json
 import re
-import types
 from pathlib import Path
 from typing import Any
 
@@ -106,14 +105,6 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
     storage.write("distortion_coefficients", np.zeros((1, 5)))
     storage.release()
     assert read_intrinsics(tmp_path / "k.yml") == SIZED
-
-
-@pytest.mark.parametrize("names", ["KD", "kd"])
-def test_a_ros_message(names: str) -> None:
-    """Bags hold messages whose arrays are NumPy's."""
-    fields = {names[0]: MATRIX.ravel(), names[1]: np.array([0.1, 0, 0, 0, 0])}
-    message = types.SimpleNamespace(width=640, height=480, distortion_model="plumb_bob", **fields)
-    assert Intrinsics.of(message) == Intrinsics(**PINHOLE, width=640, height=480, distortion=(0.1, 0, 0, 0, 0))
 
 
 def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:

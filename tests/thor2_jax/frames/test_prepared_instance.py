@@ -245,13 +245,3 @@ def test_around_at_the_image_border() -> None:
         np.testing.assert_allclose([*columns[[0, -1]], *rows[[0, -1]]], [*x, *y], atol=0.01)
         assert set(np.unique(around[..., 2])) <= {np.float32(0), np.float32(1)}
         assert (around[..., 2] == 1).any()
-
-
-def test_nothing_is_seen_beside_narrow_parts() -> None:
-    """A part of the mask as wide as a pixel, and what is two pixels beside it, is not around the instance."""
-    labels = patch((1, 50, 90, 50, 90), (1, 130, 131, 50, 90), (1, 50, 130, 71, 72))  # a ray meets column 71
-    around = prepare_instance(frame_of(flat(1000), labels), 1, 2.5).around
-    row, column = np.rint(around[..., 1] * CAMERA.fy + CAMERA.cy), np.rint(around[..., 0] * CAMERA.fx + CAMERA.cx)
-    beside = ndimage.binary_dilation(labels == 1, np.outer([1, 0, 1, 0, 1], [1, 0, 1, 0, 1]))
-    near = beside[row.astype(int), column.astype(int)]
-    assert near.any() and not around[near, 2].any()

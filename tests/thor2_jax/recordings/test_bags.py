@@ -19,7 +19,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.recordings import bags
 from thor2_jax.recordings.bags import Bag
-from thor2_jax.recordings.detection_files import MessageBag
+from thor2_jax.recordings.detection_files import DetectionBag, MessageBag, RerunFile
 from thor2_jax.recordings.topics import Topics
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
@@ -55,6 +55,7 @@ def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
     with bag_writer(path) as write:
         files.write_images(write, FRAMES[0], camera=False)
     assert_refused("camera_topic", Bag(path).__enter__)
+    assert_refused("is not open", list, Bag(path).frames())
     (recorded,) = frames_of(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000)
     assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
 
@@ -104,18 +105,17 @@ def test_streams_out_of_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("kept", [0, 5, 0.3, 0.9, 1])
+@pytest.mark.parametrize("kept", [0, 0.001, 0.3, 0.9, 1])
 def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
     path = write_recording(tmp_path / name, FRAMES)
     file = next(path.glob("*.db3")) if path.is_dir() else path
     content = bytearray(file.read_bytes())
     if kept == 1:  # bytes in the middle
         content[len(content) // 3 : len(content) // 3 + 2000] = bytes(2000)
-    file.write_bytes(content if kept == 1 else content[: int(kept * len(content)) if kept < 1 else int(kept)])
+    file.write_bytes(content[: int(kept * len(content))])
     try:
-        with Bag(path) as bag:
-            for recorded in bag.frames():
-                recorded.read()
+        for recorded in frames_of(path):
+            recorded.read()
     except InputError as error:
         assert str(path) in str(error)
     else:
@@ -143,22 +143,17 @@ def test_decompression_is_limited(tmp_path: Path, name: str, compression: str, m
     assert_refused("more than 65536 bytes", frames_of, path)
 
 
-def test_the_largest_overlap_of_chunks() -> None:
-    def overlap(*chunks: tuple[int, int, int, int]) -> int:
-        names = "message_start_time", "message_end_time", "uncompressed_size"
-        of_storage = [
-            SimpleNamespace(**dict(zip(names, chunk, strict=True)), channel_count={channel: 1})
-            for *chunk, channel in chunks
-        ]
-        return bags._largest_overlap(SimpleNamespace(storage=SimpleNamespace(chunks=of_storage)), {1, 2})
-
-    assert overlap() == 0
-    assert overlap((0, 9, 5, 1), (5, 12, 5, 2), (10, 20, 5, 1), (13, 30, 5, 1)) == 10
-    assert overlap((0, 9, 5, 1), (5, 9, 5, 1), (9, 20, 5, 1)) == 15
-    assert overlap((0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)) == 50
-
-
-def test_the_limit_of_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_overlap_of_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for chunks, expected in (
+        ([], 0),
+        ([(0, 9, 5, 1), (5, 12, 5, 2), (10, 20, 5, 1), (13, 30, 5, 1)], 10),
+        ([(0, 9, 5, 1), (5, 9, 5, 1), (9, 20, 5, 1)], 15),
+        ([(0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)], 50),
+    ):
+        names = "message_start_time", "message_end_time", "uncompressed_size", "channel_count"
+        made = [SimpleNamespace(**dict(zip(names, [*each, {k: 1}], strict=True))) for *each, k in chunks]
+        reader = SimpleNamespace(storage=SimpleNamespace(chunks=made))
+        assert bags._largest_overlap(reader, {1, 2}) == expected
     path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
     monkeypatch.setattr(bags, "MAX_OVERLAPPING", 1000)
     assert_refused("chunks of the same time; expected at most 1000", Bag(path).__enter__)
@@ -223,13 +218,11 @@ def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
     assert numbers[0] == 0 < numbers[1] < numbers[2] and numbers[2] > 8
 
 
-def test_no_recording(tmp_path: Path) -> None:
+def test_no_recording_or_no_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "x.bag").mkdir()
     message = "damaged or of another format.*metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
     assert_refused(message, Bag(tmp_path / "x.bag").__enter__)
-    assert_refused("^bag is 'a.x00b'; expected a path", Bag, "a\0b")
-
-
-def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for open_file, name in ((Bag, "bag"), (DetectionBag, "out_bag"), (RerunFile, "rerun")):
+        assert_refused(f"^{name} is 'a.x00b'; expected a path", open_file, "a\0b")
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     assert_refused(r"\.\[bags\]", Bag(tmp_path).__enter__)
