@@ -233,22 +233,19 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
             f"{path}: its header does not describe points with x, y and z; expected WIDTH x HEIGHT points with one "
             "number for each axis"
         ) from None
-    data, n = content[start:], width * height
-    if encoding == "binary":
-        if len(data) < n * record.itemsize:
-            raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
-        records = np.frombuffer(data, record, count=n)
-        with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
-            points = np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
-    elif encoding == "ascii":
-        try:
-            numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
-        except (ValueError, OverflowError):
-            raise InputError(f"{path} does not hold {n} lines of {sum(counts)} numbers") from None
-        points = numbers[:, [sum(counts[:axis]) for axis in axes]]
-    else:
+    if encoding not in ("ascii", "binary"):
         raise InputError(f"{path} has DATA {encoding}; expected ascii or binary")
-    return points.reshape(height, width, 3)
+    data, n = content[start:], width * height
+    try:
+        if encoding == "ascii":
+            numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
+            return numbers[:, [sum(counts[:axis]) for axis in axes]].reshape(height, width, 3)
+        records = np.frombuffer(data, record, count=n)
+    except (ValueError, OverflowError):
+        raise InputError(f"{path} does not hold {n} points of {sum(counts)} numbers, or is cut off") from None
+    with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
+        points = [records[f"{axis}"][:, 0].astype(np.float64) for axis in axes]
+    return np.stack(points, axis=-1).reshape(height, width, 3)
 
 
 def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:

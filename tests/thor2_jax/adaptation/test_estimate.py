@@ -21,6 +21,7 @@ from thor2_jax.adaptation.estimate import (
     MIN_INSTANCES,
     PRIOR,
     adaptation_criterion,
+    entropy,
     estimate_transform,
     evenly_spread,
     gallery_classifier,
@@ -60,6 +61,12 @@ def test_a_transform_follows_its_formula() -> None:
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
 def test_a_damaged_transform_is_refused(stored: object) -> None:
     assert_refused("color_transform", Recognizer, dataclasses.replace(run(), record={"color_transform": stored}))
+
+
+def test_entropy_counts_what_the_classes_lack() -> None:
+    p = np.array([[0.2, 0.3, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 0.5, 0]])
+    expected = [scipy_entropy([*row, 1 - sum(row)]) for row in p]
+    np.testing.assert_allclose(entropy(jnp.asarray(p)), expected, atol=1e-5)
 
 
 def test_the_objective_is_the_entropy_of_the_answers() -> None:

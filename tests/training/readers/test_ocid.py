@@ -227,9 +227,9 @@ DAMAGED_HEADERS = (
 def test_damaged_clouds(tmp_path: Path) -> None:
     for data, old, new, expected in (
         ("binary", b"DATA binary", b"DATA binary_compressed", "DATA binary_compressed"),
-        ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
-        ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
-        ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
+        ("binary", b"\x05\0\0\0", b"\x05\0\0", "or is cut off"),
+        ("ascii", b" 5\n", b"\n", "6 points of 5 numbers"),
+        ("ascii", b"2.5 ", b"x ", "6 points of 5 numbers"),
         *((data, *each, "") for data in ("ascii", "binary") for each in DAMAGED_HEADERS),
     ):
         path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
