@@ -51,25 +51,31 @@ def test_frames_of_recordings(tmp_path: Path, name: str, is_compressed: bool) ->
 
 
 def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with bag_writer(path) as write:
-        files.write_images(write, FRAMES[0], camera=False)
+    path = write_messages(tmp_path / "a.mcap", {COLOR: image(RGB, "rgb8"), files.DEPTH: image(DEPTH, "16UC1")})
     assert_refused("camera_topic", Bag(path).__enter__)
     assert_refused("is not open", list, Bag(path).frames())
     (recorded,) = frames_of(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000)
     assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
 
 
+def write_messages(path: Path, messages: dict[str, Any]) -> Path:
+    """Write one message for each topic."""
+    with bag_writer(path) as write:
+        for topic, message in messages.items():
+            write(topic, message, START)
+    return path
+
+
+INFO, RGB, DEPTH = files.camera_info(FRAMES[0].intrinsics, (240, 320)), FRAMES[0].color, FRAMES[0].depth
+
+
 def test_rectified_images_have_the_camera_of_the_projection(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
     info = files.camera_info(FRAMES[0].intrinsics, (240, 320))
     info.d[:] = 0.1, 0, 0, 0, 0
     info.p[0] = 280.0
-    with bag_writer(path) as write:
-        for topic in ("/cam/image_rect_color", "/cam/image_raw"):
-            write(topic, image(FRAMES[0].color, "bgr8"), START)
-        write("/cam/depth_registered/image", image(FRAMES[0].depth, "16UC1"), START)
-        write("/cam/camera_info", info, START)
+    images = {f"/cam/image_{kind}": image(RGB, "bgr8") for kind in ("rect_color", "raw")}
+    depth = {"/cam/depth_registered/image": image(DEPTH, "16UC1")}
+    path = write_messages(tmp_path / "a.mcap", images | depth | {"/cam/camera_info": info})
     for topic, fx, distortion in (("/cam/image_rect_color", 280, ()), ("cam/image_raw", 290, (0.1, 0, 0, 0, 0))):
         with Bag(path, Topics(color=topic)) as bag:
             assert bag.intrinsics is not None and (bag.intrinsics.fx, bag.intrinsics.distortion) == (fx, distortion)
@@ -77,20 +83,15 @@ def test_rectified_images_have_the_camera_of_the_projection(tmp_path: Path) -> N
 
 
 def test_depth_that_is_not_aligned(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with bag_writer(path) as write:
-        write(COLOR, image(FRAMES[0].color, "rgb8"), START)
-        write("/camera/depth/image_rect_raw", image(FRAMES[0].depth[::2, ::2], "16UC1", frame_id="depth"), START)
-        write(files.CAMERA, files.camera_info(FRAMES[0].intrinsics, (240, 320)), START)
-    with Bag(path) as bag:
+    depth = {"/camera/depth/image_rect_raw": image(DEPTH[::2, ::2], "16UC1", frame_id="depth")}
+    with Bag(write_messages(tmp_path / "a.mcap", {COLOR: image(RGB, "rgb8"), files.CAMERA: INFO} | depth)) as bag:
         assert len(bag.notes) == 1 and "aligned" in bag.notes[0]
         (recorded,) = bag.frames()
         assert_refused("160 x 120 pixels and color 320 x 240", recorded.read)
 
 
 def test_messages_describe_the_content_of_topics(tmp_path: Path) -> None:
-    with bag_writer(tmp_path / "a.mcap") as write:
-        write(COLOR, image(FRAMES[0].color[..., 0], "mono8"), START)
+    write_messages(tmp_path / "a.mcap", {COLOR: image(RGB[..., 0], "mono8")})
     assert_refused(rf"{COLOR} \(sensor_msgs/msg/Image, 'mono8'\)", Bag(tmp_path / "a.mcap").__enter__)
     with MessageBag(tmp_path / "b.mcap", {COLOR: "sensor_msgs/msg/Image", "/name": "std_msgs/msg/String"}) as bag:
         bag.write_message("/name", {"data": "robot"}, START)
@@ -200,22 +201,6 @@ def test_columns_of_other_types_and_sizes(tmp_path: Path, computed: str, monkeyp
     database.close()
     monkeypatch.setattr(bags, "MAX_DECOMPRESSED", 2**18)
     assert_refused("too big" if "zeroblob" in computed else "damaged", frames_of, path)
-
-
-def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(12)])
-    content = path.read_bytes()
-    numbers = []
-    for kept in (0.01, 0.4, 0.999):
-        path.write_bytes(content[: int(kept * len(content))])
-        frames = []
-        with pytest.raises(InputError, match=r"truncated after \d+ colour images"), Bag(path) as bag:
-            for recorded in bag.frames():
-                frames.append(recorded.read())
-        for k, frame in enumerate(frames):
-            np.testing.assert_array_equal(frame.depth, table_frame(k).depth)
-        numbers.append(len(frames))
-    assert numbers[0] == 0 < numbers[1] < numbers[2] and numbers[2] > 8
 
 
 def test_no_recording_or_no_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
