@@ -158,14 +158,12 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: runs[paths[0].name])
     models = tmp_path / "runs"
     command = ("evaluate", "ocid", tmp_path, "--model", models, "--names", write_names(tmp_path, table))
-    for folder in ("table/top/mixed/seq08/fold-1", "seq36/fold-1", "seq36/fold-0"):
+    for folder in ("table/top/mixed/seq08/fold-1", "seq36/fold-0"):
         (models / folder).mkdir(parents=True)
         (models / folder / "run.json").touch()
     output = printed(*command, "--per-sequence", "--out", tmp_path / "report")
     assert f"--model {models}/seq36/fold-0 " in output  # of the command that explains answers
-    assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
     cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
     assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
