@@ -138,27 +138,3 @@ def test_clouds_on_the_voxel_grid_against_loops(share: float, depth: int) -> Non
     cubes = cubes[rng.permutation(len(cubes))[:1200]]
     points = (cubes + rng.random(cubes.shape)) * 0.003 - [0.03, 0.01, -0.8]
     np.testing.assert_equal(remove_outliers(points), kept_by_loops(points))
-
-
-def grid(rows: int, columns: int, spacing: float = 0.003) -> np.ndarray:
-    """Return a plane of rows x columns points with a corner at the origin."""
-    row, column = np.mgrid[:rows, :columns]
-    return np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * spacing
-
-
-@pytest.mark.parametrize(("size", "stays"), [(99, False), (100, True), (101, True)])
-def test_pieces_stay_from_a_tenth_of_the_largest(size: int, stays: bool) -> None:
-    plane = grid(25, 40) + 0.001
-    piece = grid(11, 10)[:size] + [0.2, 0, 0.001]
-    kept, relaxed = remove_outliers(np.concatenate([plane, piece]))
-    assert not relaxed
-    np.testing.assert_array_equal(kept, np.arange(1000 + size * stays))
-
-
-@pytest.mark.parametrize(("strays", "relaxed"), [(1599, False), (1600, False), (1601, True)])
-def test_the_neighbour_rule_is_skipped_if_it_drops_most(strays: int, relaxed: bool) -> None:
-    plane = grid(40, 40)
-    scattered = grid(41, 41, 0.03)[:strays] + [0, 0, 1]
-    kept, skipped = remove_outliers(np.concatenate([plane, scattered]))
-    assert skipped is relaxed
-    np.testing.assert_array_equal(kept, np.arange(1600))  # each scattered point is a component
