@@ -1,6 +1,6 @@
 """Pictures of recognized frames: the colour image with the outline of each instance and a label with its answer.
 
-draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
+draw_overlay(frame, recognizer.recognize(frame), "overlay.png")
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy import ndimage
 from colornet.colors import LUMA
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
-from thor2_jax.frames.frames import check_images
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
@@ -78,40 +78,35 @@ class _Lettering(NamedTuple):
     height: int
 
 
-def draw_overlay(
-    color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
-) -> None:
+def draw_overlay(frame: RGBDFrame, answers: Sequence[Recognition], path: str | Path) -> None:
     """Draw the answers for a frame on its colour image, and write a PNG atomically.
 
     A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
 
     Args:
-        color: [H, W, 3] uint8, sRGB.
-        labels: [H, W] integers; 0 is background, every other number an instance.
-        answers: answers for instances in `labels`; instances without an answer are not drawn.
+        frame: a frame with labels.
+        answers: answers for instances of the frame; instances without an answer are not drawn.
         path: path of the picture.
 
     Raises:
-        InputError: a shape or type does not fit, or an answer is for a label that does not occur in `labels`.
+        InputError: the frame has no labels, or an answer is for a label that does not occur in them.
         OSError: the file cannot be written.
     """
-    color, labels = np.asarray(color), np.asarray(labels)
-    check_images(color, labels=labels)
     for answer in answers:
-        if answer.label == 0 or not (labels == answer.label).any():
+        if answer.label not in frame.instance_pixels:
             raise InputError(f"answers: label {answer.label} does not occur in labels")
-    picture = annotate(color, labels, answers)
+    picture = annotate(frame, answers)
     with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
-def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
+def annotate(frame: RGBDFrame, answers: Sequence[Recognition]) -> Image.Image:
     """Return the picture that `draw_overlay` writes; the arguments are not checked."""
     annotations = [
         Annotation(answer.label, paint, _text(answer))
         for answer, paint in zip(answers, answer_paints(answers), strict=True)
     ]
-    return draw_instances(color, labels, annotations)
+    return draw_instances(frame.color, frame.label_image, annotations)
 
 
 def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:

@@ -172,7 +172,7 @@ class DetectionBag(MessageBag):
         """Write the detections of a frame; arguments as `detection_array`, exceptions as `write_message`."""
         array = detection_array(detections, stamp=stamp, frame_id=frame_id)
         self.write_message(DETECTIONS_TOPIC, array, stamp)
-        picture = annotate(frame.color, frame.label_image, [one.recognition for one in detections])
+        picture = annotate(frame, [one.recognition for one in detections])
         overlay = {
             "header": {"stamp": ros_time(stamp), "frame_id": frame_id},
             "format": "rgb8; jpeg compressed bgr8",
