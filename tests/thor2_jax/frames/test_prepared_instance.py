@@ -53,6 +53,7 @@ def test_intrinsics_with_which_points_are_too_far_apart() -> None:
     frame = frame_of(flat(), patch((1, 20, 60, 30, 90)))
     absurd = dataclasses.replace(frame, intrinsics=Intrinsics(1e-6, 1e-6, 0, 0))
     assert_refused("^intrinsics place the points of an instance too far apart", instance_clouds, absurd)
+    assert_refused("^instance is 99; expected one of 1$", prepare_instance, frame, 99, 2.5)
 
 
 def test_colors_stay_with_their_points() -> None:

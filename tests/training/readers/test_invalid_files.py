@@ -11,6 +11,9 @@ from dataset_files import READERS, K, vlg_item, write_dataset
 from PIL import Image
 from refusals import assert_refused
 
+from training.readers.bop import BOP
+from training.readers.ocid import OCID
+
 FILES = {
     "bop": ("000049", "rgb/000001.png depth/000001.png mask_visib/000001_000000.png scene_camera.json scene_gt.json"),
     "ocid": ("table/top/mixed/seq36", "rgb/b.png depth/b.png label/b.png pcd/b.pcd"),
@@ -62,6 +65,9 @@ def test_paths_that_are_not_a_dataset(kind: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, expected in (("absent", "is not a directory"), ("file", "is not a directory"), ("empty", "has no ")):
         assert_refused(f"^(dataset|frames): {tmp_path / name} {expected}", READERS[kind], tmp_path / name)
+    if kind in ("bop", "ocid"):
+        write_dataset(kind, tmp_path)
+        assert_refused("^names is 'a.x00b'; expected a path", BOP if kind == "bop" else OCID, tmp_path, "a\0b")
 
 
 def camera(**changes: Any) -> dict[str, Any]:
