@@ -121,15 +121,15 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
         labels: [H, W] integers; 0 is background, every other number an instance.
         annotations: annotations of labels that occur in `labels`.
     """
-    masks = [labels == annotation.label for annotation in annotations]
-    places = [ndimage.find_objects(mask.view(np.uint8))[0] for mask in masks]
+    places = [ndimage.find_objects((labels == each.label).view(np.uint8))[0] for each in annotations]
+    masks = [labels[place] == each.label for each, place in zip(annotations, places, strict=True)]
     diagonal = math.hypot(*labels.shape)
     thickness = max(1, round(diagonal / 350))
     # Letters grow more slowly than the picture, since large pictures are usually viewed enlarged.
     size = max(11, round(14 * (diagonal / 800) ** 0.75))
     pixels = color.copy()
     for mask, place, annotation in zip(masks, places, annotations, strict=True):
-        _draw_outline(pixels[place], mask[place], annotation.paint, thickness)
+        _draw_outline(pixels[place], mask, annotation.paint, thickness)
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)
     covered = np.pad(labels != 0, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
@@ -140,7 +140,8 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
             target = _Box(columns.start, rows.start, columns.stop, rows.stop)
             box = _place(lettering, target, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
-            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
+            instance = np.argwhere(mask) + (target.top, target.left)
+            _draw_leader(draw, box, instance, annotation.paint, max(1, size // 7))
     for box, lettering, paint in placed:  # after all leaders, since these may cross a label
         draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
         start = box.left + lettering.start[0], box.top + lettering.start[1]
@@ -234,9 +235,11 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
     return _Box(x, y, x + width, y + height)
 
 
-def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: NDArray[np.bool_], paint: Paint, thickness: int) -> None:
-    """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
-    row, column = np.nonzero(mask)
+def _draw_leader(
+    draw: ImageDraw.ImageDraw, box: _Box, instance: NDArray[np.intp], paint: Paint, thickness: int
+) -> None:
+    """Draw a line from a label that lies beside its instance to the nearest of the instance's pixels [n, 2]."""
+    row, column = instance.T
     from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
     nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
     start = int(from_column[nearest]), int(from_row[nearest])
