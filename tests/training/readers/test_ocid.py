@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import Command
-from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, points_of, vlg_item, write_ocid
+from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, vlg_item, write_ocid
 from PIL import Image
 from refusals import assert_refused
 from toy_recognizers import NamesInOrder
@@ -44,9 +44,6 @@ def test_a_frame(tmp_path: Path, place: str, first: int) -> None:
     fitted = item.frame.intrinsics
     numbers = fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale
     np.testing.assert_allclose(numbers, (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4)
-    # The points of the frame equal those of the cloud.
-    points, there = backproject(item.frame.depth_m, fitted), depth > 0
-    np.testing.assert_allclose(points[there], points_of(depth)[there], rtol=1e-4, atol=1e-6)
 
 
 def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
@@ -63,27 +60,21 @@ def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
     assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", without_third.__getitem__, 0)
 
 
-def test_the_order_of_the_dataset(tmp_path: Path) -> None:
+def test_the_order_of_the_dataset_and_the_longest_end_of_a_path(tmp_path: Path) -> None:
     root = tmp_path / "YCB10"
     for sequence in ("table/top/mixed/seq21", "floor/top/cuboid/seq02", "table/bottom/mixed/seq21"):
         write_ocid(root, sequence, "result_b", seed=1)
         write_ocid(root, sequence, "result_a", seed=2)
     (root / "table" / "top" / "mixed" / "notes.txt").write_text("nothing to read")
     (root / "table" / "top" / "mixed" / "seq99").mkdir()
-    names = write_names(tmp_path, {"seq21": ["a", "b", "c"], "seq02": ["d", "e", "f"]})
+    table = {"seq21": list("abc"), "seq02": list("def"), "top/mixed/seq21": list("ghi"), "seq99": "not used", "7": None}
+    names = write_names(tmp_path, table)
     whole = OCID(tmp_path, names)
     sequences = ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
     assert whole.identifiers == [f"{sequence}/result_{stem}" for sequence in sequences for stem in "ab"]
     assert [item.identifier for item in whole] == whole.identifiers == OCID(root, names).identifiers
     assert [item.attributes["camera"] for item in whole] == ["lower"] * 2 + ["upper"] * 4
-
-
-def test_names_of_the_longest_matching_path_suffix_are_used(tmp_path: Path) -> None:
-    for camera in ("bottom", "top"):
-        write_ocid(tmp_path, f"table/{camera}/curved/seq36")
-    table = {"seq36": ["a", "b", "c"], "top/curved/seq36": ["d", "e", "f"], "seq99": "not used", "7": None}
-    lower, upper = OCID(tmp_path, write_names(tmp_path, table))
-    assert list(lower.truth.values()) == ["a", "b", "c"] and list(upper.truth.values()) == ["d", "e", "f"]
+    assert ["".join(item.truth.values()) for item in whole] == ["abc"] * 2 + ["ghi"] * 2 + ["def"] * 2
 
 
 @pytest.mark.parametrize("sequence", ["YCB10/table/bottom/curved/seq36", "table/bottom/curved/seq36", "seq36"])
