@@ -200,39 +200,50 @@ def find_occlusion(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, NDA
     return occluded, boundary
 
 
+def _window(
+    frame: RGBDFrame, pixels: NDArray[np.intp]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.intp]]:
+    """Return labels and depth in a window around a mask (with `MARGIN`), and the mask's flat indices in it."""
+    row, column = np.divmod(pixels, frame.depth.shape[1])
+    top, left = max(row.min() - MARGIN, 0), max(column.min() - MARGIN, 0)
+    here = slice(top, row.max() + MARGIN + 1), slice(left, column.max() + MARGIN + 1)
+    # Where the window ends inside the image, its padding is farther from the mask than what is read.
+    labels = np.pad(frame.label_image[here].astype(np.int64), MARGIN, constant_values=OUTSIDE)
+    depth = np.pad(frame.depth_m[here], MARGIN)
+    return labels, depth, (row - top + MARGIN) * labels.shape[1] + column - left + MARGIN
+
+
 def _contour(
     frame: RGBDFrame, label: int, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
     """Return whether each pixel of the mask is on the contour and on the occlusion boundary, and the object's depth."""
-    row, column = np.divmod(pixels, frame.depth.shape[1])
-    top, left = max(row.min() - MARGIN, 0), max(column.min() - MARGIN, 0)
-    window = slice(top, row.max() + MARGIN + 1), slice(left, column.max() + MARGIN + 1)
-    # Where the window ends inside the image, its padding is farther from the mask than what is read.
-    labels = np.pad(frame.label_image[window].astype(np.int64), MARGIN, constant_values=OUTSIDE)
-    places, width = (row - top + MARGIN) * labels.shape[1] + column - left + MARGIN, labels.shape[1]
-    labels, depth = labels.ravel(), np.pad(frame.depth_m[window], MARGIN).ravel()
+    window, depth, places = _window(frame, pixels)
+    labels, depth = window.ravel(), depth.ravel()
+    steps = (1, -1, window.shape[1], -window.shape[1])
+    edges = [np.flatnonzero(labels[places + step] != label) for step in steps]
+    edge, step = np.concatenate(edges), np.repeat(steps, [len(indices) for indices in edges])
+    here = places[edge]
 
-    def first_depth(start: NDArray[np.intp], step: int, wanted: Any) -> NDArray[np.float32]:
-        """Return the first valid depth of an instance along a step; 0 if there is none within `STEPS` pixels."""
+    def first_depth(start: NDArray[np.intp], step: NDArray[np.intp], wanted: Any) -> NDArray[np.float32]:
+        """Return the first valid depth of an instance along each step; 0 if there is none within `STEPS` pixels."""
         at = start + step * np.arange(STEPS)[:, None]
         usable = (labels[at] == wanted) & (depth[at] > 0)
         first = at[usable.argmax(axis=0), np.arange(len(start))]
         return np.where(usable.any(axis=0), depth[first], 0)
 
+    own = first_depth(here, -step, label)
+    beside = labels[here + step]
+    other = beside
+    for k in range(2, GAP + 2):
+        other = np.where(other == BACKGROUND, labels[here + k * step], other)
+    theirs = np.where(other > BACKGROUND, first_depth(here + step, step, other), 0)
+    hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
+
     on_contour, on_boundary = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
     own_depth = np.zeros(len(pixels), np.float32)
-    for step in (1, -1, width, -width):
-        edge = np.flatnonzero(labels[places + step] != label)
-        here = places[edge]
-        own = first_depth(here, -step, label)
-        beside = other = labels[here + step]
-        for k in range(2, GAP + 2):
-            other = np.where(other == BACKGROUND, labels[here + k * step], other)
-        theirs = np.where(other > BACKGROUND, first_depth(here + step, step, other), 0)
-        hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
-        on_contour[edge] = True
-        on_boundary[edge[hides | (beside == OUTSIDE)]] = True
-        own_depth[edge[own > 0]] = own[own > 0]
+    on_contour[edge] = True
+    on_boundary[edge[hides | (beside == OUTSIDE)]] = True
+    own_depth[edge[own > 0]] = own[own > 0]
     return on_contour, on_boundary, own_depth
 
 
