@@ -123,12 +123,15 @@ def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ..
     cell 0.
     """
     place = np.floor(points / PIECE_CELL)
-    place -= np.floor(np.median(place, axis=1, keepdims=True))
-    near = (np.abs(place) <= GRID_REACH).all(axis=0)
-    place = np.where(near, place, 0)
+    near = None
+    if np.ptp(place, axis=1).max() > GRID_REACH:
+        place -= np.floor(np.median(place, axis=1, keepdims=True))
+        near = (np.abs(place) <= GRID_REACH).all(axis=0)
+        place = np.where(near, place, 0)
     cells = (place - place.min(axis=1, keepdims=True)).astype(np.int64) + 2
     shape = tuple((cells.max(axis=1) + 3).tolist())
-    return np.where(near, np.ravel_multi_index(tuple(cells), shape), 0), shape
+    flat = np.ravel_multi_index(tuple(cells), shape)
+    return flat if near is None else np.where(near, flat, 0), shape
 
 
 def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from thor2_jax.errors import InputError
@@ -143,7 +142,11 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
     (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
     columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
     window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    return ~ndimage.minimum_filter(window, 2 * RIM + 1, mode="nearest")[window]
+    # This equals `scipy.ndimage.minimum_filter`, in half the time.
+    padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
+    inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
+    inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
+    return ~inside[window]
 
 
 def unit_question(frame: RGBDFrame) -> str:
@@ -204,13 +207,15 @@ def _window(
     frame: RGBDFrame, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.intp]]:
     """Return labels and depth in a window around a mask (with `MARGIN`), and the mask's flat indices in it."""
-    row, column = np.divmod(pixels, frame.depth.shape[1])
-    top, left = max(row.min() - MARGIN, 0), max(column.min() - MARGIN, 0)
-    here = slice(top, row.max() + MARGIN + 1), slice(left, column.max() + MARGIN + 1)
-    # Where the window ends inside the image, its padding is farther from the mask than what is read.
-    labels = np.pad(frame.label_image[here].astype(np.int64), MARGIN, constant_values=OUTSIDE)
-    depth = np.pad(frame.depth_m[here], MARGIN)
-    return labels, depth, (row - top + MARGIN) * labels.shape[1] + column - left + MARGIN
+    height, width = frame.depth.shape
+    row, column = np.divmod(pixels, width)
+    top, left = row.min() - MARGIN, column.min() - MARGIN
+    shape = row.max() - top + MARGIN + 1, column.max() - left + MARGIN + 1
+    inside = slice(max(top, 0), min(top + shape[0], height)), slice(max(left, 0), min(left + shape[1], width))
+    here = tuple(slice(part.start - first, part.stop - first) for part, first in zip(inside, (top, left), strict=True))
+    labels, depth = np.full(shape, OUTSIDE, np.int64), np.zeros(shape, np.float32)
+    labels[here], depth[here] = frame.label_image[inside], frame.depth_m[inside]
+    return labels, depth, (row - top) * shape[1] + column - left
 
 
 def _contour(

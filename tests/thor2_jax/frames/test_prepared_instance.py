@@ -148,6 +148,18 @@ def box_depth(rotation: np.ndarray, sides: np.ndarray, centre: np.ndarray) -> np
     return np.where(enters < leaves, enters, 0)
 
 
+@pytest.mark.parametrize(
+    ("turn", "distance"),
+    [*(((0, 0), d) for d in (0.3, 1.5, 2.4)), *((t, 0.8) for t in ((60, 0), (-60, 0), (0, -60), (40, 40), (65, 20)))],
+)
+def test_every_point_of_a_plane_is_kept(turn: tuple[int, int], distance: float) -> None:
+    normal = Rotation.from_euler("xy", turn, degrees=True).apply([0, 0, 1])
+    depth = distance * normal[2] / (RAYS @ normal)
+    labels = patch((1, 70, 170, 110, 210))
+    cloud = only(frame_of(depth, labels))
+    assert count_lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_every_point_of_a_box_is_kept(seed: int) -> None:
     """Includes corners and edges; no face is seen at more than about 65 degrees."""
