@@ -292,7 +292,11 @@ class Recognizer:
         return len(shapes)
 
     def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
-        """Prepare the given instances of a frame (by default all) one by one, with corrected colours."""
+        """Prepare the given instances of a frame (by default all) one by one, with corrected colours.
+
+        Raises:
+            InputError: the frame has no labels or, when it is prepared, no such instance.
+        """
         check_frame(frame)
         model, config = self.model, self.run.config
         chosen = frame.instances if labels is None else labels

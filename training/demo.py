@@ -126,7 +126,7 @@ def run_demo(
     draw_descriptor(xyz, rgb, trained.network, trained.config, "mug_blue", pictures / "descriptor.png")
     for number, scene in enumerate(scenes[:N_SHOWN]):
         recognitions = run.recognizer.recognize(scene.frame)
-        draw_overlay(scene.frame.color, scene.frame.label_image, recognitions, pictures / f"scene-{number}.png")
+        draw_overlay(scene.frame, recognitions, pictures / f"scene-{number}.png")
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     summary = DemoSummary(NAMES, accuracy, counts, time.perf_counter() - start, peak)

@@ -19,7 +19,6 @@ from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFra
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
 __all__ = ["RecognizerArguments", "recognize_frames", "track_frames"]
@@ -32,7 +31,7 @@ class FrameAnswer:
     Attributes:
         name: name of the frame.
         frame: the frame; None if it could not be read.
-        recognitions: one answer for each instance.
+        recognitions: one `Recognition` for each instance; `TrackedRecognition`s of `track_frames`.
         seconds: time for recognition, without the time to read the files.
         error: why the frame could not be recognized; None if it was.
         recorded: the frame's place in its recording; None if the frame is read from files.
@@ -40,7 +39,7 @@ class FrameAnswer:
 
     name: str
     frame: RGBDFrame | None = None
-    recognitions: Sequence[Recognition] = ()
+    recognitions: Sequence[Any] = ()
     seconds: float = 0.0
     error: str | None = None
     recorded: RecordedFrame | None = None
@@ -53,10 +52,7 @@ class FrameAnswer:
     @property
     def segmentation_failure(self) -> str:
         """Why the frame has no instance if its depth is unusable, for segmented frames; otherwise an empty string."""
-        if self.frame is None or self.recognitions:
-            return ""
-        depth = self.frame.depth_m
-        if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+        if self.frame is None or self.recognitions or self.frame.has_usable_depth:
             return ""
         wanted = f"from {MIN_DEPTH} to {MAX_DEPTH} m"
         return f"segment: nothing was found, since no pixel has depth {wanted}: {unit_question(self.frame)}"
@@ -143,22 +139,16 @@ def track_frames(
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
     """
     tracker = recognizer.track()
-    answered: list[tuple[FrameAnswer, list[TrackedRecognition]]] = []
-    last: dict[int | None, TrackedRecognition] = {}
+    answered: list[FrameAnswer] = []
+    last: dict[int | None, Any] = {}
     for number, source in enumerate(sources):
-        try:
-            frame = source.read()
-            start = time.perf_counter()
-            recognitions = tracker.update(frame, None if poses is None else poses[number])
-        except (InputError, OSError) as error:
-            answered.append((FrameAnswer(source.name, error=reason_of(error)), []))
-            continue
-        answered.append((FrameAnswer(source.name, seconds=time.perf_counter() - start), recognitions))
-        last.update({each.track: each for each in recognitions})
-    for source, (answer, recognitions) in zip(sources, answered, strict=True):
+        update = functools.partial(tracker.update, pose=None if poses is None else poses[number])
+        (answer,) = recognize_frames(update, [source])
+        answered.append(dataclasses.replace(answer, frame=None))  # a long sequence of images does not fit into memory
+        last |= {each.track: each for each in answer.recognitions}
+    for source, answer in zip(sources, answered, strict=True):
         if answer.error is None:
-            final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
-            # The frame is read a second time, since a long sequence of images does not fit into memory.
+            final = [each if each.track is None else each.renamed(last[each.track]) for each in answer.recognitions]
             try:
                 answer = dataclasses.replace(answer, frame=source.read(), recognitions=final)
             except (InputError, OSError) as error:

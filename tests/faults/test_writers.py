@@ -86,13 +86,14 @@ def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)
+FRAME = thor2.RGBDFrame(PHOTO, np.zeros((40, 50), np.uint16), PHOTO[..., 0] + 1, thor2.Intrinsics(1, 1, 0, 0))
 
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "network.npz": NETWORK.save,
     "similarity.png": lambda path: draw_similarity(NETWORK, path),
     "text.json": lambda path: write_text(path, "new" * 1000),
-    "overlay.png": lambda path: draw_overlay(PHOTO, PHOTO[..., 0] + 1, [thor2.Recognition(1, "mug", 1.0)], path),
+    "overlay.png": lambda path: draw_overlay(FRAME, [thor2.Recognition(1, "mug", 1.0)], path),
     "forest.safetensors": lambda path: write_baseline(path, StoredBaseline({"w": np.zeros(9)}, None), ("a",), 1.0),
     MANIFEST: lambda path: Manifest({"shards": 0, "objects": []}).write(path.parent),
 }

@@ -32,7 +32,6 @@ __all__ = [
     "RecordedFrame",
     "backproject",
     "check_frame",
-    "check_images",
     "check_size",
     "decode_image",
     "encode_image",
@@ -88,7 +87,16 @@ class RGBDFrame:
     def __post_init__(self) -> None:
         color, depth = as_array(self.color, "color", "[H, W, 3]"), as_array(self.depth, "depth", "[H, W]")
         labels = None if self.labels is None else as_array(self.labels, "labels", "[H, W]")
-        check_images(color, depth=depth, labels=labels)
+        if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+            raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+        if color.dtype != np.uint8:
+            raise InputError(f"color has type {color.dtype}; expected uint8")
+        size = color.shape[:2]
+        for name, image in (("depth", depth), ("labels", labels)):
+            if image is not None and image.shape != size:
+                raise InputError(f"{name} has shape {image.shape}; expected {size} (rows, columns), as color")
+        if labels is not None and labels.dtype.kind not in "ui":
+            raise InputError(f"labels has type {labels.dtype}; expected integers")
         if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
@@ -96,7 +104,7 @@ class RGBDFrame:
         if labels is not None and labels.min() < 0:
             raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
         intrinsics = Intrinsics.of(self.intrinsics)
-        check_camera(intrinsics, *color.shape[:2])
+        check_camera(intrinsics, *size)
         for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):
             object.__setattr__(self, name, value)
 
@@ -124,11 +132,13 @@ class RGBDFrame:
 
     @cached_property
     def has_usable_depth(self) -> bool:
-        """Whether any pixel of an instance has a depth from `MIN_DEPTH` to `MAX_DEPTH`.
+        """Whether any pixel of an instance has a depth from `MIN_DEPTH` to `MAX_DEPTH`; without instances, any pixel.
 
         Raises InputError as `label_image`.
         """
-        return bool(((self.depth_m >= MIN_DEPTH) & (self.depth_m <= MAX_DEPTH) & (self.label_image != 0)).any())
+        counts = self.label_image != 0
+        usable = (self.depth_m >= MIN_DEPTH) & (self.depth_m <= MAX_DEPTH)
+        return bool((usable & counts if counts.any() else usable).any())
 
     @cached_property
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
@@ -166,19 +176,6 @@ def check_frame(frame: object) -> None:
     """Raise InputError unless the value is a frame."""
     if not isinstance(frame, RGBDFrame):
         raise InputError(f"frame is a {type(frame).__name__}; expected an RGBDFrame, as read_frame returns it")
-
-
-def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
-    """Raise InputError unless the shapes and types of a frame's images are valid; the type of depth is not checked."""
-    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
-        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
-    if color.dtype != np.uint8:
-        raise InputError(f"color has type {color.dtype}; expected uint8")
-    for name, image in (("depth", depth), ("labels", labels)):
-        if image is not None and image.shape != color.shape[:2]:
-            raise InputError(f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color")
-    if labels is not None and labels.dtype.kind not in "ui":
-        raise InputError(f"labels has type {labels.dtype}; expected integers")
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:

@@ -134,9 +134,6 @@ class Intrinsics:
         if isinstance(values, Intrinsics):
             return values
         if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, (str, bytes)):
-            shape = values.shape if isinstance(values, np.ndarray) else np.asarray(values, dtype=object).shape
-            if shape not in ((3, 3), (9,)):
-                raise InputError(f"intrinsics is a {type(values).__name__} of shape {shape}; expected a 3 x 3 matrix")
             return cls.of_matrix(values)
         if hasattr(values, "distortion_model"):  # a CameraInfo message
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
@@ -144,14 +141,7 @@ class Intrinsics:
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
             values = values["intrinsic"]
-        parts = _parts(values)
-        if parts is None:
-            shown = ", ".join(map(str, list(values)[:8])) or "no entry"
-            raise InputError(
-                f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
-                "intrinsic_matrix"
-            )
-        matrix, scale, distortion = parts
+        matrix, scale, distortion = _parts(values)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
         width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
         return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
@@ -177,7 +167,7 @@ class Intrinsics:
             skew = None
         if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
             shown = " ".join(str(matrix).split())
-            raise InputError(f"intrinsics is {shown[:200]}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
+            raise InputError(f"intrinsics is {shown[:200]}; expected a 3 x 3 matrix fx, 0, cx, 0, fy, cy, 0, 0, 1")
         return cls(fx, fy, cx, cy, depth_scale, width, height, distortion)
 
 
@@ -270,10 +260,13 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
+def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any]:
     """Return a camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion.
 
-    The entries of a mapping determine its format; the result is None if no format has them.
+    The entries of a mapping determine its format.
+
+    Raises:
+        InputError: no format has these entries, or one is missing or invalid.
     """
     scale: Any = values.get("depth_scale")
     model = values.get("distortion_model")
@@ -298,7 +291,11 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any] | None:
         if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale, _supported(model, values.get("distortion"))
-    return None
+    shown = ", ".join(map(str, list(values)[:8])) or "no entry"
+    raise InputError(
+        f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
+        "intrinsic_matrix"
+    )
 
 
 def _pinhole_matrix(values: Mapping[Any, Any], column: str, row: str) -> list[Any]:

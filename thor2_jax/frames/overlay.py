@@ -1,6 +1,6 @@
 """Pictures of recognized frames: the colour image with the outline of each instance and a label with its answer.
 
-draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
+draw_overlay(frame, recognizer.recognize(frame), "overlay.png")
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy import ndimage
 from colornet.colors import LUMA
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
-from thor2_jax.frames.frames import check_images
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
@@ -66,13 +66,6 @@ class _Box(NamedTuple):
     bottom: int
 
 
-class _Mask(NamedTuple):
-    """An instance's mask within its box."""
-
-    box: _Box
-    pixels: NDArray[np.bool_]
-
-
 class _Lettering(NamedTuple):
     """A label's text, font and size; `start` is its position relative to the corner of a box of width x height."""
 
@@ -85,40 +78,35 @@ class _Lettering(NamedTuple):
     height: int
 
 
-def draw_overlay(
-    color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
-) -> None:
+def draw_overlay(frame: RGBDFrame, answers: Sequence[Recognition], path: str | Path) -> None:
     """Draw the answers for a frame on its colour image, and write a PNG atomically.
 
     A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
 
     Args:
-        color: [H, W, 3] uint8, sRGB.
-        labels: [H, W] integers; 0 is background, every other number an instance.
-        answers: answers for instances in `labels`; instances without an answer are not drawn.
+        frame: a frame with labels.
+        answers: answers for instances of the frame; instances without an answer are not drawn.
         path: path of the picture.
 
     Raises:
-        InputError: a shape or type does not fit, or an answer is for a label that does not occur in `labels`.
+        InputError: the frame has no labels, or an answer is for a label that does not occur in them.
         OSError: the file cannot be written.
     """
-    color, labels = np.asarray(color), np.asarray(labels)
-    check_images(color, labels=labels)
     for answer in answers:
-        if answer.label == 0 or not (labels == answer.label).any():
+        if answer.label not in frame.instance_pixels:
             raise InputError(f"answers: label {answer.label} does not occur in labels")
-    picture = annotate(color, labels, answers)
+    picture = annotate(frame, answers)
     with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
-def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
+def annotate(frame: RGBDFrame, answers: Sequence[Recognition]) -> Image.Image:
     """Return the picture that `draw_overlay` writes; the arguments are not checked."""
     annotations = [
         Annotation(answer.label, paint, _text(answer))
         for answer, paint in zip(answers, answer_paints(answers), strict=True)
     ]
-    return draw_instances(color, labels, annotations)
+    return draw_instances(frame.color, frame.label_image, annotations)
 
 
 def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:
@@ -133,24 +121,27 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
         labels: [H, W] integers; 0 is background, every other number an instance.
         annotations: annotations of labels that occur in `labels`.
     """
-    masks = [_crop(labels, annotation.label) for annotation in annotations]
+    places = [ndimage.find_objects((labels == each.label).view(np.uint8))[0] for each in annotations]
+    masks = [labels[place] == each.label for each, place in zip(annotations, places, strict=True)]
     diagonal = math.hypot(*labels.shape)
     thickness = max(1, round(diagonal / 350))
     # Letters grow more slowly than the picture, since large pictures are usually viewed enlarged.
     size = max(11, round(14 * (diagonal / 800) ** 0.75))
     pixels = color.copy()
-    for mask, annotation in zip(masks, annotations, strict=True):
-        _draw_outline(pixels, mask, annotation.paint, thickness)
+    for mask, place, annotation in zip(masks, places, annotations, strict=True):
+        _draw_outline(pixels[place], mask, annotation.paint, thickness)
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)
     covered = np.pad(labels != 0, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     placed: list[tuple[_Box, _Lettering, Paint]] = []
-    for mask, annotation in zip(masks, annotations, strict=True):
+    for mask, (rows, columns), annotation in zip(masks, places, annotations, strict=True):
         lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
         if lettering is not None:
-            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            target = _Box(columns.start, rows.start, columns.stop, rows.stop)
+            box = _place(lettering, target, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
-            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
+            instance = np.argwhere(mask) + (target.top, target.left)
+            _draw_leader(draw, box, instance, annotation.paint, max(1, size // 7))
     for box, lettering, paint in placed:  # after all leaders, since these may cross a label
         draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
         start = box.left + lettering.start[0], box.top + lettering.start[1]
@@ -173,20 +164,12 @@ def _text(answer: Recognition) -> str:
     return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
 
 
-def _crop(labels: NDArray[Any], label: int) -> _Mask:
-    mask = labels == label
-    rows, columns = ndimage.find_objects(mask.view(np.uint8))[0]
-    return _Mask(_Box(columns.start, rows.start, columns.stop, rows.stop), mask[rows, columns])
-
-
-def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
+def _draw_outline(pixels: NDArray[np.uint8], mask: NDArray[np.bool_], paint: Paint, thickness: int) -> None:
     """Draw a coloured line along the inner edge of the mask and a thin black or white one beside it."""
-    left, top, right, bottom = mask.box
-    within = ndimage.binary_erosion(mask.pixels, iterations=thickness)
+    within = ndimage.binary_erosion(mask, iterations=thickness)
     core = ndimage.binary_erosion(within, iterations=max(1, thickness // 3))
-    target = pixels[top:bottom, left:right]
-    target[mask.pixels & ~within] = paint
-    target[within & ~core] = _ink(paint)
+    pixels[mask & ~within] = paint
+    pixels[within & ~core] = _ink(paint)
 
 
 def _ink(paint: Paint) -> Paint:
@@ -252,10 +235,11 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
     return _Box(x, y, x + width, y + height)
 
 
-def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: Paint, thickness: int) -> None:
-    """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
-    row, column = np.nonzero(mask.pixels)
-    row, column = row + mask.box.top, column + mask.box.left
+def _draw_leader(
+    draw: ImageDraw.ImageDraw, box: _Box, instance: NDArray[np.intp], paint: Paint, thickness: int
+) -> None:
+    """Draw a line from a label that lies beside its instance to the nearest of the instance's pixels [n, 2]."""
+    row, column = instance.T
     from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
     nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
     start = int(from_column[nearest]), int(from_row[nearest])

@@ -64,7 +64,7 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
     out.mkdir(parents=True, exist_ok=True)
     instances = [dataclasses.asdict(recognition) for recognition in recognitions]
     write_text(out / RESULT_FILES[0], json.dumps(instances, indent=1) + "\n")
-    draw_overlay(frame.color, frame.label_image, recognitions, out / RESULT_FILES[1])
+    draw_overlay(frame, recognitions, out / RESULT_FILES[1])
 
 
 def image_numbers(names: Sequence[str]) -> list[tuple[int, int]]:

@@ -38,9 +38,6 @@ CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
 
-MAX_TOPICS = 1000
-"""Largest number of image and camera topics, since finding the first message of each may read the whole recording."""
-
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 """Suffix of a file -> command that repairs it; for directories, the command of .db3."""
 
@@ -96,6 +93,7 @@ class Bag:
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
         self.is_truncated = False
         self.notes: list[str] = []
+        self._reader: Any = None
 
     def __enter__(self) -> "Bag":
         """Open the recording, choose its topics and read the camera.
@@ -125,7 +123,7 @@ class Bag:
             self.is_truncated = self.path.suffix == ".mcap" and _is_truncated(self.path)
             # ROS's image definitions are used, which have not changed; rosbags would compile those of the file.
             if self.path.suffix == ".bag":
-                self._reader: Any = Reader1(self.path)
+                self._reader = Reader1(self.path)
                 self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
                 self._reader = Reader2(self.path)
@@ -133,11 +131,11 @@ class Bag:
                     self._reader.storage.path = SimpleNamespace(open=lambda _: _CompleteRecords(io.FileIO(self.path)))
                 self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
             self._reader.open()
-        try:
-            self._choose()
-        except BaseException:
-            self._reader.close()
-            raise
+            try:
+                self._choose()
+            except BaseException:
+                self._reader.close()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -190,6 +188,8 @@ class Bag:
 
     def _messages(self, *topics: str | None) -> Iterator[tuple[str, Any, int]]:
         """Yield the messages of some topics: topic, message, and time of arrival in nanoseconds."""
+        if self._reader is None:
+            raise InputError(f"bag: {self.path} is not open; read its frames inside a with statement")
         connections = [each for each in self._reader.connections if each.topic in topics]
         with self._damage_named():
             for connection, arrival, content in self._reader.messages(connections):
@@ -197,21 +197,14 @@ class Bag:
 
     def _choose(self) -> None:
         """Choose the topics by their first messages, and read the camera."""
-        with self._damage_named():
-            types = {connection.topic: connection.msgtype for connection in self._reader.connections}
-            if not all(isinstance(name, str) for name in (*types, *types.values())):
-                raise ValueError("a topic has a name that is no text")
-            images = [topic for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)]
-            if len(images) > MAX_TOPICS:
-                raise InputError(
-                    f"bag: {self.path} has {len(images)} topics of images and cameras; expected at most {MAX_TOPICS}"
-                )
-            overlap = _largest_overlap(self._reader, {c.id for c in self._reader.connections if c.topic in images})
-            if overlap > MAX_OVERLAPPING:
-                raise InputError(
-                    f"bag: {self.path} has {overlap} bytes of images in chunks of the same time; expected at most "
-                    f"{MAX_OVERLAPPING}; record it with smaller chunks"
-                )
+        types = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        images = [topic for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)]
+        overlap = _largest_overlap(self._reader, {c.id for c in self._reader.connections if c.topic in images})
+        if overlap > MAX_OVERLAPPING:
+            raise InputError(
+                f"bag: {self.path} has {overlap} bytes of images in chunks of the same time; expected at most "
+                f"{MAX_OVERLAPPING}; record it with smaller chunks"
+            )
         if self.is_truncated and not types:
             raise self._truncation()
         first = {topic: message for topic in images for _, message, _ in itertools.islice(self._messages(topic), 1)}

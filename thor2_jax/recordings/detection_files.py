@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.files import check_output_file, errors_name, temporary_directory
+from thor2_jax.files import as_path, check_output_file, errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame, encode_image
 from thor2_jax.frames.overlay import annotate, answer_paints
 from thor2_jax.model.recognition import Detection
@@ -87,7 +87,7 @@ class MessageBag:
 
     argument = "path"
 
-    def __init__(self, path: Path, topics: Mapping[str, str]) -> None:
+    def __init__(self, path: str | Path, topics: Mapping[str, str]) -> None:
         """Check that `path` can be written.
 
         Args:
@@ -98,6 +98,7 @@ class MessageBag:
             InputError: `path` exists or names a ROS 1 bag, or the package rosbags is missing.
             OSError: the parent directory does not exist or cannot be written.
         """
+        path = as_path(path, self.argument)
         if path.suffix == ".bag":
             raise InputError(
                 f"{self.argument} is {path}; expected an MCAP file (.mcap) or a directory for a ROS 2 bag: detections "
@@ -163,7 +164,7 @@ class DetectionBag(MessageBag):
 
     argument = "out_bag"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         """Check that `path` can be written; exceptions as `MessageBag`."""
         super().__init__(path, {DETECTIONS_TOPIC: DETECTION_ARRAY, OVERLAY_TOPIC: COMPRESSED_IMAGE})
 
@@ -171,7 +172,7 @@ class DetectionBag(MessageBag):
         """Write the detections of a frame; arguments as `detection_array`, exceptions as `write_message`."""
         array = detection_array(detections, stamp=stamp, frame_id=frame_id)
         self.write_message(DETECTIONS_TOPIC, array, stamp)
-        picture = annotate(frame.color, frame.label_image, [one.recognition for one in detections])
+        picture = annotate(frame, [one.recognition for one in detections])
         overlay = {
             "header": {"stamp": ros_time(stamp), "frame_id": frame_id},
             "format": "rgb8; jpeg compressed bgr8",
@@ -208,13 +209,14 @@ class RerunFile:
         n_frames: number of frames written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         """Check that `path` can be written.
 
         Raises:
             InputError: the suffix is not .rrd, the file is a recording of another program, or rerun-sdk is missing.
             OSError: the parent directory does not exist or cannot be written.
         """
+        path = as_path(path, "rerun")
         if path.suffix != ".rrd" or path.is_dir():
             raise InputError(f"rerun is {path}; expected a file with the suffix .rrd")
         _check_folder(path)

@@ -149,12 +149,13 @@ def nearest_pairs(
     """
     colors: deque[StampedImage] = deque()
     depths: deque[StampedImage] = deque()
-    latest = None  # time stamp of the latest colour image
 
     def resolve(color: StampedImage) -> Iterator[tuple[StampedImage, StampedImage]]:
         if not depths:
             return
         nearest = min(depths, key=lambda depth: abs(depth.stamp - color.stamp))
+        while depths[0] is not nearest:  # nor is it nearest to a later colour image
+            depths.popleft()
         gap = abs(nearest.stamp - color.stamp)
         counts.smallest_gap = gap if counts.smallest_gap is None else min(gap, counts.smallest_gap)
         if gap <= tolerance:
@@ -165,7 +166,6 @@ def nearest_pairs(
         if image.is_color:
             counts.color += 1
             colors.append(image)
-            latest = image.stamp
         else:
             counts.depth += 1
             depths.append(image)
@@ -173,11 +173,7 @@ def nearest_pairs(
             (depths and depths[-1].stamp >= colors[0].stamp) or image.arrival - colors[0].arrival > LONGEST_WAIT
         ):
             yield from resolve(colors.popleft())
-        earliest = colors[0].stamp if colors else latest
-        # Later colour images follow, so only the last depth image before `earliest` can still be nearest to one.
-        while len(depths) > 1 and (
-            (earliest is not None and depths[1].stamp <= earliest) or image.arrival - depths[0].arrival > LONGEST_WAIT
-        ):
+        while len(depths) > 1 and image.arrival - depths[0].arrival > LONGEST_WAIT:
             depths.popleft()
     while colors:
         yield from resolve(colors.popleft())

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, needs_extra, reason_of
+from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 
 __all__ = ["ENTRY_POINTS", "MODEL", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
@@ -75,14 +75,16 @@ def load_segmenter(name: str, others: Sequence[str] = ()) -> Segmenter:
 
 
 def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any]:
-    """Segment a frame; existing labels are ignored.
+    """Return the labels [H, W] of `segmented`, integers; 0 is background."""
+    return segmented(frame, segmenter).label_image
+
+
+def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame:
+    """Return a frame with the labels of a segmenter; existing labels are ignored.
 
     Args:
         frame: colour, depth and intrinsics.
         segmenter: name of a segmenter, or a segmenter.
-
-    Returns:
-        Labels [H, W], integers; 0 is background.
 
     Raises:
         InputError: the segmenter is unknown, raises an exception, or does not return labels of the frame's size.
@@ -96,21 +98,13 @@ def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any
         raise
     except (Exception, SystemExit) as error:
         raise InputError(f"segmenter {name} failed on the frame ({_reason(error)}); check its package") from error
-    expected = f"expected integers of shape {frame.depth.shape} (rows, columns), 0 for the background"
     if not isinstance(labels, np.ndarray):
-        raise InputError(f"segmenter {name} returned a {type(labels).__name__}; {expected}, as a NumPy array")
-    if labels.shape != frame.depth.shape or labels.dtype.kind not in "ui":
         raise InputError(
-            f"segmenter {name} returned labels of shape {labels.shape} and type {labels.dtype}; {expected}"
+            f"segmenter {name} returned a {type(labels).__name__}; expected integers of shape {frame.depth.shape} "
+            "(rows, columns), 0 for the background, as a NumPy array"
         )
-    if labels.min() < 0:
-        raise InputError(f"segmenter {name} returned the label {labels.min()}; {expected}")
-    return labels
-
-
-def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame:
-    """Return the frame with the labels of a segmenter; arguments and exceptions as `segment`."""
-    return dataclasses.replace(frame, labels=segment(frame, segmenter))
+    with with_context(f"segmenter {name} returned invalid labels"):
+        return dataclasses.replace(frame, labels=labels)
 
 
 def _reason(error: BaseException) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import read_file
+from thor2_jax.files import as_path, read_file
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
 
@@ -80,7 +80,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
             rigid motion. The message names the file.
         OSError: the file cannot be read.
     """
-    content = read_file(path)
+    content = read_file(as_path(path, "poses"))
     with decoding(f"poses: {path} is invalid", "JSON: frame name -> [4, 4] matrix, or a list of matrices"):
         stored = json.loads(content)
         if not isinstance(stored, (dict, list)):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
@@ -94,10 +95,8 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
             f"least {MIN_OBJECTS} objects of the model"
         )
         return
-    lights = {}
-    for name, factors in LIGHTS.items():
-        lit = np.rint(frame.color * np.array(factors)).clip(0, 255)
-        lights[name] = confidences(lit.astype(np.uint8))
+    lit = {name: np.rint(frame.color * np.array(factors)).clip(0, 255) for name, factors in LIGHTS.items()}
+    lights = {name: confidences(color.astype(np.uint8)) for name, color in lit.items()}
     best = max(lights, key=lambda name: float(lights[name].mean()))
     if _logit(exchanged) - _logit(given) > MIN_LOGIT_GAIN and exchanged.mean() > lights[best].mean():
         diagnosis.add(
@@ -116,5 +115,4 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
 
 
 def _logit(confidence: NDArray[np.float64]) -> float:
-    clipped = np.clip(confidence, 1e-9, 1 - 1e-9)
-    return float(np.clip(np.log(clipped / (1 - clipped)), -MAX_LOGIT, MAX_LOGIT).mean())
+    return float(np.clip(logit(confidence), -MAX_LOGIT, MAX_LOGIT).mean())

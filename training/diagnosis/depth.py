@@ -171,17 +171,16 @@ def _check_unit(
 
     scale = 1.0 if is_metric else frame.intrinsics.depth_scale
     best = min(DEPTH_SCALES, key=lambda each: misfit(scale / each))
-    likely = best if misfit(scale / best) < math.inf else None
+    is_likely, would_be = misfit(scale / best) < math.inf, _length(median * scale / best)
+    advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
     if is_metric:
         advice = "Floating-point depth must be in metres."
-        if likely is not None:
-            advice += f" Divide it by {likely:g}: the median would be {_length(median / likely)}."
-    else:
-        advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
-        if likely is not None:
-            advice = f"With depth_scale {likely:g} (units per metre) the median distance would be "
-            advice += f"{_length(median * scale / likely)}: set it in the intrinsics or by --depth-scale."
-    if likely is None and MIN_DEPTH <= median <= MAX_DEPTH:
+    if is_likely and is_metric:
+        advice += f" Divide it by {best:g}: the median would be {would_be}."
+    elif is_likely:
+        advice = f"With depth_scale {best:g} (units per metre) the median distance would be {would_be}: set it in the "
+        advice += "intrinsics or by --depth-scale."
+    elif MIN_DEPTH <= median <= MAX_DEPTH:
         advice += " If the distance is right, the focal length or the labels are wrong."
     if extent is not None and len(frame.instances) == 1 and extent > high and MIN_DEPTH <= median <= MAX_DEPTH:
         diagnosis.add(

@@ -6,7 +6,6 @@ identifies objects by numbers; a YAML or JSON file maps each obj_id to a name.
 """
 
 import contextlib
-import dataclasses
 import functools
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_table
+from thor2_jax.files import as_path, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, named_path
 
@@ -58,7 +57,7 @@ class BOP(LabelledFrames):
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
         self._names_file = names
-        self._names = None if names is None else read_object_names(Path(names))
+        self._names = None if names is None else read_object_names(as_path(names, "names"))
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, the names of its scored instances and its scene.
@@ -68,51 +67,45 @@ class BOP(LabelledFrames):
         """
         image = self.sources[number]
         scene = _scene(image)
-        frame = self.unlabelled(number)
-        with _entry(image, "gt") as entry:
-            objects = _values(entry, "obj_id", int)
-        visible: list[float] = [1.0] * len(objects)
-        if (scene / "scene_gt_info.json").exists():
-            with _entry(image, "gt_info") as entry:
-                visible = _values(entry, "visib_fract", (int, float))
-                if len(visible) != len(objects):
-                    raise InputError(f"it has {len(visible)} instances, scene_gt.json {len(objects)}")
-        masks = [_mask(scene / MASKS / f"{image.stem}_{k:06d}.png", frame.depth) for k in range(len(objects))]
+        objects = _values(image, "gt", "obj_id", int)
+        visible = [1.0] * len(objects)
+        if _table(image, "gt_info").exists():
+            visible = _values(image, "gt_info", "visib_fract", (int, float))
+        if len(visible) != len(objects):
+            table = _table(image, "gt_info")
+            raise InputError(f"{table}: it has {len(visible)} instances, scene_gt.json {len(objects)}")
+        color, depth, intrinsics = _read_images(image)
+        masks = [_mask(scene / MASKS / f"{image.stem}_{k:06d}.png", depth) for k in range(len(objects))]
         sizes = [int(mask.sum()) for mask in masks]
-        labels = np.zeros(frame.depth.shape, np.int32)
+        labels = np.zeros(depth.shape, np.int32)
         for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
             labels[masks[k]] = k + 1
         scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
         truth = {k + 1: self._name(objects[k]) for k in scored}
-        return dataclasses.replace(frame, labels=labels), truth, {"scene": scene.name}
+        return RGBDFrame(color, depth, labels, intrinsics), truth, {"scene": scene.name}
 
-    def unlabelled(self, number: int) -> RGBDFrame:
-        """Read a frame without its masks; raise errors as `read`."""
+    def read_frame(self, number: int) -> RGBDFrame:
+        """Read a frame, with labels if its scene has ground truth and masks; raise errors as `read`.
+
+        BOP keeps both back for some test sets.
+        """
         image = self.sources[number]
-        with _entry(image, "camera") as entry:
-            intrinsics = _intrinsics(entry)
-        depth = read_depth(_scene(image) / "depth" / f"{image.stem}.png")
-        return RGBDFrame(read_color(image), depth, None, intrinsics)
-
-    def has_labels(self, number: int) -> bool:
-        """Return whether the scene of a frame has ground truth and masks, which BOP keeps back for some test sets."""
-        scene = _scene(self.sources[number])
-        return (scene / "scene_gt.json").exists() and (scene / MASKS).exists()
+        if _table(image, "gt").exists() and (_scene(image) / MASKS).exists():
+            return self.read(number)[0]
+        color, depth, intrinsics = _read_images(image)
+        return RGBDFrame(color, depth, None, intrinsics)
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame: its images, its masks and the tables of its scene."""
         image = self.sources[number]
-        scene = _scene(image)
-        tables = [scene / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
+        scene, tables = _scene(image), [_table(image, name) for name in ("camera", "gt", "gt_info")]
         masks = sorted((scene / MASKS).glob(f"{image.stem}_*.png"))
         return [image, scene / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
 
     def names(self) -> Iterator[str]:
         """Yield the names of the objects in all scenes, frame by frame."""
         for image in self.sources:
-            with _entry(image, "gt") as entry:
-                objects = _values(entry, "obj_id", int)
-            yield from map(self._name, objects)
+            yield from map(self._name, _values(image, "gt", "obj_id", int))
 
     def _name(self, obj_id: int) -> str:
         if self._names is None:
@@ -126,10 +119,14 @@ def _scene(image: Path) -> Path:
     return image.parent.parent
 
 
+def _table(image: Path, name: str) -> Path:
+    return _scene(image) / f"scene_{name}.json"
+
+
 @contextlib.contextmanager
 def _entry(image: Path, name: str) -> Iterator[Any]:
     """Yield the entry of an image in a table of its scene; errors name the table."""
-    path, number = _scene(image) / f"scene_{name}.json", str(int(image.stem))
+    path, number = _table(image, name), str(int(image.stem))
     status = path.stat()
     table = _read_table(path, status.st_mtime_ns, status.st_size)
     with with_context(str(path)):
@@ -171,21 +168,25 @@ def read_object_names(path: Path) -> dict[int, str]:
     return names
 
 
-def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any]:
-    """Return the value of `key` of each instance of an image."""
-    try:
-        values = [instance[key] for instance in instances]
-    except (TypeError, KeyError):
-        raise InputError(f"an image's entry is not a list of {{{key}: <number>, ...}}") from None
-    invalid = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
-    if invalid:
-        raise InputError(f"{key} is {invalid[0]!r}; expected a number")
-    return values
+def _values(image: Path, name: str, key: str, kind: type | tuple[type, ...]) -> list[Any]:
+    """Return the value of `key` of each instance of an image in a table of its scene."""
+    with _entry(image, name) as entry:
+        try:
+            values = [instance[key] for instance in entry]
+        except (TypeError, KeyError):
+            raise InputError(f"an image's entry is not a list of {{{key}: <number>, ...}}") from None
+        invalid = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
+        if invalid:
+            raise InputError(f"{key} is {invalid[0]!r}; expected a number")
+        return values
 
 
-def _intrinsics(entry: Any) -> Intrinsics:
-    try:
-        matrix, scale = entry["cam_K"], entry["depth_scale"]
-    except (TypeError, KeyError):
-        raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
-    return Intrinsics.of({"cam_K": matrix, "depth_scale": scale})
+def _read_images(image: Path) -> tuple[NDArray[np.uint8], NDArray[Any], Intrinsics]:
+    """Return the colour, the depth and the camera of an image."""
+    with _entry(image, "camera") as entry:
+        try:
+            matrix, scale = entry["cam_K"], entry["depth_scale"]
+        except (TypeError, KeyError):
+            raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
+        camera = Intrinsics.of({"cam_K": matrix, "depth_scale": scale})
+    return read_color(image), read_depth(_scene(image) / "depth" / f"{image.stem}.png"), camera

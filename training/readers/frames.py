@@ -236,7 +236,7 @@ def _read_segmented(source: FrameSource | RecordedFrame, segmenter: Segmenter) -
 
 
 def _read_bop(dataset: BOP, depth_scale: float | None) -> RGBDFrame:
-    frame = dataset.read(0)[0] if dataset.has_labels(0) else dataset.unlabelled(0)
+    frame = dataset.read_frame(0)
     return dataclasses.replace(frame, intrinsics=frame.intrinsics.with_depth_scale(depth_scale))
 
 

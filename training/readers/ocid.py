@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file, read_table
+from thor2_jax.files import as_path, read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, path_ends, sequence_of
 
@@ -61,15 +61,15 @@ class OCID(LabelledFrames):
         root = path / "YCB10" if (path / "YCB10").is_dir() else path
         images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
-            for folder in sorted((root / place / camera).glob("*/*")):
-                sequence = folder.relative_to(root).as_posix()
-                images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
+            found = sorted((root / place / camera).glob("*/*/rgb/*.png"))
+            images += [(image.parents[1].relative_to(root).as_posix(), image) for image in found]
         if not images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        value = read_table(Path(names), (dict, list))
+        names = as_path(names, "names")
+        value = read_table(names, (dict, list))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
-            self._names, listed = _names_of_vlg(Path(names), value)
+            self._names, listed = _names_of_vlg(names, value)
             images = [
                 (sequence, image)
                 for sequence, image in images
@@ -78,7 +78,7 @@ class OCID(LabelledFrames):
             if not images:
                 raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
         else:
-            self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in images))
+            self._names = _names_in_order(names, value, dict.fromkeys(sequence for sequence, _ in images))
         self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in images]
         self.sources = [image for _, image in images]
 
@@ -225,29 +225,26 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
         axes = [fields.index(name) for name in "xyz"]
         width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
         (encoding,) = header["DATA"]
+        if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
+            raise ValueError
     except (KeyError, IndexError, ValueError, TypeError, OverflowError):
-        raise InputError(f"{path}: its header does not describe points with x, y and z") from None
-    if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
         raise InputError(
-            f"{path}: its header has {width} x {height} points with fields of {counts} numbers; "
-            "expected at least one point and one number for each axis"
-        )
-    data, n = content[start:], width * height
-    if encoding == "binary":
-        if len(data) < n * record.itemsize:
-            raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
-        records = np.frombuffer(data, record, count=n)
-        with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
-            points = np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
-    elif encoding == "ascii":
-        try:
-            numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
-        except (ValueError, OverflowError):
-            raise InputError(f"{path} does not hold {n} lines of {sum(counts)} numbers") from None
-        points = numbers[:, [sum(counts[:axis]) for axis in axes]]
-    else:
+            f"{path}: its header does not describe points with x, y and z; expected WIDTH x HEIGHT points with one "
+            "number for each axis"
+        ) from None
+    if encoding not in ("ascii", "binary"):
         raise InputError(f"{path} has DATA {encoding}; expected ascii or binary")
-    return points.reshape(height, width, 3)
+    data, n = content[start:], width * height
+    try:
+        if encoding == "ascii":
+            numbers = np.array(data.split(), np.float64).reshape(n, sum(counts))
+            return numbers[:, [sum(counts[:axis]) for axis in axes]].reshape(height, width, 3)
+        records = np.frombuffer(data, record, count=n)
+    except (ValueError, OverflowError):
+        raise InputError(f"{path} does not hold {n} points of {sum(counts)} numbers, or is cut off") from None
+    with np.errstate(invalid="ignore"):  # the data may contain signalling NaN
+        points = [records[f"{axis}"][:, 0].astype(np.float64) for axis in axes]
+    return np.stack(points, axis=-1).reshape(height, width, 3)
 
 
 def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:

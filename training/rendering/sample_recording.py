@@ -40,7 +40,7 @@ def write_sample_recording(path: str | Path) -> None:
         OSError: the recording cannot be written.
     """
     topics = {COLOR: COMPRESSED_IMAGE, DEPTH: COMPRESSED_IMAGE, INFO: "sensor_msgs/msg/CameraInfo"}
-    with MessageBag(Path(path), topics) as bag:
+    with MessageBag(path, topics) as bag:
         views = compose_views(
             builtin_objects(), np.random.default_rng(8), n_objects=4, n_views=FRAMES, camera=CAMERA, arc=ARC,
             clutter=0.0, noise=0.03, light=0.0, level=True,

@@ -114,14 +114,11 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
 
 
-def test_too_few_instances_are_refused_with_their_number() -> None:
+def test_instances_are_spread_evenly_and_too_few_are_refused() -> None:
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(instances(1)[0], reason="too few points")]
+    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
     message = f"9 usable instances; expected at least {MIN_INSTANCES}: .* unusable ones .1.; .* too few points"
     assert_refused(message, estimate_transform, few, none_is_known)
-
-
-def test_instances_are_spread_evenly() -> None:
-    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
 def frame(seed: int, shape: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from image_files import deep_png, write_frame_files
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 from refusals import assert_refused
 
 from thor2_jax.frames.frames import (
@@ -50,16 +49,12 @@ BAD_INTRINSICS: list[tuple[Any, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("values", "problem"), BAD_INTRINSICS)
-def test_intrinsics_that_are_no_mapping_of_positive_numbers(values: Any, problem: str) -> None:
-    assert_refused(f"^intrinsics{problem}", Intrinsics.of, values)
-
-
-def test_intrinsics_of_numbers_of_any_kind_and_other_entries() -> None:
+def test_intrinsics_are_a_mapping_of_numbers_of_any_kind() -> None:
     """The principal point may lie outside the image."""
     values = {"fx": np.int64(500), "fy": np.float32(501), "cx": -20, "cy": 2.5, "depth_scale": 5, "name": "left"}
     assert Intrinsics.of(values) == Intrinsics(500, 501, -20, 2.5, 5)
-    assert_refused("^intrinsics.fx is nan", Intrinsics, math.nan, 501, -20, 2.5)
+    for bad, problem in BAD_INTRINSICS:
+        assert_refused(f"^intrinsics{problem}", Intrinsics.of, bad)
 
 
 # Frames
@@ -111,35 +106,17 @@ def test_depth_becomes_metres(depth: np.ndarray, metres: list[list[float]]) -> N
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int64])
-@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (31, 17)])
-def test_instances_and_their_pixels(kind: Any, shape: tuple[int, int]) -> None:
+def test_instances_and_their_pixels(kind: Any) -> None:
     rng = np.random.default_rng(4)
-    labels = (rng.integers(0, 5, shape) * 40).astype(kind)
-    frame = RGBDFrame(**{**arrays(*shape), "labels": labels})
-    assert frame.instances == tuple(sorted(set(labels.ravel().tolist()) - {0}))
-    assert list(frame.instance_pixels) == list(frame.instances)
-    for label, pixels in frame.instance_pixels.items():
-        assert type(label) is int
-        np.testing.assert_array_equal(pixels, np.flatnonzero(labels == label))
-
-
-def test_a_frame_without_labels() -> None:
-    frame = RGBDFrame(**arrays() | {"labels": None})
-    assert frame.labels is None and frame.depth_m.shape == (5, 7)
-    for read in ("label_image", "instance_pixels", "instances"):
-        assert_refused(r"^labels is None;", getattr, frame, read)
-    labelled = dataclasses.replace(frame, labels=arrays()["labels"])
-    assert labelled.instances == RGBDFrame(**arrays()).instances
-
-
-def test_largest_number_of_instances() -> None:
-    labels = np.arange(MAX_INSTANCES + 1, dtype=np.int32).reshape(7, -1)
-    frame = RGBDFrame(**{**arrays(*labels.shape), "labels": labels})
-    assert frame.instances == tuple(range(1, MAX_INSTANCES + 1))
-    np.testing.assert_array_equal(np.concatenate(list(frame.instance_pixels.values())), frame.instances)
-    more = dataclasses.replace(frame, labels=labels + 1)
-    for of_frame in (lambda: more.instances, lambda: more.instance_pixels):
-        assert_refused(f"labels has {MAX_INSTANCES + 1} instances", of_frame)
+    most = np.arange(MAX_INSTANCES + 1).reshape(7, -1)
+    for labels in (*(40 * rng.integers(0, 5, shape) for shape in ((1, 1), (5, 7), (31, 17))), most % 256, most):
+        frame = RGBDFrame(**{**arrays(*labels.shape), "labels": labels.astype(kind)})
+        assert list(frame.instance_pixels) == list(frame.instances) == sorted(set(frame.labels.ravel().tolist()) - {0})
+        for label, pixels in frame.instance_pixels.items():
+            assert type(label) is int
+            np.testing.assert_array_equal(pixels, np.flatnonzero(frame.labels == label))
+    more = dataclasses.replace(frame, labels=most + 1)
+    assert_refused(f"labels has {MAX_INSTANCES + 1} instances", getattr, more, "instances")
 
 
 # Files
@@ -158,7 +135,9 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
     assert frame.depth.dtype == np.uint16 and frame.intrinsics == dataclasses.replace(CAMERA, depth_scale=5000)
     del files["labels"]
     frame = read_frame(**files)
-    assert frame.labels is None and frame.intrinsics == CAMERA
+    assert frame.labels is None and frame.intrinsics == CAMERA and frame.depth_m.shape == (5, 7)
+    for read in ("label_image", "instance_pixels", "instances"):
+        assert_refused(r"^labels is None;", getattr, frame, read)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
@@ -181,16 +160,6 @@ def test_damaged_images_and_other_formats(files: dict[str, Path], name: str) -> 
         assert_refused(f"^{name}: {files[name]} [^<>]*$", read_frame, **files)  # without the name of an object
 
 
-def test_images_with_an_invalid_checksum_are_refused(tmp_path: Path) -> None:
-    """Even if their pixels can be decoded."""
-    text = PngInfo()
-    text.add_text("Title", "scene")
-    whole = encode_image(np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2, pnginfo=text)
-    for place in range(8, len(whole) - 12):  # all but the signature and the chunk that ends the file
-        (tmp_path / "l.png").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        assert_refused("^labels: .*l.png ", read_labels, tmp_path / "l.png")
-
-
 @pytest.mark.parametrize(
     ("read", "modes", "problem"),
     [
@@ -210,8 +179,9 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
     mask = Image.fromarray(arrays()["labels"])
     mask.save(tmp_path / "lossy", "JPEG")
     mask.save(tmp_path / "lossy.tiff", "TIFF", compression="jpeg")
-    mask.save(tmp_path / "lossless.tiff", "TIFF", compression="tiff_lzw")
-    assert np.array_equal(read_labels(tmp_path / "lossless.tiff"), np.asarray(mask))
+    deep = np.array([[0, 255], [256, 65535]], np.uint16)
+    Image.fromarray(deep).save(tmp_path / "lossless.tiff", "TIFF", compression="tiff_lzw")
+    np.testing.assert_array_equal(read_labels(tmp_path / "lossless.tiff"), deep)
     for name in ("lossy", "lossy.tiff"):
         assert_refused(f"^labels: .*{name}.*JPEG", read_labels, tmp_path / name)
 
@@ -234,15 +204,3 @@ def test_depth_files_of_32_bit(tmp_path: Path, value: int) -> None:
     depth[0, 0] = value
     Image.fromarray(depth).save(tmp_path / "d.tiff")
     assert_refused(rf"^depth: .*has values from .*{value}.*; expected 0 to 65535$", read_depth, tmp_path / "d.tiff")
-
-
-def test_label_files_of_16_bit_and_of_indexed_colors(tmp_path: Path) -> None:
-    labels = np.array([[0, 1, 2], [254, 255, 65535]], np.uint16)
-    Image.fromarray(labels).save(tmp_path / "l.png")
-    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), labels)
-    indices = labels.astype(np.uint8)
-    image = Image.fromarray(indices, mode="L").copy()
-    image.putpalette(list(np.random.default_rng(0).integers(0, 256, 768)))
-    assert image.mode == "P"
-    image.save(tmp_path / "l.png")
-    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), indices)

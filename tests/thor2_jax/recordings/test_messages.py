@@ -2,7 +2,6 @@
 
 import struct
 import tracemalloc
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,13 +20,12 @@ PNG = encode_image(COLOR, "PNG")
 RGB = image(COLOR, "rgb8")
 
 
-@pytest.mark.parametrize("padding", [0, 3])
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "RGB8"])
-def test_colour_encodings(encoding: str, padding: int) -> None:
+def test_colour_encodings(encoding: str) -> None:
     pixels = COLOR if encoding.lower().startswith("rgb") else COLOR[..., ::-1]
     if "a" in encoding:
         pixels = np.dstack([pixels, np.full((5, 7), 9, np.uint8)])
-    message = image(pixels, encoding, padding=padding)
+    message = image(pixels, encoding, padding=3)
     assert image_kind(message) == "color"
     np.testing.assert_array_equal(color_image(message), COLOR)
 
@@ -43,17 +41,15 @@ def test_depth_encodings(pixels: np.ndarray, encoding: str) -> None:
     np.testing.assert_array_equal(depth_image(message), native, strict=True)
 
 
-@pytest.mark.parametrize(("encoding", "read"), [("rgb8", color_image), ("16UC1", depth_image)])
-def test_raw_images_of_too_many_pixels(encoding: str, read: Callable[[Any], Any]) -> None:
-    message = image(np.zeros((1, 1, 6), np.uint8), encoding)
+def test_raw_images_of_too_many_pixels() -> None:
+    message = image(np.zeros((1, 1, 6), np.uint8), "rgb8")
     message.width, message.height, message.step = 2**13, 2**13 + 1, 2**15
     message.data = np.zeros(message.step * message.height, np.uint8)
     tracemalloc.start()
-    try:
-        assert_refused("8192 x 8193 pixels; expected at most", read, message)
-        assert tracemalloc.get_traced_memory()[1] < 2**20
-    finally:
-        tracemalloc.stop()
+    assert_refused("8192 x 8193 pixels; expected at most", color_image, message)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
 
 
 def test_compressed_images() -> None:

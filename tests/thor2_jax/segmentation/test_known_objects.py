@@ -67,15 +67,10 @@ def test_frames_without_pieces_or_without_depth_remain() -> None:
     np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown), ONE_PIECE)
 
 
-@pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1], ids=["all of it", "one half"])
-def test_a_piece_with_one_known_object_remains(known: NDArray[np.bool_]) -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, knows(known)), ONE_PIECE)
-
-
-@pytest.mark.parametrize("answer", [(None, 0.99), ("a", 0.5), ("a", 0.99)], ids=["unknown", "unsure", "one object"])
-def test_a_piece_with_one_answer_everywhere_remains(answer: Answer) -> None:
-    labels = segment_known(FRAME, ONE_PIECE, lambda frames: [answer] * len(frames))
-    np.testing.assert_array_equal(labels, ONE_PIECE)
+@pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1, (None, 0.99), ("a", 0.5), ("a", 0.99)])
+def test_a_piece_with_one_known_object_or_one_answer_remains(known: NDArray[np.bool_] | Answer) -> None:
+    recognize = (lambda frames: [known] * len(frames)) if isinstance(known, tuple) else knows(known)
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
 
 
 def test_candidates_are_shown_where_they_are() -> None:
@@ -132,11 +127,6 @@ def test_small_pieces_go_to_the_nearest_one() -> None:
     assert (far != TRUTH).sum() < 10
 
 
-def test_without_known_objects_labels_remain() -> None:
-    for labels in (TRUTH, np.zeros_like(TRUTH)):
-        np.testing.assert_array_equal(fit_masks(FRAME, labels, lambda frame: {}), labels)
-
-
 def test_points_beyond_the_reach_of_a_surface_leave() -> None:
     near = surface_of(TRUTH == 1)
 
@@ -149,9 +139,10 @@ def test_points_beyond_the_reach_of_a_surface_leave() -> None:
     assert (labels[TRUTH == 2] != 1).mean() > 0.6
 
 
-def test_a_small_object_may_leave_completely() -> None:
+def test_labels_remain_without_known_objects_or_if_a_small_one_leaves() -> None:
     rows, columns = np.nonzero(TRUTH == 1)
     labels = np.zeros_like(TRUTH)
+    np.testing.assert_array_equal(fit_masks(FRAME, labels, lambda frame: {}), labels)
     labels[rows[1000:1150], columns[1000:1150]] = 1
     fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
     np.testing.assert_array_equal(fitted, labels)

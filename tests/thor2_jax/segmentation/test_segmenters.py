@@ -39,6 +39,7 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
 def test_the_table_segmenter_is_built_in() -> None:
     assert segmenter_names()[0] == "table" and load_segmenter("table") is segment_table
     np.testing.assert_array_equal(thor2.segment(FRAME), segment_table(FRAME))
+    assert_refused("^frame is a str; expected an RGBDFrame", thor2.segmented, "frame.png")
 
 
 def test_a_segmenter_of_another_package(offer: Callable[[str, str], None]) -> None:
@@ -59,11 +60,6 @@ def test_an_entry_point_that_is_no_function(offer: Callable[[str, str], None], v
     assert_refused(rf"^segmenter is 'broken'; {value} ", load_segmenter, "broken")
 
 
-def test_only_frames_are_segmented() -> None:
-    assert_refused("^frame is a NoneType; expected an RGBDFrame", segment, None)
-    assert_refused("^frame is a str; expected an RGBDFrame", thor2.segmented, "frame.png", halves)
-
-
 def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(sys.modules):
         if name.startswith("thor2_jax.segmentation.") and "segmenters" not in name:
@@ -72,22 +68,16 @@ def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> 
     assert_refused(r"^segmenter is 'table', which needs OpenCV .*\[segment\]", load_segmenter, "table")
 
 
-@pytest.mark.parametrize(
-    ("result", "message"),
-    [
+def test_segmenters_that_fail() -> None:
+    for result, message in (
         (None, "a NoneType"),
-        (np.zeros((6, 7), int), r"shape \(6, 7\)"),
-        (np.zeros((6, 8)), "type float64"),
-        (np.zeros((6, 8), bool), "type bool"),
-        (np.full((6, 8), -1), "label -1"),
-    ],
-)
-def test_labels_that_are_not_labels(result: Any, message: str) -> None:
-    assert_refused(rf"^segmenter <lambda> returned .*{message}", segment, FRAME, lambda frame: result)
+        (np.zeros((6, 7), int), r"invalid labels: labels has shape \(6, 7\)"),
+        (np.zeros((6, 8), bool), "invalid labels: labels has type bool"),
+        (np.full((6, 8), -1), "invalid labels: labels has the value -1"),
+    ):
+        assert_refused(rf"^segmenter <lambda> returned {message}", segment, FRAME, lambda frame, result=result: result)
 
-
-def test_a_segmenter_that_raises_without_a_message() -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
-        raise NotImplementedError
+        raise NotImplementedError  # without a message
 
     assert_refused(r"^segmenter failing failed .*\(NotImplementedError\);", segment, FRAME, failing)

@@ -8,7 +8,7 @@ from refusals import assert_refused
 
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
-from thor2_jax.tracking.viewpoints import check_pose, merge_views
+from thor2_jax.tracking.viewpoints import check_pose, merge_views, read_poses
 from training.rendering.camera import camera_pose
 
 
@@ -54,6 +54,7 @@ NO_MOTIONS = (
 @pytest.mark.parametrize("pose", NO_MOTIONS)
 def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
     is_nan = np.shape(pose) == (4, 4) and np.isnan(pose).any()
+    assert_refused("^poses is 'a.x00b'; expected a path", read_poses, "a\0b", [])
     assert_refused("pose has NaN" if is_nan else "pose (has shape|is not)", check_pose, pose, "camera_pose")
 
 

@@ -156,7 +156,7 @@ def test_labels(frame: RGBDFrame) -> None:
         assert_found(expected, check_labels, make(frame.label_image))
 
 
-def test_registration(frame: RGBDFrame) -> None:
+def test_registration_of_depth_and_of_labels(frame: RGBDFrame) -> None:
     for damage, expected in (
         (lambda depth: np.roll(depth, (0, 3), (0, 1)), ""),
         (lambda depth: np.roll(depth, (0, 20), (0, 1)), "registration: .*moved (19|20|21) pixels left"),
@@ -167,14 +167,8 @@ def test_registration(frame: RGBDFrame) -> None:
         (np.zeros_like, ""),
     ):
         assert_found(expected, check_registration, frame.color, damage(frame.depth_m))
-
-
-def test_frames_without_edges_are_not_judged() -> None:
     flat = np.zeros((90, 120, 3), np.uint8), np.ones((90, 120))
     assert "registration" in assert_found("", check_registration, *flat).notes[0]
-
-
-def test_labels_of_another_place(frame: RGBDFrame) -> None:
     moved = np.roll(frame.label_image, 25, axis=1)
     assert_found("labels-shifted: .*moved (24|25|26) pixels left", check_labels_alignment, frame.color, moved)
 
@@ -260,7 +254,7 @@ def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Co
     assert f"{files.color} is missing" in refused(*command, "--json")
 
 
-def test_folders_of_frames(tmp_path: Path, texts: Texts, printed: Command) -> None:
+def test_folders_of_frames_and_scenes_of_bop(tmp_path: Path, texts: Texts, printed: Command) -> None:
     """The names in labels.json tell which mesh an object is compared with; a frame that is missing files fails."""
     for name in ("breakfast", "tools"):
         shutil.copytree(SAMPLES / name, tmp_path / "frames" / name)
@@ -277,6 +271,8 @@ def test_folders_of_frames(tmp_path: Path, texts: Texts, printed: Command) -> No
     reports = json_lines(texts(*command, status=1)[0])
     assert [[finding["code"] for finding in report["findings"]] for report in reports] == [[], ["intrinsics-focal"]]
     assert printed("doctor", tmp_path / "frames" / "tools").startswith("tools:\n")
+    out, _ = texts("doctor", write_bop(tmp_path / "000001"), "--json", status=1)  # its images have few pixels
+    assert [line["frame"] for line in json_lines(out)] == ["000001/000001"]
     frame_files(tmp_path / "frames" / "breakfast").color.unlink()
     out, err = texts(*command, status=2)
     assert [report["frame"] for report in json_lines(out)] == ["tools"]
@@ -284,8 +280,3 @@ def test_folders_of_frames(tmp_path: Path, texts: Texts, printed: Command) -> No
     color = frame_files(tmp_path / "frames" / "breakfast").color
     color.mkdir()
     assert f"failed: breakfast: {color}: Is a directory\n" in texts(*command, status=2)[1]
-
-
-def test_scenes_of_bop(tmp_path: Path, texts: Texts) -> None:
-    out, _ = texts("doctor", write_bop(tmp_path / "000001"), "--json", status=1)  # its images have few pixels
-    assert [line["frame"] for line in json_lines(out)] == ["000001/000001"]

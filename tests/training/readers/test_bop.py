@@ -72,22 +72,13 @@ def test_instances_that_are_scored(tmp_path: Path) -> None:
         assert list(item.truth) == scored and item.frame.instances == instances
 
 
-def test_names(tmp_path: Path) -> None:
-    """Objects that are not scored need no name."""
-    objects = [(8, band(0, 2)), (14, band(3, 5)), (8, band(6, 8)), (5, band(0, 0))]
-    write_bop(tmp_path / "test" / "000048", objects=objects)
-    (tmp_path / "names.json").write_text(json.dumps({8: "gelatin_box", 14: "mug", 21: "foam_brick"}))
-    (item,) = BOP(tmp_path / "test", tmp_path / "names.json")
-    assert item.truth == {1: "gelatin_box", 2: "mug", 3: "gelatin_box"}
-
-
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
-    """There are two scenes of three objects; in the second, the first object is almost hidden."""
+    """There are two scenes; in the second, an object is almost hidden and one is absent, which needs no name."""
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
     monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
     objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
     write_bop(tmp_path / "test" / "000048", objects=objects, visible=[1, 1, 1])
-    write_bop(tmp_path / "test" / "000049", objects=objects, visible=[0.05, 1, 1])
+    write_bop(tmp_path / "test" / "000049", objects=[*objects, (5, band(0, 0))], visible=[0.05, 1, 1, 0])
     (tmp_path / "names.yaml").write_text("13: bowl\n14: mug\n")
     command = ("evaluate", "bop", tmp_path / "test", "--model", tmp_path / "run")
     options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import Command
-from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, points_of, vlg_item, write_ocid
+from dataset_files import CAMERA, SHAPE, STEM, ocid_scene, pack_pcd, vlg_item, write_ocid
 from PIL import Image
 from refusals import assert_refused
 from toy_recognizers import NamesInOrder
@@ -44,9 +44,6 @@ def test_a_frame(tmp_path: Path, place: str, first: int) -> None:
     fitted = item.frame.intrinsics
     numbers = fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale
     np.testing.assert_allclose(numbers, (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4)
-    # The points of the frame equal those of the cloud.
-    points, there = backproject(item.frame.depth_m, fitted), depth > 0
-    np.testing.assert_allclose(points[there], points_of(depth)[there], rtol=1e-4, atol=1e-6)
 
 
 def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
@@ -58,29 +55,26 @@ def test_only_objects_with_pixels_are_scored(tmp_path: Path) -> None:
     assert item.truth == {3: "mug", 5: "banana"}
     without_third = OCID(tmp_path, write_names(tmp_path, {"seq36": ["mug", "bowl"]}))
     assert_refused(f"{folder / 'label' / STEM}.png.*label 5;", without_third.__getitem__, 0)
+    cloud = folder / "pcd" / f"{STEM}.pcd"
+    cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
+    assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", without_third.__getitem__, 0)
 
 
-def test_the_order_of_the_dataset(tmp_path: Path) -> None:
+def test_the_order_of_the_dataset_and_the_longest_end_of_a_path(tmp_path: Path) -> None:
     root = tmp_path / "YCB10"
     for sequence in ("table/top/mixed/seq21", "floor/top/cuboid/seq02", "table/bottom/mixed/seq21"):
         write_ocid(root, sequence, "result_b", seed=1)
         write_ocid(root, sequence, "result_a", seed=2)
     (root / "table" / "top" / "mixed" / "notes.txt").write_text("nothing to read")
     (root / "table" / "top" / "mixed" / "seq99").mkdir()
-    names = write_names(tmp_path, {"seq21": ["a", "b", "c"], "seq02": ["d", "e", "f"]})
+    table = {"seq21": list("abc"), "seq02": list("def"), "top/mixed/seq21": list("ghi"), "seq99": "not used", "7": None}
+    names = write_names(tmp_path, table)
     whole = OCID(tmp_path, names)
     sequences = ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
     assert whole.identifiers == [f"{sequence}/result_{stem}" for sequence in sequences for stem in "ab"]
     assert [item.identifier for item in whole] == whole.identifiers == OCID(root, names).identifiers
     assert [item.attributes["camera"] for item in whole] == ["lower"] * 2 + ["upper"] * 4
-
-
-def test_names_of_the_longest_matching_path_suffix_are_used(tmp_path: Path) -> None:
-    for camera in ("bottom", "top"):
-        write_ocid(tmp_path, f"table/{camera}/curved/seq36")
-    table = {"seq36": ["a", "b", "c"], "top/curved/seq36": ["d", "e", "f"], "seq99": "not used", "7": None}
-    lower, upper = OCID(tmp_path, write_names(tmp_path, table))
-    assert list(lower.truth.values()) == ["a", "b", "c"] and list(upper.truth.values()) == ["d", "e", "f"]
+    assert ["".join(item.truth.values()) for item in whole] == ["abc"] * 2 + ["ghi"] * 2 + ["def"] * 2
 
 
 @pytest.mark.parametrize("sequence", ["YCB10/table/bottom/curved/seq36", "table/bottom/curved/seq36", "seq36"])
@@ -97,13 +91,6 @@ def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
     for item in dataset:
         assert item.frame.instances == (3, 4, 5)
         assert dict(item.truth) == {3: "mug", 5: "bowl_1"}
-
-
-def test_a_cloud_of_another_size(tmp_path: Path) -> None:
-    cloud = write_ocid(tmp_path) / "pcd" / f"{STEM}.pcd"
-    cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
-    dataset = OCID(tmp_path, write_names(tmp_path))
-    assert_refused(rf"{cloud}.*\(1, 54\).*\(6, 9\)", dataset.__getitem__, 0)
 
 
 def test_the_camera_against_least_squares_of_numpy() -> None:
@@ -142,17 +129,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     output = printed(*command, "--out", tmp_path / "report")
     assert "instances scored: 4" in output
     assert "Published table 3" in output and "Published table 1" not in output
-    page = (tmp_path / "report" / "report.html").read_text()
-    assert "Models: run." in page and "banana (unknown object)" in page
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"banana": 1}
-    tables = report["accuracy"]["max"]
-    cells = {(*table["by"], *cell["where"].values()): cell for table in tables for cell in table["cells"]}
-    accuracy = {where: (cell["instances"], cell["accuracy"]["TOPS"]["mean"]) for where, cell in cells.items()}
-    assert accuracy[()] == (4, 0.75)
-    assert accuracy["camera", "lower"] == (2, 1.0) and accuracy["camera", "upper"] == (2, 0.5)
-    assert accuracy["camera", "place", "lower", "table"] == (2, 1.0)
-    assert accuracy["camera", "type", "upper", "mixed"] == (2, 0.5)
+    tables = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
+    by_camera = {cell["where"]["camera"]: cell["accuracy"]["TOPS"]["mean"] for cell in tables["camera",]}
+    assert by_camera == {"lower": 1.0, "upper": 0.5} and {("camera", "place"), ("camera", "type")} < tables.keys()
     names.unlink()
     assert refused(*command) == f"error: {names}: No such file or directory"
 
@@ -168,14 +149,12 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: runs[paths[0].name])
     models = tmp_path / "runs"
     command = ("evaluate", "ocid", tmp_path, "--model", models, "--names", write_names(tmp_path, table))
-    for folder in ("table/top/mixed/seq08/fold-1", "seq36/fold-1", "seq36/fold-0"):
+    for folder in ("table/top/mixed/seq08/fold-1", "seq36/fold-0"):
         (models / folder).mkdir(parents=True)
         (models / folder / "run.json").touch()
     output = printed(*command, "--per-sequence", "--out", tmp_path / "report")
     assert f"--model {models}/seq36/fold-0 " in output  # of the command that explains answers
-    assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
     cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
     assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
@@ -225,26 +204,21 @@ DAMAGED_HEADERS = (
     (b"DATA", b"DATE"),
     (b"FIELDS x y z", b"FIELDS x y w"),
     (b"SIZE 4", b"SIZE 3"),
-    (b"SIZE 4", b"SIZE four"),
-    (b"TYPE F", b"TYPE X"),
     (b"TYPE F F F U U\n", b""),
     (b"COUNT 1", b"COUNT 2"),
-    (b"COUNT 1", b"COUNT 0"),
     (b"COUNT 1 1 1 1 1", b"COUNT 1 1 1 1 9999999999999999999999"),
     (b"WIDTH 3", b"WIDTH 0"),
     (b"WIDTH 3", b"WIDTH"),
     (b"HEIGHT 2", b"HEIGHT 3"),
-    (b"HEIGHT 2\n", b""),
 )
 
 
 def test_damaged_clouds(tmp_path: Path) -> None:
     for data, old, new, expected in (
         ("binary", b"DATA binary", b"DATA binary_compressed", "DATA binary_compressed"),
-        ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
-        ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
-        ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
-        ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
+        ("binary", b"\x05\0\0\0", b"\x05\0\0", "or is cut off"),
+        ("ascii", b" 5\n", b"\n", "6 points of 5 numbers"),
+        ("ascii", b"2.5 ", b"x ", "6 points of 5 numbers"),
         *((data, *each, "") for data in ("ascii", "binary") for each in DAMAGED_HEADERS),
     ):
         path = write_cloud(tmp_path / "cloud.pcd", data, old, new)
