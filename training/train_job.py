@@ -236,11 +236,11 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
             raise InputError(
                 f"frames: the names {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-        if name not in names and len(labelled.views[name]) < 2:
-            raise InputError(
-                f"frames: {name!r} has one usable instance; expected at least two: label it in another frame, "
-                "or leave it out (leave_out)"
-            )
+    if single := [name for name in classes if name not in names and len(labelled.views[name]) < 2]:
+        raise InputError(
+            f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "
+            "label it in another frame, or leave it out with --leave-out"
+        )
 
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:

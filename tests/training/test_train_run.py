@@ -114,7 +114,7 @@ STICK = brick_and_stick(1)["stick"]
 
 def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
     for bad, folds, message in (
-        ({}, 1, "views of 0 classes"),
+        ({}, 1, "the objects with views are none"),
         ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
@@ -146,7 +146,7 @@ def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monk
 def test_failures_before_and_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is full at several steps; interrupts before the first file is moved to its name, and after some are."""
     out, rename = tmp_path / "run", Path.rename
-    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+    for name in ("begin_job", "log_metrics", "draw_curves", "save_run"):
         with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
             patch.setattr(module, name, full_disk)
             train(out)

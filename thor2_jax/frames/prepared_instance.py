@@ -326,7 +326,10 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     """
     check_frame(frame)
     if label is None and len(frame.instances) != 1:
-        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
+        raise InputError(
+            f"labels has {len(frame.instances)} instances; expected one, or the number of the object: give instance "
+            "(--instance)"
+        )
     if label is not None and label not in frame.instances:
         listed = first_names(list(map(str, frame.instances)), 10)
         expected = f"one of {listed}" if listed else "a frame with instances"

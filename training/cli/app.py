@@ -128,10 +128,11 @@ console = Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column; by default, rich cuts them."""
+    """A table that folds words that are longer than a column, but no names; by default, rich cuts them."""
 
-    def __init__(self, *names: str, title: str | None = None) -> None:
-        super().__init__(*(table.Column(name, overflow="fold") for name in names), title=title)
+    def __init__(self, *titles: str, title: str | None = None) -> None:
+        columns = (table.Column(each, overflow="fold", no_wrap=each == "name") for each in titles)
+        super().__init__(*columns, title=title)
 
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
@@ -187,17 +188,14 @@ def thor2(
     show_help(context)
 
 
-def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 0.01) -> None:
-    """Send Ctrl-C again after some seconds if its exception was lost; pass other lost exceptions to `report`.
+def _repeat_interrupt(report: Callable[[Any], Any], lost: Any) -> None:
+    """Send Ctrl-C again, when this function has ended, if its exception was lost; pass other ones to `report`.
 
     Python ignores exceptions that are raised in finalizers and in callbacks of the garbage collector, including those
     of JAX. It only calls `sys.unraisablehook`.
     """
     if issubclass(lost.exc_type, KeyboardInterrupt):
-        try:
-            threading.Timer(seconds, os.kill, [os.getpid(), signal.SIGINT]).start()
-        except KeyboardInterrupt:  # On a busy machine, the signal may arrive before this function ends.
-            _repeat_interrupt(report, lost, 10 * seconds)
+        threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGINT]).start()
     else:
         report(lost)
 

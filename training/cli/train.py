@@ -2,30 +2,14 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
-
-
-class _TrainCommand(options.ManyFrames):
-    """The train command. Its help states the defaults of the protocols."""
-
-    def insert_values(self) -> None:
-        """Insert the values into the help, only when it is shown, since importing the protocols takes a second."""
-        from training.protocol import DEFAULT, PAPER, QUICK
-
-        parameters: list[Any] = self.params
-        for option in parameters:
-            option.help = (option.help or "").format(default=DEFAULT, paper=PAPER, quick=QUICK)
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Insert the values, and show the help."""
-        self.insert_values()
-        super().format_help(ctx, formatter)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,29 +41,22 @@ class ProtocolOptions:
 
     azimuth_step: Annotated[
         float | None,
-        typer.Option(
-            help="Degrees between cameras around the object. ({default.azimuth_step:g}; paper: {paper.azimuth_step:g})"
-        ),
+        typer.Option(help="Degrees between cameras around the object. (20; paper: 5)"),
     ] = None
     polar_step: Annotated[
         float | None,
-        typer.Option(
-            help="Degrees between cameras from pole to pole. ({default.polar_step:g}; paper: {paper.polar_step:g})"
-        ),
+        typer.Option(help="Degrees between cameras from pole to pole. (15; paper: 5)"),
     ] = None
     epochs: Annotated[
         int | None,
         typer.Option(
-            help="Passes over the samples: of the embedding ({default.distractors.epochs}) and of the classifiers, "
-            "half at a learning rate of {default.fit.learning_rates[0]:g}, half at {default.fit.learning_rates[1]:g} "
-            "({default.fit.epochs}; paper: {paper.fit.epochs})."
+            help="Passes over the samples: of the embedding (8) and of the classifiers, half at a learning rate of "
+            "0.01, half at 0.001 (16; paper: 100)."
         ),
     ] = None
     batch_size: Annotated[
         int | None,
-        typer.Option(
-            help="Samples per step of the classifiers. ({default.fit.batch_size}; paper: {paper.fit.batch_size})"
-        ),
+        typer.Option(help="Samples per step of the classifiers. (256; paper: 128)"),
     ] = None
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0
     folds: Annotated[
@@ -89,13 +66,12 @@ class ProtocolOptions:
         int | None,
         typer.Option(
             min=0,
-            help="Additional samples of each view in random orientations, for the classifiers. "
-            "({default.orientation_copies}; paper: {paper.orientation_copies})",
+            help="Additional samples of each view in random orientations, for the classifiers. (1; paper: 0)",
         ),
     ] = None
 
 
-@app.command(cls=_TrainCommand)
+@app.command(cls=options.ManyFrames)
 @options.grouped_options
 def train(
     given: JobOptions,
@@ -128,8 +104,8 @@ def train(
         typer.Option(
             min=0,
             metavar="N",
-            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. "
-            "({default.distractors.procedural}; quick: {quick.distractors.procedural}; paper: 0)",
+            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (1500; quick: 600; "
+            "paper: 0)",
         ),
     ] = None,
     distractors: Annotated[
@@ -183,6 +159,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
     from thor2_jax.model.run_record import RUN_FILE
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
@@ -212,9 +189,12 @@ def train(
                 console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
             if run.embedding is not None and run.surfaces is None:
                 console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
+        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
+        if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
+            views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
+            console.print(f"enrolled, too, since they have no mesh: {escape_characters(views)}")
         finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
         objects = f" (objects: {len(runs[0].classes)})" if runs else ""
         written = "run written to" if runs else f"{finished}; the run is in"
-        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
         frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
         finish(f"{written} {directory}{objects}", "recognize a frame", "recognize", "--model", model, *frame)

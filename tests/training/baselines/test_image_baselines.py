@@ -26,7 +26,7 @@ from training.baselines.architectures import (
     crop_size,
     network_inputs,
     pretrained_files,
-    tensor_shapes,
+    tensors,
 )
 from training.baselines.baseline import BaselineInputs, baseline_file, read_baseline
 from training.baselines.image_baselines import check_backbone, compare
@@ -124,9 +124,9 @@ def write_weights(folder: Path, seed: int = 0) -> Path:
     rng = np.random.default_rng(seed)
     model: Any = nnx.eval_shape(lambda: ARCHITECTURES[SMALL].build(2, 0))
     for backbone, file in ARCHITECTURES[SMALL].weights.items():
-        shapes = tensor_shapes(getattr(model, backbone))
-        tensors = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
-        save_file(tensors, folder / f"{file}.safetensors")
+        shapes = {name: shape for name, shape, *_ in tensors(getattr(model, backbone))}
+        values = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
+        save_file(values, folder / f"{file}.safetensors")
     return folder
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -189,6 +190,18 @@ def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, mo
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
 
 
+def test_the_help_of_train_has_the_values_of_the_protocols(printed: Command) -> None:
+    page = " ".join(re.sub(r"[│ \n]+", " ", printed("train", "--help")).split())
+    for name in ("azimuth_step", "polar_step", "orientation_copies"):
+        assert f"({getattr(DEFAULT, name):g}; paper: {getattr(PAPER, name):g})" in page
+    fit, own, quick = DEFAULT.fit, DEFAULT.distractors, QUICK.distractors
+    assert own is not None and quick is not None and PAPER.distractors is None
+    rates, epochs = "{:g}, half at {:g}".format(*fit.learning_rates), f"({fit.epochs}; paper: {PAPER.fit.epochs})"
+    assert f"of the embedding ({own.epochs}) " in page and f"a learning rate of {rates} {epochs}" in page
+    assert f"({fit.batch_size}; paper: {PAPER.fit.batch_size})" in page
+    assert f"({own.procedural}; quick: {quick.procedural}; paper: 0)" in page
+
+
 def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:
     monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
@@ -252,7 +265,7 @@ def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: 
         ("{}", "has no sequence"),
         ('{"c": ["dragon"]}', "no class dragon"),
         ('{"c": "mug"}', "c is 'mug'"),
-        ('{"d": ["cereal_box_blue", "soup_can_red"], "c": ["mug_white"]}', "add objects to mug_white"),
+        ('{"d": ["cereal_box_blue", "soup_can_red"], "c": ["mug_white"]}', "the objects with views are mug_white"),
         ('{"c": []}', "c is []"),
         ('{"../c": ["mug_white"]}', "'../c'"),
         ('{"/c": ["mug_white"]}', "'/c'"),

@@ -95,7 +95,7 @@ def test_one_counter_numbers_all_stages_of_the_demo(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(demo, "run_train_job", train)
     with pytest.raises(Interrupted):
         demo.run_demo(tmp_path, 1, lambda stage, *_: shown.append(stage))
-    assert shown == ["stage 1 of 7: render"]
+    assert shown == ["stage 1 of 6: render"]
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": fit, "config": SMALL_CONFIG}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
-    for stage, step in (("stage 4 of 7: fit tops", 13), ("stage 7 of 7: recognize scenes", 1)):
+    for stage, step in (("stage 4 of 6: fit tops", 13), ("stage 6 of 6: recognize scenes", 1)):
         with pytest.raises(Interrupted):
             demo.run_demo(tmp_path, 1, stop_when(stage, step))
     assert not (tmp_path / "report.html").exists()
@@ -128,7 +128,7 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     (summary,) = summaries
     printed = capsys.readouterr().out
     assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
-    assert stages == {"stage 6 of 7: compose scenes": (6, 6), "stage 7 of 7: recognize scenes": (6, 6)}
+    assert stages == {"stage 6 of 6: recognize scenes": (6, 6)}
     assert "This call of the command took" in (tmp_path / "report.html").read_text()
     assert_refused("^out: ", run_demo, tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
