@@ -165,19 +165,18 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
 
 
 def test_finished_templates_need_no_backbone(tmp_path: Path) -> None:
-    assert_refused("^baselines: templates needs a backbone", check_backbone, ["templates"], tmp_path)
+    """Without one, they are refused before and in the training; networks are refused without crops."""
+    message = "^baselines: templates needs a backbone"
+    assert_refused(message, check_backbone, ["templates"], tmp_path)
+    run, without_crops = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
+    assert_refused(message, train_baselines, run, SOURCE, ["templates"])
+    assert_refused("no crops", train_baselines, run, without_crops, [SMALL])
     check_backbone([SMALL, "templates"], tmp_path)
     for name in (SMALL, "templates"):
         file = baseline_file(tmp_path / name / "fold-0", name)
         file.parent.mkdir(parents=True)
         file.touch()
         check_backbone(["templates"], tmp_path / name)
-
-
-def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:
-    folder, source = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
-    assert_refused("^baselines: templates needs a backbone", train_baselines, folder, SOURCE, ["templates"])
-    assert_refused("no crops", train_baselines, folder, source, [SMALL])
 
 
 def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
