@@ -32,7 +32,7 @@ from training.rendering.camera import camera_pose
 from training.rendering.scenes import compose_scene
 from training.reports.html import Picture, Section, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
-from training.storage.jobs import Progress, numbered
+from training.storage.jobs import Progress
 from training.train_job import TrainJob, run_train_job
 from training.train_run import is_finished
 from training.views.mesh_views import view_cloud
@@ -52,9 +52,6 @@ PROTOCOL = dataclasses.replace(
 
 N_SCENES = 40
 """Number of scenes. The ten cameras of `CHOOSE` take turns, one camera per scene."""
-
-RECOGNIZE, SCENES_SHARE = "recognize scenes", 0.6
-"""The stage after the training, and its time, divided by that of rendering the views."""
 
 N_SHOWN = 6
 NAMES = ("CE", "TOPS", "TOPS2", "THOR2")
@@ -103,12 +100,11 @@ def run_demo(
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
     job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
-    shown = numbered(progress, job.stages | {RECOGNIZE: SCENES_SHARE})
-    run_train_job(job, shown, stages={})
+    run_train_job(job, progress)
     pictures.mkdir(exist_ok=True)
     (run,) = load_runs([out / "run"])
     trained = run.model.run
-    answers = _answer_scenes(run, objects, seed, shown, pictures)
+    answers = _answer_scenes(run, objects, seed, progress, pictures)
     report = compute_results("demo", [run], answers)
     cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]
     subsets = {" ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all": cell for cell in cells}
@@ -147,7 +143,7 @@ def _answer_scenes(
         if number < N_SHOWN:
             recognitions = run.recognizer.recognize(frame)
             draw_overlay(frame.color, frame.label_image, recognitions, pictures / f"scene-{number}.png")
-        progress(RECOGNIZE, number + 1, N_SCENES, "")
+        progress("recognize scenes", number + 1, N_SCENES, "")
     return grouped
 
 

@@ -212,6 +212,9 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
         trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces, classes=())
         monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
         assert ("no surfaces" in printed(*command)) == (surfaces is None)
+    enrolled = SimpleNamespace(objects={"mug": SimpleNamespace(clouds=[1, 2])})
+    monkeypatch.setattr("thor2_jax.gallery.store.load_gallery", lambda _: enrolled)
+    assert "enrolled, too, since they have no mesh: mug (views: 2)" in printed(*command)
 
 
 @pytest.mark.usefixtures("small_descriptors", "weights")
