@@ -207,6 +207,13 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
 
 
+def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
+    rows = [{"classifier": "tops", **dict.fromkeys(module.CURVE, 0.5), "epoch": epoch} for epoch in (1, 2)]
+    rows[1]["held_out_accuracy"] = 0.25
+    outcome = module._outcome(rows, {"tops": 1})
+    assert outcome["held_out_accuracy"] == {"tops": 0.5} and outcome["kept_epochs"] == {"tops": 1}
+
+
 def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted in the second fold, and while the checkpoints are removed after the last one is finished."""
     out, rmdir = tmp_path / "run", os.rmdir

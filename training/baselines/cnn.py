@@ -225,8 +225,9 @@ class DenseNet(nnx.Module):
         """Return [B, channels] features for images [B, S, S, 3]: the means over all pixels."""
         x = stem_pool(nnx.relu(self.norm0(self.conv0(x))))
         for number in range(1, self.n_blocks + 1):
-            for layer in getattr(self, f"denseblock{number}").values():
-                x = layer(x)
+            block = getattr(self, f"denseblock{number}")
+            for layer in range(1, len(block) + 1):  # the order of the items changes when a network is merged
+                x = block[f"denselayer{layer}"](x)
             if number < self.n_blocks:
                 x = getattr(self, f"transition{number}")(x)
         return nnx.relu(self.norm5(x)).mean(axis=(1, 2))
