@@ -98,13 +98,8 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
         with_rim: whether to find the rim.
 
     Raises:
-        InputError: the frame has no such instance, or the points are too far apart for the grid, for example because of
-            wrong intrinsics.
+        InputError: the points are too far apart for the grid, for example because of wrong intrinsics.
     """
-    if label not in frame.instances:
-        listed = first_names(list(map(str, frame.instances)), 10)
-        expected = f"one of {listed}" if listed else "a frame with instances"
-        raise InputError(f"instance is {label!r}; expected {expected}")
     pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
@@ -332,6 +327,10 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     check_frame(frame)
     if label is None and len(frame.instances) != 1:
         raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
+    if label is not None and label not in frame.instances:
+        listed = first_names(list(map(str, frame.instances)), 10)
+        expected = f"one of {listed}" if listed else "a frame with instances"
+        raise InputError(f"instance is {label!r}; expected {expected}")
     view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
     if view.reason is not None:
         raise InputError(f"instance {view.label} cannot be used: {view.reason}")
