@@ -108,6 +108,7 @@ def command_line() -> str:
     for path, command in commands():
         context = typer.Context(command, info_name=path)
         usage = " ".join(command.collect_usage_pieces(context))
+        getattr(command, "insert_values", lambda: None)()
         lines += ["", f"## {path}", "", f"    {path} {usage}", "", _text(command.help or "")]
         rows = [_row(parameter, context) for parameter in command.params if parameter.name != "help"]
         if rows:

@@ -1,4 +1,4 @@
-"""examples/ros2: the conversions on messages of rosbags, and the node with replacements of the packages of ROS 2."""
+"""examples/ros2: the node in ROS 2 where that is installed, and without it on messages of rosbags."""
 
 import importlib
 import io
@@ -11,6 +11,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from PIL import Image
+from processes import wait_until
 from recording_files import COLOR, DEPTH, START, camera_info, image, table_frame
 from refusals import assert_refused
 
@@ -135,3 +136,36 @@ def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyP
     assert [one["results"][0]["hypothesis"]["class_id"] for one in message.detections] == ["mug", "mug"]
     assert client.frames[0].intrinsics.fx == 290 and not node.callbacks
     rclpy.try_shutdown.assert_called_once_with()
+
+
+@pytest.mark.slow
+def test_the_node_publishes_detections_in_ros2(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    from sensor_msgs.msg import CameraInfo, Image
+    from vision_msgs.msg import Detection2DArray
+
+    node_module = importlib.import_module("detection_node")
+    monkeypatch.setattr(node_module, "Client", lambda *arguments: LocalClient())
+    rclpy.init()
+    node, camera, received = node_module.DetectionNode(), rclpy.create_node("camera"), []
+    camera.create_subscription(Detection2DArray, "/thor2/detections", received.append, 1)
+    height, width = FRAME.depth.shape
+    info = CameraInfo(height=height, width=width, k=CAMERA.k, distortion_model="plumb_bob")
+    sent = [(camera.create_publisher(CameraInfo, "/camera/color/camera_info", 10), info)]
+    for topic, pixels, encoding in ((COLOR, FRAME.color, "rgb8"), (DEPTH, FRAME.depth, "16UC1")):
+        message = Image(height=height, width=width, encoding=encoding, step=pixels[0].nbytes)
+        message.header.stamp.sec, message.data = START // 10**9, np.frombuffer(pixels.tobytes(), np.uint8)
+        sent.append((camera.create_publisher(Image, topic, 10), message))
+
+    def send(seconds: float) -> None:
+        for publisher, message in sent:
+            publisher.publish(message)
+        for _ in range(4):
+            rclpy.spin_once(node, timeout_sec=0.1)
+            rclpy.spin_once(camera, timeout_sec=0.1)
+
+    wait_until(lambda: received, pause=send)
+    assert received[0].header.stamp.sec == START // 10**9
+    assert [one.results[0].hypothesis.class_id for one in received[0].detections] == ["mug", "mug"]
+    node.destroy_node()
+    rclpy.try_shutdown()

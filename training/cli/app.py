@@ -188,14 +188,17 @@ def thor2(
     show_help(context)
 
 
-def _repeat_interrupt(report: Callable[[Any], Any], lost: Any) -> None:
-    """Send Ctrl-C again, when this function has ended, if its exception was lost; pass other ones to `report`.
+def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 0.01) -> None:
+    """Send Ctrl-C again after some seconds if its exception was lost; pass other lost exceptions to `report`.
 
     Python ignores exceptions that are raised in finalizers and in callbacks of the garbage collector, including those
     of JAX. It only calls `sys.unraisablehook`.
     """
     if issubclass(lost.exc_type, KeyboardInterrupt):
-        threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGINT]).start()
+        try:
+            threading.Timer(seconds, os.kill, [os.getpid(), signal.SIGINT]).start()
+        except KeyboardInterrupt:  # On a busy machine, the signal may arrive before this function ends.
+            _repeat_interrupt(report, lost, 10 * seconds)
     else:
         report(lost)
 

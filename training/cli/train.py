@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -10,6 +10,23 @@ from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
+
+
+class _TrainCommand(options.ManyFrames):
+    """The train command. Its help states the defaults of the protocols."""
+
+    def insert_values(self) -> None:
+        """Insert the values into the help, only when it is shown, since importing the protocols takes a second."""
+        from training.protocol import DEFAULT, PAPER, QUICK
+
+        parameters: list[Any] = self.params
+        for option in parameters:
+            option.help = (option.help or "").format(default=DEFAULT, paper=PAPER, quick=QUICK)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Insert the values, and show the help."""
+        self.insert_values()
+        super().format_help(ctx, formatter)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,22 +58,29 @@ class ProtocolOptions:
 
     azimuth_step: Annotated[
         float | None,
-        typer.Option(help="Degrees between cameras around the object. (20; paper: 5)"),
+        typer.Option(
+            help="Degrees between cameras around the object. ({default.azimuth_step:g}; paper: {paper.azimuth_step:g})"
+        ),
     ] = None
     polar_step: Annotated[
         float | None,
-        typer.Option(help="Degrees between cameras from pole to pole. (15; paper: 5)"),
+        typer.Option(
+            help="Degrees between cameras from pole to pole. ({default.polar_step:g}; paper: {paper.polar_step:g})"
+        ),
     ] = None
     epochs: Annotated[
         int | None,
         typer.Option(
-            help="Passes over the samples: of the embedding (8) and of the classifiers, half at a learning rate of "
-            "0.01, half at 0.001 (16; paper: 100)."
+            help="Passes over the samples: of the embedding ({default.distractors.epochs}) and of the classifiers, "
+            "half at a learning rate of {default.fit.learning_rates[0]:g}, half at {default.fit.learning_rates[1]:g} "
+            "({default.fit.epochs}; paper: {paper.fit.epochs})."
         ),
     ] = None
     batch_size: Annotated[
         int | None,
-        typer.Option(help="Samples per step of the classifiers. (256; paper: 128)"),
+        typer.Option(
+            help="Samples per step of the classifiers. ({default.fit.batch_size}; paper: {paper.fit.batch_size})"
+        ),
     ] = None
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0
     folds: Annotated[
@@ -66,12 +90,13 @@ class ProtocolOptions:
         int | None,
         typer.Option(
             min=0,
-            help="Additional samples of each view in random orientations, for the classifiers. (1; paper: 0)",
+            help="Additional samples of each view in random orientations, for the classifiers. "
+            "({default.orientation_copies}; paper: {paper.orientation_copies})",
         ),
     ] = None
 
 
-@app.command(cls=options.ManyFrames)
+@app.command(cls=_TrainCommand)
 @options.grouped_options
 def train(
     given: JobOptions,
@@ -104,8 +129,8 @@ def train(
         typer.Option(
             min=0,
             metavar="N",
-            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (1500; quick: 600; "
-            "paper: 0)",
+            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. "
+            "({default.distractors.procedural}; quick: {quick.distractors.procedural}; paper: 0)",
         ),
     ] = None,
     distractors: Annotated[

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shlex
 import shutil
 from pathlib import Path
@@ -188,18 +187,6 @@ def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, mo
     assert paper.distractors == replace(distractors, procedural=20, epochs=3) and paper.classifiers == FEATURES
     assert job("--folds", 3).protocol == replace(default, folds=3)
     assert "quick" in refused("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
-
-
-def test_the_help_of_train_has_the_values_of_the_protocols(printed: Command) -> None:
-    page = " ".join(re.sub(r"[│ \n]+", " ", printed("train", "--help")).split())
-    for name in ("azimuth_step", "polar_step", "orientation_copies"):
-        assert f"({getattr(DEFAULT, name):g}; paper: {getattr(PAPER, name):g})" in page
-    fit, own, quick = DEFAULT.fit, DEFAULT.distractors, QUICK.distractors
-    assert own is not None and quick is not None and PAPER.distractors is None
-    rates, epochs = "{:g}, half at {:g}".format(*fit.learning_rates), f"({fit.epochs}; paper: {PAPER.fit.epochs})"
-    assert f"of the embedding ({own.epochs}) " in page and f"a learning rate of {rates} {epochs}" in page
-    assert f"({fit.batch_size}; paper: {PAPER.fit.batch_size})" in page
-    assert f"({own.procedural}; quick: {quick.procedural}; paper: 0)" in page
 
 
 def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:
