@@ -1,16 +1,13 @@
 """Adaptation of a run directory to a camera: a copy whose record contains the camera's colour transform."""
 
 import dataclasses
-import errno
 import json
 import os
-import shutil
-import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.adaptation.estimate import Adaptation, Report
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import with_context
 from thor2_jax.files import atomic_directory, check_output_directory, read_file
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
@@ -19,8 +16,8 @@ from training.readers.frames import FrameSource
 
 __all__ = ["adapt_run"]
 
-UNFINISHED = shutil.ignore_patterns("checkpoints", "views", ".*")
-"""Names in a run directory that are not copied."""
+UNFINISHED = ("checkpoints", "views")
+"""Folders in a run directory that are not copied."""
 
 
 def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
@@ -49,13 +46,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
 
     adaptation = recognizer.adapt(frames(), report)
     with atomic_directory(out) as run:
-        try:
-            shutil.copytree(model, run, ignore=UNFINISHED, copy_function=_copy, dirs_exist_ok=True)
-        except shutil.Error as error:
-            raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
-        finally:
-            for directory, _, _ in os.walk(run):  # read-only directories could be neither moved nor removed
-                os.chmod(directory, os.stat(directory).st_mode | stat.S_IRWXU)
+        _copy_files(model, run)
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
             "color_transform": dataclasses.asdict(adaptation.transform),
@@ -65,12 +56,12 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
     return adaptation
 
 
-def _copy(source: str, target: str) -> None:
-    """Copy a file; raise InputError if it cannot be read, such as a device."""
-    try:
-        content = read_file(source)
-    except OSError as error:
-        reason = f"model: {source} cannot be copied ({error.strerror}); expected a readable run directory"
-        raise InputError(reason) from None
-    Path(target).write_bytes(content)
-    shutil.copymode(source, target)
+def _copy_files(model: Path, run: Path) -> None:
+    """Copy a run directory's content, without modes and without hidden files; raise OSError for devices."""
+    for folder, folders, names in os.walk(model, followlinks=True):
+        folders[:] = [name for name in folders if name not in UNFINISHED and not name.startswith(".")]
+        target = run / Path(folder).relative_to(model)
+        target.mkdir(exist_ok=True)
+        for name in names:
+            if not name.startswith("."):
+                (target / name).write_bytes(read_file(Path(folder, name)))

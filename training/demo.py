@@ -29,10 +29,10 @@ from training.objects.mesh import TexturedMesh
 from training.protocol import DEFAULT
 from training.readers.labelled import LabelledFrame
 from training.rendering.camera import camera_pose
-from training.rendering.scenes import Scene, compose_scene
+from training.rendering.scenes import compose_scene
 from training.reports.html import Picture, Section, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
-from training.storage.jobs import Progress, numbered
+from training.storage.jobs import Progress
 from training.train_job import TrainJob, run_train_job
 from training.train_run import is_finished
 from training.views.mesh_views import view_cloud
@@ -52,10 +52,6 @@ PROTOCOL = dataclasses.replace(
 
 N_SCENES = 40
 """Number of scenes. The ten cameras of `CHOOSE` take turns, one camera per scene."""
-
-COMPOSE, RECOGNIZE = "compose scenes", "recognize scenes"
-SCENE_STAGES = {COMPOSE: 0.2, RECOGNIZE: 0.4}
-"""The stages after the training, with their times, divided by that of rendering the views."""
 
 N_SHOWN = 6
 NAMES = ("CE", "TOPS", "TOPS2", "THOR2")
@@ -104,13 +100,11 @@ def run_demo(
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
     job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
-    shown = numbered(progress, job.stages | SCENE_STAGES)
-    run_train_job(job, shown, stages={})
+    run_train_job(job, progress)
     pictures.mkdir(exist_ok=True)
-    scenes = _compose_scenes(objects, seed, shown)
     (run,) = load_runs([out / "run"])
     trained = run.model.run
-    answers = _answer_scenes(run, scenes, shown)
+    answers = _answer_scenes(run, objects, seed, progress, pictures)
     report = compute_results("demo", [run], answers)
     cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]
     subsets = {" ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all": cell for cell in cells}
@@ -124,10 +118,6 @@ def run_demo(
     mug = objects["mug_blue"]
     xyz, rgb = view_cloud(mug, camera_pose(0.8, 1.2, mug.centre))
     draw_descriptor(xyz, rgb, trained.network, trained.config, "mug_blue", pictures / "descriptor.png")
-    for number, scene in enumerate(scenes[:N_SHOWN]):
-        recognitions = run.recognizer.recognize(scene.frame)
-        draw_overlay(scene.frame, recognitions, pictures / f"scene-{number}.png")
-
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     summary = DemoSummary(NAMES, accuracy, counts, time.perf_counter() - start, peak)
     content = {"figures": dataclasses.asdict(summary), "instances": list(_instances(run, answers))}
@@ -136,26 +126,24 @@ def run_demo(
     return summary
 
 
-def _compose_scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Progress) -> list[Scene]:
+def _answer_scenes(
+    run: Run, objects: Mapping[str, TexturedMesh], seed: int, progress: Progress, pictures: Path
+) -> list[FrameAnswers]:
+    """Compose scenes, draw the first ones with their answers, and return the answers by the degree of occlusion."""
+    grouped = []
     # Each scene has its own random stream, so that a change to one scene does not affect the later ones.
     seeds = zip(np.random.SeedSequence(seed).spawn(N_SCENES), itertools.cycle(CHOOSE), strict=False)
-    scenes = []
-    for number, (scene_seed, camera) in enumerate(seeds, 1):
+    for number, (scene_seed, camera) in enumerate(seeds):
         scene = compose_scene(objects, np.random.default_rng(scene_seed))
-        scenes.append(dataclasses.replace(scene, frame=through_camera(scene.frame, camera)))
-        progress(COMPOSE, number, N_SCENES, "")
-    return scenes
-
-
-def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> list[FrameAnswers]:
-    """Return the answers for all scenes, with the instances of each scene grouped by their degree of occlusion."""
-    frames = (LabelledFrame(f"scene {number}", scene.frame, scene.truth, {}) for number, scene in enumerate(scenes))
-    grouped = []
-    for number, (_, answers) in enumerate(answer_frames([run], frames)):
+        frame = through_camera(scene.frame, camera)
+        ((_, answers),) = answer_frames([run], [LabelledFrame(f"scene {number}", frame, scene.truth, {})])
         for degree in ("none", "low", "high"):
-            instances = [i for i in answers.instances if scenes[number].occlusion(i.label) == degree]
+            instances = [i for i in answers.instances if scene.occlusion(i.label) == degree]
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))
-        progress(RECOGNIZE, number + 1, N_SCENES, "")
+        if number < N_SHOWN:
+            recognitions = run.recognizer.recognize(frame)
+            draw_overlay(frame, recognitions, pictures / f"scene-{number}.png")
+        progress("recognize scenes", number + 1, N_SCENES, "")
     return grouped
 
 

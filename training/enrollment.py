@@ -1,13 +1,15 @@
 """Enroll objects in the gallery of a run directory.
 
-from training.views.mesh_views import mesh_views
-enroll_objects(Path("run"), ({"mug": Path("mug.glb")}, iter([mesh_views(Path("mug.glb"))])))
+enroll_objects(Path("run"), {"mug": Path("mug.glb")})
 enroll_objects(Path("run"), FrameFolder("labelled-frames"))
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_directory
@@ -20,6 +22,8 @@ from training.objects.meshes import load_mesh
 from training.objects.surfaces import surfaces_of
 from training.readers.frames import FrameFolder
 from training.storage.jobs import Progress
+from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views import mesh_views
 from training.views.labelled_views import read_instances
 
 __all__ = ["enroll_objects"]
@@ -27,7 +31,7 @@ __all__ = ["enroll_objects"]
 
 def enroll_objects(
     model: Path,
-    source: FrameFolder | tuple[Mapping[str, Path], Iterator[Sequence[PreparedInstance]]],
+    source: FrameFolder | Mapping[str, Path],
     *,
     name: str | None = None,
     label_name: str | None = None,
@@ -36,14 +40,14 @@ def enroll_objects(
     replace: bool = False,
     gallery: Path | None = None,
     mesh_scale: float = 1.0,
+    pool: WorkerPool = IN_PROCESS,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> tuple[dict[str, int], ObjectGallery, Sequence[str]]:
     """Enroll objects in the gallery of a run directory, all or none; a missing run directory is created.
 
     Args:
         model: the run directory.
-        source: labelled frames, or the meshes of objects by name and an iterator over their rendered views, in the same
-            order.
+        source: labelled frames, or the meshes of objects by name.
         name: the only object to enroll; its name is checked before anything is read. None enrolls all objects.
         label_name: name of this object in the frames; by default `name`.
         instance: number of this object in the frames, see `read_instances`.
@@ -51,6 +55,7 @@ def enroll_objects(
         replace: replace the views of existing objects.
         gallery: directory of the gallery, for an existing run directory; by default `gallery` in the run directory.
         mesh_scale: factor that converts the unit of the meshes to metres.
+        pool: worker processes that render the meshes.
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
@@ -61,13 +66,17 @@ def enroll_objects(
             `read_instances`), or a name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
         OSError: a file cannot be written; the gallery is unchanged, and no run directory is created.
     """
+    if not isinstance(source, FrameFolder):
+        for file in source.values():
+            load_mesh(file, mesh_scale)  # raises if it cannot be used
     model = model.resolve()
     is_new = _is_empty(model)
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
     added: dict[str, GalleryObject] = {}
     skipped: Sequence[str] = []
-    with atomic_directory(model) if is_new else contextlib.nullcontext(model) as run:
+    with contextlib.ExitStack() as stack:
+        run = stack.enter_context(atomic_directory(model)) if is_new else model
         if is_new:
             embedding = ObjectGallery(()).embedding
             save_run(TrainedRun(embedding.config, embedding.network, (), {}, {}), run)
@@ -75,22 +84,24 @@ def enroll_objects(
         objects = recognizer.objects
         if name is not None:
             objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        views: Iterator[Sequence[PreparedInstance]]
+        views: Iterable[Sequence[PreparedInstance]]
+        surfaces: Iterable[Any] = itertools.repeat(None)
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
             labelled, skipped = instances.views, instances.skipped
             if name is not None:
                 labelled = {name: [view for each in labelled.values() for view in each]}
             views = ([recognizer.model.corrected(view) for view in each] for each in labelled.values())
-            names, kind, meshes = list(labelled), "frames", None
+            names, kind = list(labelled), "frames"
         else:
-            given, views = source
-            names, kind, meshes = list(given), "mesh", iter(given.values())
+            render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
+            views = stack.enter_context(contextlib.closing(pool(render, source.values())))
+            surfaces = (surfaces_of([load_mesh(file, mesh_scale)]).arrays for file in source.values())
+            names, kind = list(source), "mesh"
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
-        for number, each in enumerate(names):
+        for number, (each, of_object, surface) in enumerate(zip(names, views, surfaces, strict=False)):
             progress("enroll", number, len(names), each)
-            surface = None if meshes is None else surfaces_of([load_mesh(next(meshes), mesh_scale)]).arrays
-            added[each] = enrolled_views(objects.embedding, next(views), kind, surface)
+            added[each] = enrolled_views(objects.embedding, of_object, kind, surface)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):

@@ -79,15 +79,12 @@ class TrainJob:
         return {"render": 1.0} | ({"render crops": 1.0} if self.crop_size is not None else {}) | self.protocol.stages
 
 
-def run_train_job(
-    job: TrainJob, progress: Progress, stages: Mapping[str, float] | None = None
-) -> dict[Path, list[TrainedRun]]:
+def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedRun]]:
     """Train all runs and baselines of the job that are not finished yet.
 
     Args:
         job: the job.
         progress: called with (stage, done, total, note); the stages are numbered, those of a sequence after its name.
-        stages: stages to number, with their times; empty if `progress` numbers them. None numbers those of the job.
 
     Returns:
         Run directory -> the runs of its folds that this call has trained; empty if they were already finished.
@@ -113,8 +110,7 @@ def run_train_job(
             _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    stages = job.stages if stages is None else stages
-    shown = numbered(progress, stages)
+    shown = numbered(progress, job.stages)
     source = _open_views(job, labelled, shown)
     enrolled = source.without_mesh if isinstance(source, WithLabelledViews) else {}
     if job.leave_out:
@@ -136,7 +132,7 @@ def run_train_job(
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         if job.sequences is not None:
-            shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), stages)
+            shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), job.stages)
         is_done = is_finished(directory)
         runs[directory] = [] if is_done else train_run(views, directory, job.protocol, shown, enrolled)
         if baselines and jax.process_index() == 0:
@@ -236,11 +232,11 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
             raise InputError(
                 f"frames: the names {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-        if name not in names and len(labelled.views[name]) < 2:
-            raise InputError(
-                f"frames: {name!r} has one usable instance; expected at least two: label it in another frame, "
-                "or leave it out (leave_out)"
-            )
+    if single := [name for name in classes if name not in names and len(labelled.views[name]) < 2]:
+        raise InputError(
+            f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "
+            "label it in another frame, or leave it out with --leave-out"
+        )
 
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:

@@ -5,7 +5,7 @@ RUN/embedding.safetensors             with distractors: the embedding, which als
 RUN/references.safetensors            its reference views, for galleries
 RUN/surfaces.safetensors              surfaces of the classes, if all were trained from meshes
 RUN/gallery/                          with an embedding: labelled views of classes without a mesh, enrolled
-RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
+RUN/metrics.jsonl                     added after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
+from thor2_jax.files import check_output_directory, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
@@ -102,11 +102,11 @@ def finished_record(out: Path) -> Mapping[str, Any]:
     return load_run(find_run_directories([out])[0]).record
 
 
-def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
-    """Append the metrics of one epoch."""
-    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    with errors_name(path), path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
+def log_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
+    """Add the metrics of one epoch; those that an interrupted training logged before its checkpoint are replaced."""
+    key, row = (fold, classifier), {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
+    earlier = [r for r in read_metrics(path) if (r["fold"], r["classifier"]) != key or r["epoch"] < metrics.epoch]
+    write_text(path, "".join(json.dumps(each) + "\n" for each in [*earlier, row]))
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -124,13 +124,6 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"out: {path} is damaged ({error}); remove it, or choose another directory") from None
     return rows
-
-
-def discard_later_epochs(path: Path, fold: int, classifier: str, epoch: int) -> None:
-    """Remove the lines of a classifier after `epoch`, since its training resumes there and appends them again."""
-    rows = read_metrics(path)
-    kept = [r for r in rows if (r["fold"], r["classifier"]) != (fold, classifier) or r["epoch"] <= epoch]
-    write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def train_run(
@@ -314,12 +307,8 @@ class _Fold(NamedTuple):
         return dataclasses.replace(embedding, references=references), known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
-        """Open the checkpoints of a fit, which log its metrics; remove logged epochs that have no checkpoint."""
-        log = functools.partial(append_metrics, self.out / METRICS, self.number, name)
-        checkpoints = Checkpoints(self.scratch / name, log)
-        if jax.process_index() == 0:
-            discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
-        return checkpoints
+        """Open the checkpoints of a fit, which log its metrics."""
+        return Checkpoints(self.scratch / name, functools.partial(log_metrics, self.out / METRICS, self.number, name))
 
     def report(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Show the progress of a stage of this fold."""

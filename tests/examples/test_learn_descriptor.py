@@ -17,5 +17,5 @@ def test_one_object_is_refused(tmp_path: Path) -> None:
     compare = example["compare"]
     compare.__globals__["load_sets"] = lambda options: ({name: mesh}, {})
     options = Namespace(azimuth_step=180.0, polar_step=90.0, out=tmp_path)
-    assert_refused("views of 1 classes; expected at least two", compare, options, [])
+    assert_refused("expected at least two; add views of another one", compare, options, [])
     assert not list(tmp_path.iterdir())

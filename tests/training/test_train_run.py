@@ -24,7 +24,7 @@ from training.evaluation.runs import load_runs
 from training.fitting import loop
 from training.fitting.calibration import fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext
-from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, find_run_directories
+from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
 from training.fitting.samples import sample_views
 from training.protocol import Protocol
 from training.train_run import train_run
@@ -114,7 +114,7 @@ STICK = brick_and_stick(1)["stick"]
 
 def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
     for bad, folds, message in (
-        ({}, 1, "views of 0 classes"),
+        ({}, 1, "the objects with views are none"),
         ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
         (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
         ({"a": random_clouds(0, [9000], (9, 9, 9)), "b": STICK}, 1, "9000 points"),
@@ -146,7 +146,7 @@ def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monk
 def test_failures_before_and_while_the_run_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is full at several steps; interrupts before the first file is moved to its name, and after some are."""
     out, rename = tmp_path / "run", Path.rename
-    for name in ("begin_job", "append_metrics", "draw_curves", "save_run"):
+    for name in ("begin_job", "log_metrics", "draw_curves", "save_run"):
         with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
             patch.setattr(module, name, full_disk)
             train(out)
@@ -177,9 +177,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     before = files_of(out)
     begun = Protocol(("tops",), OPTIONS, CONFIG)
     for message, seed, changes in (
-        ("batch_size 8, not 6", 0, {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", 0, {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
-        (r"classifiers\[0\] \"tops\", not \"ce\"", 0, {"classifiers": ("tops", "ce")}),
         ("folds 1, not 3", 0, {"folds": 3}),
         (f'dataset "{source().digest}", not ', 1, {}),
         (r"descriptor_config\.\w+ ", 0, {"config": thor2.DescriptorConfig()}),
@@ -210,9 +208,9 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
 
 
 def test_the_held_out_accuracy_is_that_of_the_kept_epoch() -> None:
-    accuracies = {1: 0.5, 2: 0.75, 3: 0.25}
-    rows = [EpochMetrics(epoch, 1.0, 1.0, 1.0, accuracy) for epoch, accuracy in accuracies.items()]
-    outcome = module._outcome([{"classifier": "tops", **dataclasses.asdict(row)} for row in rows], {"tops": 1})
+    rows = [{"classifier": "tops", **dict.fromkeys(module.CURVE, 0.5), "epoch": epoch} for epoch in (1, 2)]
+    rows[1]["held_out_accuracy"] = 0.25
+    outcome = module._outcome(rows, {"tops": 1})
     assert outcome["held_out_accuracy"] == {"tops": 0.5} and outcome["kept_epochs"] == {"tops": 1}
 
 
@@ -244,18 +242,15 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     same_weights(runs[0], first)
     samples, _ = sample_views(source(), runs[0].network, CONFIG)
     fold_of = fold_of_views(samples.label, samples.view, source().classes, 3, OPTIONS.seed)
-    logged = []
     for fold, one in enumerate(load_runs([out])):
         rows, context = np.flatnonzero(fold_of == fold), FitContext("tops", runs[fold].network, CONFIG)
         probabilities = sample_probabilities(runs[fold].classifiers["tops"], samples, rows, context)
         assert one.temperatures == {"tops": pytest.approx(fit_temperature(probabilities, samples.label[rows]))}
         record = runs[fold].record
         curve = record["curves"]["tops"]
-        logged += [(fold, "tops", row["epoch"], row["loss"], row["accuracy"]) for row in curve]
         best = max(row["held_out_accuracy"] for row in curve)
         assert record["fold"] == fold and record["held_out_accuracy"] == {"tops": best}
         assert curve[record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
-    assert logged_rows(out) == logged
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
     assert_refused("out: .* already contains", run)

@@ -8,10 +8,10 @@ The files have the tensor names of timm: `layer1.0.conv1.weight` is the kernel o
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,33 +39,18 @@ _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var"
 """Last part of an NNX path -> last part of the tensor's name."""
 
 
-class _Tensor(NamedTuple):
-    """A tensor in a backbone's file: its variable in the network, the variable's last name, and the tensor's shape.
+def tensors(model: nnx.Module) -> Iterator[tuple[str, tuple[int, ...], str, Any]]:
+    """Yield the tensors of a backbone's file: name, shape, and the last name and the variable in the network.
 
     The last two axes of kernels are the first ones of the tensor, reversed.
     """
-
-    variable: Any
-    kind: str
-    shape: tuple[int, ...]
-
-
-def _tensors(model: nnx.Module) -> tuple[Any, dict[str, _Tensor]]:
-    """Return the state of a backbone, and the name of each tensor -> the tensor."""
-    state, tensors = nnx.state(model, (nnx.Param, nnx.BatchStat)), {}
     prefix: str = getattr(model, "PREFIX", "")
-    for path, variable in nnx.to_flat_state(state):
+    for path, variable in nnx.to_flat_state(nnx.state(model, (nnx.Param, nnx.BatchStat))):
         *modules, kind = map(str, path)
         shape = variable.shape
         if kind == "kernel":
             shape = (shape[-1], shape[-2], *shape[:-2])
-        tensors[prefix + ".".join([*modules, _TENSORS.get(kind, kind)])] = _Tensor(variable, kind, shape)
-    return state, tensors
-
-
-def tensor_shapes(model: nnx.Module) -> dict[str, tuple[int, ...]]:
-    """Return the names and shapes of the tensors of a backbone's file."""
-    return {name: tensor.shape for name, tensor in _tensors(model)[1].items()}
+        yield prefix + ".".join([*modules, _TENSORS.get(kind, kind)]), shape, kind, variable
 
 
 def weights_file(directory: Path, name: str) -> Path:
@@ -88,11 +73,10 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     Raises:
         InputError: the file is missing or damaged, or a tensor is missing or has another shape.
     """
-    state, tensors = _tensors(model)
     try:
         with safetensors.safe_open(path, "numpy") as file:
             names = set(file.keys())
-            for name, (variable, kind, wanted) in tensors.items():
+            for name, wanted, kind, variable in tensors(model):
                 if name not in names:
                     raise InputError(
                         f"weights: {path} has no tensor {name}; expected one of shape {wanted}: give the "
@@ -112,7 +96,6 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
         raise InputError(
             f"weights: {path} cannot be read ({error}); expected a safetensors file, see docs/baselines.md"
         ) from None
-    nnx.update(model, state)
 
 
 def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -174,22 +174,6 @@ class DenseLayer(nnx.Module):
         return jnp.concatenate([x, self.conv2(nnx.relu(self.norm2(y)))], axis=-1)
 
 
-class DenseBlock(nnx.Module):
-    """A sequence of layers denselayer1, denselayer2, ..."""
-
-    def __init__(self, inputs: int, growth: int, layers: int, *, rngs: nnx.Rngs) -> None:
-        """Initialize the weights."""
-        self.n_layers = layers
-        for number in range(layers):
-            setattr(self, f"denselayer{number + 1}", DenseLayer(inputs + number * growth, growth, rngs=rngs))
-
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Return the input and the outputs of all layers, concatenated along the channels."""
-        for number in range(self.n_layers):
-            x = getattr(self, f"denselayer{number + 1}")(x)
-        return x
-
-
 class Transition(nnx.Module):
     """A transition layer, which halves the channels, the height and the width."""
 
@@ -226,8 +210,11 @@ class DenseNet(nnx.Module):
         self.conv0 = convolution(3, width, 7, 2, rngs)
         self.norm0 = batch_norm(width, rngs)
         for number, layers in enumerate(blocks, 1):
-            setattr(self, f"denseblock{number}", DenseBlock(width, growth, layers, rngs=rngs))
-            width += layers * growth
+            block: Any = nnx.Dict()
+            for layer in range(1, layers + 1):
+                block[f"denselayer{layer}"] = DenseLayer(width, growth, rngs=rngs)
+                width += growth
+            setattr(self, f"denseblock{number}", block)
             if number < len(blocks):
                 setattr(self, f"transition{number}", Transition(width, rngs=rngs))
                 width //= 2
@@ -238,7 +225,9 @@ class DenseNet(nnx.Module):
         """Return [B, channels] features for images [B, S, S, 3]: the means over all pixels."""
         x = stem_pool(nnx.relu(self.norm0(self.conv0(x))))
         for number in range(1, self.n_blocks + 1):
-            x = getattr(self, f"denseblock{number}")(x)
+            block = getattr(self, f"denseblock{number}")
+            for layer in range(1, len(block) + 1):  # the order of the items changes when a network is merged
+                x = block[f"denselayer{layer}"](x)
             if number < self.n_blocks:
                 x = getattr(self, f"transition{number}")(x)
         return nnx.relu(self.norm5(x)).mean(axis=(1, 2))

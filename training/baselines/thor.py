@@ -167,28 +167,23 @@ def fit_thor(task: FitTask) -> StoredBaseline:
     best = np.zeros((len(samples), len(task.run.classes)), np.float32)
     arrays: dict[str, NDArray[Any]] = {}
 
-    def fit_classifier(name: ViewType, rows: NDArray[np.intp], k: int) -> MLP:
-        """Fit the classifier of one view type, whose samples have these rows, on the first `k` slices."""
+    def report(name: ViewType, k: int, done: int, total: int, metrics: EpochMetrics) -> None:
         number, epochs = VIEW_TYPES.index(name) * config.n_slices + k - 1, task.options.epochs
-
-        def report(done: int, total: int, metrics: EpochMetrics) -> None:
-            note = f"{name}, {k} slices, accuracy {metrics.accuracy:.3f}"
-            total_epochs = len(VIEW_TYPES) * config.n_slices * epochs
-            task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
-
-        context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
-        checkpoints = Checkpoints(task.scratch / f"{name}-{k}")
-        return fit(samples, context, task.options, checkpoints, held_of_type, report, rows=rows)[0]
+        note = f"{name}, {k} slices, accuracy {metrics.accuracy:.3f}"
+        total_epochs = len(VIEW_TYPES) * config.n_slices * epochs
+        task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
 
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
         # A class is trained on the held-out views of a type if it has no others.
         held_of_type = held_out & np.isin(samples.label, samples.label[rows[~held_out[rows]]])
         for k in range(1, config.n_slices + 1):
-            model = fit_classifier(name, rows, k)
+            context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
+            checkpoints, shown = Checkpoints(task.scratch / f"{name}-{k}"), partial(report, name, k)
+            model, _ = fit(samples, context, task.options, checkpoints, held_of_type, shown, rows=rows)
             arrays |= model_arrays(model, f"{name}-{k}/")
         # Held-out views are not occluded, so they are classified by all slices, as in `THOR`.
-        context, held_rows = FitContext("tops", task.run.network, config), rows[held_out[rows]]
+        held_rows = rows[held_out[rows]]
         values = sample_probabilities(model, samples, held_rows, context)
         better = values.max(axis=1) > best[held_rows].max(axis=1)
         best[held_rows[better]] = values[better]

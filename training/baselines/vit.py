@@ -39,20 +39,6 @@ VIT_TINY_4 = dataclasses.replace(VIT_TINY, depth=4)
 VIT_DINOV2_SMALL = ViTConfig(384, 12, 6, patch=14, layer_scale=True)
 
 
-class PatchEmbed(nnx.Module):
-    """Linear embedding of the patches of an image."""
-
-    def __init__(self, config: ViTConfig, *, rngs: nnx.Rngs) -> None:
-        """Initialize the weights."""
-        size = (config.patch, config.patch)
-        self.proj = nnx.Conv(3, config.width, size, size, padding="VALID", rngs=rngs)
-
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Return tokens [B, (S/patch)^2, width] for images [B, S, S, 3]."""
-        y = self.proj(x)
-        return y.reshape(len(y), -1, y.shape[-1])
-
-
 class Attention(nnx.Module):
     """Multi-head self-attention."""
 
@@ -122,7 +108,8 @@ class ViT(nnx.Module):
         """Initialize the weights; `size` is the side of the images in pixels, a multiple of the patch's."""
         self.channels = config.width
         tokens = 1 + (size // config.patch) ** 2
-        self.patch_embed = PatchEmbed(config, rngs=rngs)
+        patch = (config.patch, config.patch)
+        self.patch_embed = nnx.Dict(proj=nnx.Conv(3, config.width, patch, patch, padding="VALID", rngs=rngs))
         normal = nnx.initializers.normal(TOKEN_DEVIATION)
         self.cls_token = nnx.Param(normal(rngs.params(), (1, 1, config.width)))
         self.pos_embed = nnx.Param(normal(rngs.params(), (1, tokens, config.width)))
@@ -131,7 +118,7 @@ class ViT(nnx.Module):
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Return [B, channels] features for images [B, S, S, 3]: the normalized class token."""
-        patches = self.patch_embed(x)
+        patches = self.patch_embed.proj(x).reshape(len(x), -1, self.channels)
         token = jnp.broadcast_to(self.cls_token[...], (len(x), 1, self.channels))
         tokens = jnp.concatenate([token, patches], axis=1) + self.pos_embed[...]
         for block in self.blocks:

@@ -128,10 +128,11 @@ console = Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column; by default, rich cuts them."""
+    """A table that folds words that are longer than a column, but no names; by default, rich cuts them."""
 
-    def __init__(self, *names: str, title: str | None = None) -> None:
-        super().__init__(*(table.Column(name, overflow="fold") for name in names), title=title)
+    def __init__(self, *titles: str, title: str | None = None) -> None:
+        columns = (table.Column(each, overflow="fold", no_wrap=each == "name") for each in titles)
+        super().__init__(*columns, title=title)
 
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")

@@ -1,12 +1,8 @@
 """`thor2 enroll`: add new objects to a run, without training."""
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,9 +10,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
-
-if TYPE_CHECKING:
-    from thor2_jax.frames.prepared_instance import PreparedInstance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,20 +65,18 @@ def enroll(
     options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
     scale = options.given_scale(target.mesh_scale)
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
-    from training.objects.meshes import find_object_meshes, load_mesh
-    from training.readers.frames import FrameFolder
+    from training.objects.meshes import find_object_meshes
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
-    frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-    with _rendered(meshes, target.mesh_scale, processes) as views_of_meshes:
-        for file in meshes.values():
-            load_mesh(file, target.mesh_scale)
-        # This import takes seconds, so the meshes are checked first.
-        from training.enrollment import enroll_objects
+    frames = [] if meshes else given.sources(segment)
+    from training.enrollment import enroll_objects  # takes seconds, so the arguments are checked first
+    from training.readers.frames import FrameFolder
+    from training.storage.workers import IN_PROCESS
 
-        with show_progress(quiet) as progress:
-            source = (meshes, views_of_meshes) if frames is None else frames
-            counts, known, skipped = enroll_objects(model, source, name=name, progress=progress, **vars(target))
+    source = meshes or FrameFolder(frames, named=name is None)
+    pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes) or 1)).pool() or IN_PROCESS
+    with show_progress(quiet) as progress:
+        counts, known, skipped = enroll_objects(model, source, name=name, pool=pool, progress=progress, **vars(target))
     for reason in skipped:
         console.print(f"skipped: {reason}")
     for each, count in counts.items():
@@ -96,24 +87,3 @@ def enroll(
     # `thor2 recognize` uses the gallery in the run directory.
     then = ("serve the objects", "serve") if target.gallery else ("recognize a frame", "recognize", "FRAME")
     finish(enrolled, *then, model=model, gallery=target.gallery)
-
-
-@contextlib.contextmanager
-def _rendered(
-    meshes: Mapping[str, Path], mesh_scale: float, processes: options.WorkerOptions
-) -> Iterator[Iterator[Sequence["PreparedInstance"]]]:
-    """Yield an iterator over the views of each mesh; rendering starts at once.
-
-    Several meshes are rendered by worker processes, which start while this process imports JAX.
-    """
-    if not meshes:
-        yield iter(())
-        return
-    from training.storage.workers import IN_PROCESS
-    from training.views import mesh_views
-
-    render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
-    pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes))).pool() or IN_PROCESS
-    with contextlib.closing(pool(render, meshes.values())) as views, ThreadPoolExecutor(1) as thread:
-        first = thread.submit(next, views)
-        yield (next(views) if number else first.result() for number in range(len(meshes)))

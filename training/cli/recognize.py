@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Column, Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
-from training.cli.app import app, console, finish, print_note
+from training.cli.app import Table, app, console, finish, print_note
 
 if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
@@ -229,11 +228,8 @@ def recognize(
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:
     tracked = any(hasattr(r, "track") for r in recognitions)
-    names = (
-        *["track"] * tracked, "label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note",
-    )  # fmt: skip
-    # On a narrow terminal, the other columns are folded, and nothing is cut.
-    table = Table(*(Column(name, overflow="fold", no_wrap=name == "name") for name in names))
+    titles = "label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note"
+    table = Table(*["track"] * tracked, *titles)
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")

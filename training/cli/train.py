@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
@@ -183,6 +184,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
     from thor2_jax.model.run_record import RUN_FILE
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
@@ -212,9 +214,12 @@ def train(
                 console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
             if run.embedding is not None and run.surfaces is None:
                 console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
+        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
+        if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
+            views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
+            console.print(f"enrolled, too, since they have no mesh: {escape_characters(views)}")
         finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
         objects = f" (objects: {len(runs[0].classes)})" if runs else ""
         written = "run written to" if runs else f"{finished}; the run is in"
-        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
         frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
         finish(f"{written} {directory}{objects}", "recognize a frame", "recognize", "--model", model, *frame)

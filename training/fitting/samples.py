@@ -202,8 +202,8 @@ def sample_normalized(
 def check_classes(source: ViewSource) -> None:
     """Raise InputError if there are fewer than two classes, or a class has no views."""
     if len(source.classes) < 2:
-        names, count = ", ".join(source.classes) or "none", len(source.classes)
-        raise InputError(f"there are views of {count} classes; expected at least two; add objects to {names}")
+        names = ", ".join(source.classes) or "none"
+        raise InputError(f"the objects with views are {names}; expected at least two; add views of another one")
     for label, name in enumerate(source.classes):
         if not any(shard.label == label and shard.views for shard in source.shards):
             raise InputError(f"class {name!r} has no views; render more views or leave it out")

@@ -91,8 +91,7 @@ def add_prefix(progress: Progress, name: str) -> Progress:
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
     """Return a callback that adds "stage k of n" to the name of each stage, and the remaining total time to its note.
 
-    The estimate uses the pace of the current stage for this stage, and the pace of all progress so far for later ones.
-    Work that was done before a stage was resumed is not counted.
+    The estimate uses the pace of all progress so far. Work that was done before a stage was resumed is not counted.
 
     Args:
         progress: the callback to call with the extended name and note.
@@ -101,20 +100,16 @@ def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
     """
     names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
     earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))
-    seconds, made, first, last = 0.0, 0.0, (0.0, 0.0), ("", 0.0, 0.0)
+    seconds, made, last = 0.0, 0.0, ("", 0.0, 0.0)
 
     def show(stage: str, done: int, total: int, note: str) -> None:
-        nonlocal seconds, made, first, last
+        nonlocal seconds, made, last
         if stages.get(stage):
             now, part = time.monotonic(), earlier[stage] + stages[stage] * done / max(total, 1)
             if stage == last[0]:
                 seconds, made = seconds + now - last[1], made + part - last[2]
-            else:
-                first = now, part
-            last, end = (stage, now, part), earlier[stage] + stages[stage]
-            pace = seconds / made if made > 0 else 0.0
-            own = (now - first[0]) / (part - first[1]) if part > first[1] else pace
-            left = own * (end - part) + pace * (sum(stages.values()) - end)
+            last = stage, now, part
+            left = seconds * (sum(stages.values()) - part) / made if made > 0 else 0.0
             if seconds >= 1 and left >= 1:
                 note = ", ".join(filter(None, (note, f"about {left:.0f} s left of all stages")))
         progress(names.get(stage, stage), done, total, note)

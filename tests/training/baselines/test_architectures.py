@@ -14,7 +14,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from training.baselines.architectures import load_backbone, resampled_positions, tensor_shapes
+from training.baselines.architectures import load_backbone, resampled_positions, tensors
 from training.baselines.cnn import DENSENET_161, GRU, DenseNet, ResNet18
 from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT
 
@@ -54,8 +54,9 @@ def assert_golden(name: str, outputs: list[Any]) -> None:
 def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int) -> None:
     """They have the random weights of their tensors' names, from a file."""
     model = nnx.eval_shape(lambda: create(rngs=nnx.Rngs(0)))
-    tensors = {name: random_tensor(name, shape) for name, shape in tensor_shapes(model).items()}
-    save_file(tensors, tmp_path / "weights.safetensors")
+    save_file(
+        {name: random_tensor(name, shape) for name, shape, *_ in tensors(model)}, tmp_path / "weights.safetensors"
+    )
     load_backbone(model, tmp_path / "weights.safetensors")
     model.eval()
     assert_golden(name, jax.tree.leaves(nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))))

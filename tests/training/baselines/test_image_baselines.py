@@ -26,7 +26,7 @@ from training.baselines.architectures import (
     crop_size,
     network_inputs,
     pretrained_files,
-    tensor_shapes,
+    tensors,
 )
 from training.baselines.baseline import BaselineInputs, baseline_file, read_baseline
 from training.baselines.image_baselines import check_backbone, compare
@@ -124,9 +124,9 @@ def write_weights(folder: Path, seed: int = 0) -> Path:
     rng = np.random.default_rng(seed)
     model: Any = nnx.eval_shape(lambda: ARCHITECTURES[SMALL].build(2, 0))
     for backbone, file in ARCHITECTURES[SMALL].weights.items():
-        shapes = tensor_shapes(getattr(model, backbone))
-        tensors = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
-        save_file(tensors, folder / f"{file}.safetensors")
+        shapes = {name: shape for name, shape, *_ in tensors(getattr(model, backbone))}
+        values = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
+        save_file(values, folder / f"{file}.safetensors")
     return folder
 
 
@@ -165,19 +165,18 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
 
 
 def test_finished_templates_need_no_backbone(tmp_path: Path) -> None:
-    assert_refused("^baselines: templates needs a backbone", check_backbone, ["templates"], tmp_path)
+    """Without one, they are refused before and in the training; networks are refused without crops."""
+    message = "^baselines: templates needs a backbone"
+    assert_refused(message, check_backbone, ["templates"], tmp_path)
+    run, without_crops = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
+    assert_refused(message, train_baselines, run, SOURCE, ["templates"])
+    assert_refused("no crops", train_baselines, run, without_crops, [SMALL])
     check_backbone([SMALL, "templates"], tmp_path)
     for name in (SMALL, "templates"):
         file = baseline_file(tmp_path / name / "fold-0", name)
         file.parent.mkdir(parents=True)
         file.touch()
         check_backbone(["templates"], tmp_path / name)
-
-
-def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:
-    folder, source = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
-    assert_refused("^baselines: templates needs a backbone", train_baselines, folder, SOURCE, ["templates"])
-    assert_refused("no crops", train_baselines, folder, source, [SMALL])
 
 
 def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:

@@ -111,5 +111,5 @@ def test_bad_input_writes_nothing(
     run = Path(shutil.copytree(model, tmp_path / "run"))
     (run / "curves.png").symlink_to("/dev/zero")
     monkeypatch.setattr(Recognizer, "adapt", lambda *_: Adaptation(ColorTransform(), 12, 0.5, 0.4))
-    assert "curves.png cannot be copied" in refused("adapt", "--model", run, video, "--out", tmp_path / "out")
+    assert "curves.png" in refused("adapt", "--model", run, video, "--out", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "run", "unlabelled"]

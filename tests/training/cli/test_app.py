@@ -233,7 +233,7 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
         ("stage 2 of 4: cached", 1, 2, ""),
         ("stage 3 of 4: fit", 1, 4, "loss 1, about 50 s left of all stages"),
         ("fit thor", 1, 2, ""),
-        ("stage 3 of 4: fit", 2, 4, "loss 1, about 67 s left of all stages"),
+        ("stage 3 of 4: fit", 2, 4, "loss 1, about 58 s left of all stages"),
         ("stage 4 of 4: write", 0, 2, "about 29 s left of all stages"),
         ("stage 4 of 4: write", 2, 2, ""),
     ]

@@ -199,6 +199,9 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
         trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces, classes=())
         monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
         assert ("no surfaces" in printed(*command)) == (surfaces is None)
+    enrolled = SimpleNamespace(objects={"mug": SimpleNamespace(clouds=[1, 2])})
+    monkeypatch.setattr("thor2_jax.gallery.store.load_gallery", lambda _: enrolled)
+    assert "enrolled, too, since they have no mesh: mug (views: 2)" in printed(*command)
 
 
 @pytest.mark.usefixtures("small_descriptors", "weights")
@@ -252,7 +255,7 @@ def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, refused: 
         ("{}", "has no sequence"),
         ('{"c": ["dragon"]}', "no class dragon"),
         ('{"c": "mug"}', "c is 'mug'"),
-        ('{"d": ["cereal_box_blue", "soup_can_red"], "c": ["mug_white"]}', "add objects to mug_white"),
+        ('{"d": ["cereal_box_blue", "soup_can_red"], "c": ["mug_white"]}', "the objects with views are mug_white"),
         ('{"c": []}', "c is []"),
         ('{"../c": ["mug_white"]}', "'../c'"),
         ('{"/c": ["mug_white"]}', "'/c'"),

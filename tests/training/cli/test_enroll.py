@@ -110,7 +110,8 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
-    assert "2 instances" in refused("enroll", "new", frames, "--model", model)
+    error = refused("enroll", "new", frames, "--model", model)
+    assert "2 instances" in error and "--instance" in error
     assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
     assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0

@@ -79,36 +79,25 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 
 
-def test_advice_on_a_wrong_name() -> None:
-    """It names the instance and the look-alike, and adaptation where a shift of the colours gives another name."""
+def test_texts_of_a_page() -> None:
+    """Advice on a wrong name, and what is said if surfaces or an enrolled object decided against the best score."""
     change = SimpleNamespace(kind="color")
     for occluded, other, changes in ((True, "bowl", [change]), (False, None, [])):
         answer = SimpleNamespace(label=7, occluded=occluded)
-        explanation = SimpleNamespace(recognition=answer, name="mug", runner_up=other, changes=changes)
-        advice = explanation_page._advice(explanation)  # type: ignore[arg-type]
+        explanation: Any = SimpleNamespace(recognition=answer, name="mug", runner_up=other, changes=changes)
+        advice = explanation_page._advice(explanation)
         assert "thor2 enroll NAME FRAME --instance 7" in advice
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
-
-
-def test_no_change_is_claimed_for_a_name_that_other_evidence_decided() -> None:
-    """Surfaces, or an enrolled object, may decide against the best score."""
-    for best, text in (
-        (0, "No shift of the colours"),
-        (1, "The explained scores alone would give bowl"),
-    ):
+    for best, text in ((0, "No shift of the colours"), (1, "The explained scores alone would give bowl")):
         scores = SimpleNamespace(names=("mug", "bowl"), of_instances=lambda _, best=best: np.eye(2)[[best]])
         explanation = SimpleNamespace(scores=scores, instance=None, name="mug", runner_up="bowl", changes=())
-        assert explanation_page._changes_text(explanation).startswith(text)  # type: ignore[arg-type]
-
-
-def test_similarities_and_losses_in_words() -> None:
-    """A name that surfaces decided may be less similar, and a name may be the only one."""
+        assert explanation_page._changes_text(explanation).startswith(text)
     for other, lead, words in (
         *(("bowl", 0.25, "mug is 0.25 more similar "), ("bowl", -0.25, "mug is 0.25 less similar ")),
         *(("bowl", -0.004, "mug is as similar "), (None, 0.004, "mug (cosine) is 0.00, and no other object")),
     ):
         assert words in explanation_page._similarity_text("mug", other, lead)
-    explanation: Any = SimpleNamespace(scores=SimpleNamespace(unit="log-odds"))
+    explanation = SimpleNamespace(scores=SimpleNamespace(unit="log-odds"))
     for loss, words in ((0.3, "loses 0.30"), (-0.01, "gains 0.01"), (-0.001, "loses 0.00")):
         assert explanation_page.loss_text(explanation, loss) == f"{words} in log-odds"
 
@@ -134,13 +123,10 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     assert seen == [(0.9, "classifiers", gallery)] * 2
 
 
-def test_frames_without_instances_are_named(model: Path, tmp_path: Path, texts: Texts) -> None:
+def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:
     empty = write_frame(tmp_path / "nothing", {})
     _, err = texts("explain", "--model", model, empty, "--out", tmp_path / "out", status=2)
     assert err.startswith("skipped: nothing: ")
-
-
-def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
     command = ("explain", "--model", model, frame, "--out", out)
     assert "table: --instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)

@@ -106,7 +106,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--dataset views --coordinator localhost:1 --processes 2 --process 2", "process is 2"),
         ("--frames unlabelled", "no frame has"),
         ("--frames one", "the objects are brick; expected at least two"),
-        ("--frames frames/0", "one usable instance"),
+        ("--frames frames/0", "one usable instance of 'brick', 'book'"),
         ("--frames case --meshes meshes", "'brick' and 'Brick' differ only by case or form"),
         ("--frames frames --mesh-scale 0.001", "--mesh-scale is 0.001"),
         ("--frames frames --baselines thor", "baselines: thor"),

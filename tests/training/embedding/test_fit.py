@@ -105,28 +105,16 @@ def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest
 
     with pytest.raises(Interrupted):
         sample(pool=stopped, directory=tmp_path / "samples")
-    (tmp_path / "samples" / "000000.safetensors").write_bytes(b"damaged")
-    rendered.clear()
-    done.clear()
-    for _ in range(2):
-        np.testing.assert_equal(sample(pool=stopped, directory=tmp_path / "samples").arrays(), whole.arrays())
-        assert rendered == [0, 6] and done[:3] == [(3, 8), (6, 8), (8, 8)]
-
-
-def test_only_damaged_files_are_rendered_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(module, "OBJECTS_PER_TASK", 2)
-    sample = functools.partial(sample_objects, OBJECTS[:4], NETWORK, SMALL_CONFIG, 1, directory=tmp_path)
-    whole, damaged = sample(), tmp_path / "000002.safetensors"
+    damaged = tmp_path / "samples" / "000000.safetensors"
     content = damaged.read_bytes()
     save_arrays(tmp_path / "incomplete", {"label": whole.label}, {})
-    incomplete = (tmp_path / "incomplete").read_bytes()
-    with mock.patch.object(module, "render_clouds", wraps=render_clouds) as render:
-        for bad in (content[:-1] + bytes([content[-1] ^ 1]), content[:-1], incomplete):
-            damaged.write_bytes(bad)
-            np.testing.assert_equal(sample().arrays(), whole.arrays())
-            assert damaged.read_bytes() == content
-            np.testing.assert_equal(sample().arrays(), whole.arrays())
-    assert [set(call.args[0]) for call in render.call_args_list] == [{2, 3}] * 3
+    last, incomplete = bytes([content[-1] ^ 1]), (tmp_path / "incomplete").read_bytes()
+    for bad, expected in ((content[:-1], [0, 6]), (content[:-1] + last, [0]), (incomplete, [0]), (content, [])):
+        damaged.write_bytes(bad)
+        rendered.clear()
+        np.testing.assert_equal(sample(pool=stopped, directory=tmp_path / "samples").arrays(), whole.arrays())
+        assert rendered == expected and damaged.read_bytes() == content
+    assert done[7:10] == [(3, 8), (6, 8), (8, 8)]
 
 
 @pytest.fixture(scope="module")

@@ -135,19 +135,14 @@ def test_invalid_options_are_refused_by_name() -> None:
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 
-def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
-    """Only the epochs of one classifier and fold are discarded."""
+def test_repeated_epochs_replace_the_later_ones_of_a_classifier(tmp_path: Path) -> None:
+    """Only in its fold; a last line that was cut off by a crash is ignored."""
     path = tmp_path / "metrics.jsonl"
-    train_run.append_metrics(path, 0, "ce", EpochMetrics(1, 1.0, 0.5, 1000.0))
-    with path.open("a") as file:
-        file.write('{"fold": 0, "cl')
-    assert [row["epoch"] for row in train_run.read_metrics(path)] == [1]
-    train_run.discard_later_epochs(path, 0, "ce", 1)
-    for fold, classifier in ((0, "ce"), (0, "tops"), (1, "ce")):
-        train_run.append_metrics(path, fold, classifier, EpochMetrics(2, 0.5, 0.5, 1000.0))
-    assert [row["epoch"] for row in train_run.read_metrics(path)] == [1, 2, 2, 2]
-    train_run.discard_later_epochs(path, 0, "ce", 1)
-    kept = [(row["fold"], row["classifier"], row["epoch"]) for row in train_run.read_metrics(path)]
-    assert kept == [(0, "ce", 1), (0, "tops", 2), (1, "ce", 2)]
+    for fold, classifier, epoch in ((0, "ce", 1), (0, "ce", 2), (0, "tops", 2), (1, "ce", 2), (0, "ce", 2)):
+        train_run.log_metrics(path, fold, classifier, EpochMetrics(epoch, 1.0, 0.5, 1000.0))
+    logged = [(0, "ce", 1), (0, "tops", 2), (1, "ce", 2), (0, "ce", 2)]
+    for rest in ("", '{"fold": 0, "cl'):
+        path.write_text(path.read_text() + rest)
+        assert [(r["fold"], r["classifier"], r["epoch"]) for r in train_run.read_metrics(path)] == logged
     path.write_text("no json\n{}\n")
     assert_refused(r"out: .*metrics\.jsonl", train_run.read_metrics, path)

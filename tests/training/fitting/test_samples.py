@@ -13,7 +13,6 @@ from small_clouds import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.types import Cloud
 from training.fitting.samples import PAPER_MIRRORS, Form, describe_batch, sample_views
 from training.views import normalized_views
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
@@ -81,17 +80,6 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     ((label, (xyz, rgb)),) = kept
     assert label == 0 and np.array_equal(rgb, second.rgb)
     np.testing.assert_allclose(xyz * CONFIG.sigma_s, second.xyz - second.camera, atol=1e-6)
-
-
-def test_the_digest_is_that_of_the_views() -> None:
-    def digest(**clouds: list[Cloud]) -> str:
-        return MemoryViews(clouds, CONFIG).digest
-
-    one, two = views(0, (3, 4)), views(1, (5,))
-    other = [(one[0][0], one[0][1] ^ 1), one[1]]
-    digests = [digest(a=one, b=two), digest(b=one, a=two), digest(a=two, b=one), digest(a=other, b=two)]
-    assert len(set(digests)) == 4
-    assert digest(a=views(0, (3, 4)), b=two) == digests[0]
 
 
 def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:
