@@ -151,6 +151,7 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
 
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#notice-text")).to_contain_text("taken back")
+    expect(page.locator("#notice-text")).to_be_focused()
     expect(page.get_by_role("button", name="Undo")).to_be_hidden()
     expect(invitations).to_have_count(3)
     expect(page.locator("#classes li")).to_have_count(2)
