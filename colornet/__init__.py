@@ -18,6 +18,8 @@ from colornet.network import ColorNetwork
 
 __all__ = ["ColorNetwork", "build", "grid_index", "load", "load_default", "save"]
 
+load, save = ColorNetwork.load, ColorNetwork.save
+
 
 def build() -> ColorNetwork:
     """Build the colour network from scratch, with kmapper; the packaged network is the result of this function."""
@@ -31,22 +33,3 @@ def build() -> ColorNetwork:
 def load_default() -> ColorNetwork:
     """Return the packaged colour network."""
     return load(Path(__file__).with_name("data") / "network.npz")
-
-
-def load(path: str | Path) -> ColorNetwork:
-    """Load a colour network that was written by `save`.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is damaged or is not a colour network; the message names the file.
-    """
-    return ColorNetwork.load(path)
-
-
-def save(network: ColorNetwork, path: str | Path) -> None:
-    """Write a colour network to a file (npz), atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    network.save(path)

@@ -326,16 +326,17 @@ def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, s
     for label, pixels in frame.instance_pixels.items():
         labels.flat[pixels] = other[label]
     clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=labels))}
-    for cloud in instance_clouds(frame):
-        same = clouds.pop(other[cloud.label])
-        for name in ("kept_by_fallback", "reason", "points", "colors"):
-            np.testing.assert_array_equal(getattr(same, name), getattr(cloud, name), err_msg=name)
+    expected = list(instance_clouds(frame))
+    _assert_equal_clouds([clouds.pop(other[cloud.label]) for cloud in expected], expected)
     assert not clouds
 
 
 def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) -> None:
     """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
-    other = dataclasses.replace(frame, depth=frame.depth_m)
-    for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
-        for name in ("reason", "points", "colors"):
+    _assert_equal_clouds(instance_clouds(dataclasses.replace(frame, depth=frame.depth_m)), instance_clouds(frame))
+
+
+def _assert_equal_clouds(actual: Sequence[PreparedInstance], expected: Sequence[PreparedInstance]) -> None:
+    for first, second in zip(actual, expected, strict=True):
+        for name in ("kept_by_fallback", "reason", "points", "colors"):
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
