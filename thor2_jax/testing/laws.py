@@ -306,16 +306,12 @@ def assert_mirrored_strips(
     mirrored = strips(with_points(aligned, flipped))
     if axis == "y":
         low, high = (np.where(plain.occupied, size - np.asarray(a, np.float64), 0) for a in (plain.high, plain.low))
-        expected = plain
+        expected, rounding = dataclasses.replace(plain, low=low, high=high), 2 * UNIT * size
     else:
-        reversed_axis = 2 if axis == "x" else 1
+        reversed_axis, rounding = 2 if axis == "x" else 1, 0.0
         expected = jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain)
-        low, high = (np.asarray(a) for a in (expected.low, expected.high))
-    for name in ("occupied", "color", "overflow"):
-        np.testing.assert_array_equal(getattr(mirrored, name), getattr(expected, name), err_msg=name)
-    atol = 2 * UNIT * size if axis == "y" else 0
-    np.testing.assert_allclose(mirrored.low, low, rtol=0, atol=atol)
-    np.testing.assert_allclose(mirrored.high, high, rtol=0, atol=atol)
+    for name, atol in {"occupied": 0.0, "color": 0.0, "overflow": 0.0, "low": rounding, "high": rounding}.items():
+        np.testing.assert_allclose(*(getattr(s, name) for s in (mirrored, expected)), rtol=0, atol=atol, err_msg=name)
 
 
 def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
