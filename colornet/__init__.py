@@ -18,8 +18,6 @@ from colornet.network import ColorNetwork
 
 __all__ = ["ColorNetwork", "build", "grid_index", "load", "load_default", "save"]
 
-load, save = ColorNetwork.load, ColorNetwork.save
-
 
 def build() -> ColorNetwork:
     """Build the colour network from scratch, with kmapper; the packaged network is the result of this function."""
@@ -33,3 +31,22 @@ def build() -> ColorNetwork:
 def load_default() -> ColorNetwork:
     """Return the packaged colour network."""
     return load(Path(__file__).with_name("data") / "network.npz")
+
+
+def load(path: str | Path) -> ColorNetwork:
+    """Load a colour network that was written by `save`.
+
+    Raises:
+        OSError: the file cannot be read, or the path has a null character.
+        ValueError: the file is damaged or is not a colour network; the message names the file.
+    """
+    return ColorNetwork.load(path)
+
+
+def save(network: ColorNetwork, path: str | Path) -> None:
+    """Write a colour network to a file (npz), atomically.
+
+    Raises:
+        OSError: the file cannot be written, or the path has a null character.
+    """
+    network.save(path)
