@@ -24,10 +24,6 @@ def pack(*clouds: np.ndarray, **options: object) -> thor2.PointClouds:
     return thor2.PointClouds.pack([(points, np.full(points.shape, 0.5)) for points in clouds], **options)
 
 
-def normalized(points: np.ndarray) -> np.ndarray:
-    return np.asarray(thor2.view_normalize(pack(points), CONFIG).points[0, : len(points)], np.float64)
-
-
 def shapes() -> list[np.ndarray]:
     """Return randomly rotated clouds like those of objects, half a metre away: flat, long, round and partial."""
     rng = np.random.default_rng(0)
@@ -80,7 +76,7 @@ AMBIGUOUS = {
 @pytest.mark.parametrize("name", AMBIGUOUS)
 def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
     points = AMBIGUOUS[name]
-    after = normalized(points)
+    after = np.asarray(thor2.view_normalize(pack(points), CONFIG).points[0, : len(points)], np.float64)
     between = np.linalg.norm(points[:, None] - points, axis=-1) * 2.5
     np.testing.assert_allclose(np.linalg.norm(after[:, None] - after, axis=-1), between, atol=3e-6)
     assert (np.diff(after.max(axis=0)) <= 2e-6).all()

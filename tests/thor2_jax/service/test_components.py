@@ -7,7 +7,7 @@ import queue
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock, Mock
@@ -59,14 +59,9 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
 FAR = time.monotonic() + HANG
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[PreparationPool]:
+def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     pool = PreparationPool(1)
-    yield pool
-    pool.close()
-
-
-def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    request.addfinalizer(pool.close)
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
         replaced = pool.submit(FAR, os.getpid).result(HANG)
