@@ -306,12 +306,13 @@ def assert_mirrored_strips(
     mirrored = strips(with_points(aligned, flipped))
     if axis == "y":
         low, high = (np.where(plain.occupied, size - np.asarray(a, np.float64), 0) for a in (plain.high, plain.low))
-        expected, rounding = dataclasses.replace(plain, low=low, high=high), 2 * UNIT * size
+        expected, rounding = vars(plain) | {"low": low, "high": high}, 2 * UNIT * size
     else:
         reversed_axis, rounding = 2 if axis == "x" else 1, 0.0
-        expected = jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain)
-    for name, atol in {"occupied": 0.0, "color": 0.0, "overflow": 0.0, "low": rounding, "high": rounding}.items():
-        np.testing.assert_allclose(*(getattr(s, name) for s in (mirrored, expected)), rtol=0, atol=atol, err_msg=name)
+        expected = vars(jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain))
+    for name, values in expected.items():
+        atol = rounding if name in ("low", "high") else 0
+        np.testing.assert_allclose(getattr(mirrored, name), values, rtol=0, atol=atol, err_msg=name)
 
 
 def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:

@@ -45,7 +45,7 @@ SOME = pack(SHAPES[0], np.zeros((0, 3)), *SHAPES[1:3])
 """Four clouds, one of which is empty."""
 
 
-def test_clouds_are_rotated_and_shifted_with_the_camera_into_small_boxes() -> None:
+def test_clouds_move_rigidly_with_the_camera_into_small_boxes() -> None:
     """Volumes are compared with those of an exhaustive search."""
     ratios = []
     for seed, points in enumerate(SHAPES):
