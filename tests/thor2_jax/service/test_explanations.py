@@ -158,6 +158,18 @@ def test_why_is_503_until_explanations_are_compiled(
     assert compiled == service.engine.explanation_programs() and "are compiled" not in caplog.text
 
 
+def test_compiled_explanations_are_logged_unless_the_service_stops(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    monkeypatch.setattr(pipeline, "compile_explanations", Mock())
+    for state, size in (("ready", 4096), ("stopping", 2048)):
+        monkeypatch.setattr(service, "state", state)
+        monkeypatch.setattr(service, "_compiled", {})
+        service._compile_explanations((size, True)).result(HANG)
+        assert (f"clouds of {size} points are compiled" in caplog.text) == (state == "ready")
+
+
 @pytest.mark.slow
 def test_why_returns_pictures(
     service: Service, teaching_url: str, files: Files, monkeypatch: pytest.MonkeyPatch
