@@ -37,7 +37,7 @@ def load(path: str | Path) -> ColorNetwork:
     """Load a colour network that was written by `save`.
 
     Raises:
-        OSError: the file cannot be read.
+        OSError: the file cannot be read, or the path has a null character.
         ValueError: the file is damaged or is not a colour network; the message names the file.
     """
     return ColorNetwork.load(path)
@@ -47,6 +47,6 @@ def save(network: ColorNetwork, path: str | Path) -> None:
     """Write a colour network to a file (npz), atomically.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or the path has a null character.
     """
     network.save(path)

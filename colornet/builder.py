@@ -1,12 +1,12 @@
 """Construction of the colour network: Mapper, regions, edges and similarity (paper, section "Color network").
 
-Mapper consists of a lens, a cover, clusters and their nerve. kmapper covers the lens and connects the clusters, which
-DBSCAN finds with the HyAB distance. scikit-learn would evaluate a Python metric pair by pair (hours) or store a dense
-matrix (5 GB). Neighbourhoods are therefore computed exactly and sparsely: HyAB is never smaller than the Euclidean
-distance, so that the Euclidean ball of a k-d tree contains every HyAB neighbour.
+Mapper consists of a lens, a cover, clusters and their nerve. kmapper covers the lens, DBSCAN finds the clusters with
+the HyAB distance, and the nerve connects clusters that share a colour. scikit-learn would evaluate a Python metric pair
+by pair (hours) or store a dense matrix (5 GB). Neighbourhoods are therefore computed exactly and sparsely: HyAB is
+never smaller than the Euclidean distance, so that the Euclidean ball of a k-d tree contains every HyAB neighbour.
 """
 
-from typing import Any
+import itertools
 
 import kmapper
 import numpy as np
@@ -63,66 +63,51 @@ def hyab_neighbors(lab: NDArray[np.float64], radius: float) -> csr_array:
     return csr_array(upper + upper.T)
 
 
-class HyabDBSCAN:
-    """DBSCAN of CIELAB colours with the HyAB distance; it has the methods of an estimator that kmapper calls."""
-
-    def get_params(self) -> dict[str, Any]:
-        """Return the parameters; kmapper skips cubes with fewer than `min_samples` colours."""
-        return {"eps": EPS, "min_samples": MIN_SAMPLES}
-
-    def fit_predict(self, lab: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cluster of each colour, [n, 3] CIELAB to [n] int64; -1 for noise."""
-        graph = hyab_neighbors(lab, EPS)
-        # Colours are distinct, so no other stored distance is 0; an explicit diagonal completes the graph.
-        graph.setdiag(0.0)
-        graph = sort_graph_by_row_values(graph, warn_when_not_sorted=False)
-        clusterer = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed")
-        return np.asarray(clusterer.fit_predict(graph), np.int64)
+def hyab_clusters(lab: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the DBSCAN cluster of each colour by the HyAB distance, [n, 3] CIELAB to [n] int64; -1 for noise."""
+    graph = hyab_neighbors(lab, EPS)
+    # Colours are distinct, so no other stored distance is 0; an explicit diagonal completes the graph.
+    graph.setdiag(0.0)
+    graph = sort_graph_by_row_values(graph, warn_when_not_sorted=False)
+    clusterer = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed")
+    return np.asarray(clusterer.fit_predict(graph), np.int64)
 
 
-def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDArray[np.int64], NDArray[np.int64]]:
-    """Run Mapper on CIELAB colours, and connect the nodes across the cut of the hue circle.
+def _map_colors(lab: NDArray[np.float64]) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    """Return the nodes of Mapper on CIELAB colours, and those to connect across the cut of the hue circle.
 
     Args:
         lab: [n, 3] float64, the colours of the grid in CIELAB.
 
     Returns:
-        For each node, in kmapper's order, the sorted grid indices of its colours, int64 [n]; the nerve [e, 2] int64,
-        pairs of nodes that share a colour; and pairs of nodes [c, 2] int64 that are neighbours across the cut.
+        For each node, in the order of the cubes and of their clusters, the sorted grid indices of its colours, int64
+        [n]; and the pairs of nodes [c, 2] int64 in the first and in the last hue interval of one chroma interval.
     """
-    values = lens(lab)
+    rows = np.column_stack([np.arange(len(lab)), lens(lab)])  # kmapper expects an index in the first column
     cover = kmapper.Cover(n_cubes=list(_N_CUBES), perc_overlap=list(_OVERLAP))
-    graph = kmapper.KeplerMapper(verbose=0).map(values, lab, clusterer=HyabDBSCAN(), cover=cover)
-    names = list(graph["nodes"])
-    members = [np.sort(np.asarray(graph["nodes"][name], np.int64)) for name in names]
-    nerve = [(names.index(i), names.index(j)) for i, others in graph["links"].items() for j in others]
-    return members, np.array(nerve, np.int64), np.array(_cyclic_pairs(names, cover, values), np.int64)
-
-
-def _cyclic_pairs(names: list[str], cover: Any, values: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return all pairs of nodes in the first and in the last hue interval of the same chroma interval."""
-    # Names of nodes (cube3_cluster0) number non-empty cubes only; the position of a cube among all centres gives its
-    # intervals.
-    rows = np.column_stack([np.arange(len(values)), values])
-    occupied = [k for k, center in enumerate(cover.centers_) if len(cover.transform_single(rows, center))]
-    cubes = [int(name.removeprefix("cube").split("_")[0]) for name in names]
-    intervals = [divmod(occupied[cube], _N_CUBES[1]) for cube in cubes]
-    return [
-        (i, j)
-        for i, (chroma_i, hue_i) in enumerate(intervals)
-        for j, (chroma_j, hue_j) in enumerate(intervals)
-        if chroma_i == chroma_j and hue_i == 0 and hue_j == _N_CUBES[1] - 1
-    ]
+    members: list[NDArray[np.int64]] = []
+    intervals: list[tuple[int, int]] = []  # chroma and hue interval of each node
+    for cube, center in enumerate(cover.fit(rows)):
+        inside = cover.transform_single(rows, center)[:, 0].astype(np.int64)
+        if len(inside) >= MIN_SAMPLES:
+            cluster_of = hyab_clusters(lab[inside])
+            clusters = [inside[cluster_of == k] for k in range(cluster_of.max() + 1)]
+            members += clusters
+            intervals += [divmod(cube, _N_CUBES[1])] * len(clusters)
+    pairs = itertools.combinations(range(len(members)), 2)
+    across = [(i, j) for i, j in pairs if intervals[i][1] == 0 and intervals[j] == (intervals[i][0], _N_CUBES[1] - 1)]
+    return members, np.array(across, np.int64)
 
 
 def build_network() -> ColorNetwork:
     """Build the colour network from the colour grid; the result is the same on every call."""
     colors = grid_colors()
-    nodes, *pairs = _map_colors(to_lab(colors, GRID_WHITE))
+    nodes, across = _map_colors(to_lab(colors, GRID_WHITE))
     members, region = merge_redundant(colors, nodes, EPS)
 
-    nerve, cyclic = (relabel(edges, region) for edges in pairs)
-    edges = np.unique(np.concatenate([nerve, cyclic]), axis=0)
+    pairs = itertools.combinations(range(len(members)), 2)
+    nerve = np.array([(i, j) for i, j in pairs if np.intersect1d(members[i], members[j]).size])
+    edges = np.unique(np.concatenate([nerve, np.sort(region[across], axis=1)]), axis=0)
     in_nerve = (edges[:, None] == nerve).all(axis=-1).any(axis=1)
 
     means = np.array([colors[rows].mean(axis=0) for rows in members])
@@ -171,17 +156,6 @@ def merge_redundant(
     _, first = np.unique(component, return_index=True)
     region = np.argsort(np.argsort(first))[component].astype(np.int64)
     return [np.flatnonzero(has[region == k].any(axis=0)) for k in range(n_regions)], region
-
-
-def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert edges between nodes to edges between regions: distinct sorted pairs i < j.
-
-    Args:
-        edges: [e, 2] int64, pairs of nodes.
-        region: [nodes] int64, the region of each node.
-    """
-    moved = np.sort(region[edges], axis=1)
-    return np.unique(moved[moved[:, 0] != moved[:, 1]], axis=0)
 
 
 def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.float64]) -> NDArray[np.float64]:

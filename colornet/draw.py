@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
 from numpy.typing import NDArray
 
@@ -41,14 +40,7 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     disc: dict[str, Any] = {"linestyle": "", "marker": "o", "markerfacecolor": "white", "markeredgecolor": _TEXT_COLOR}
     counts = (100, 5_000, 20_000)
     sizes = [Line2D([], [], markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **disc) for count in counts]
-    figure.legend(
-        handles=sizes,
-        title="grid colours",
-        labelspacing=1.6,
-        handletextpad=1.2,
-        **_LEGEND_STYLE,
-        bbox_to_anchor=(0.815, 0.93),
-    )
+    figure.legend(handles=sizes, title="grid colours", labelspacing=1.6, **_LEGEND_STYLE, bbox_to_anchor=(0.815, 0.93))
     lines = [Line2D([], [], color=_EDGE_COLOR, linewidth=_width(w), label=str(w)) for w in (25, 50, 100)]
     lines.append(Line2D([], [], color=_EDGE_COLOR, linewidth=_width(50), linestyle="--", label="across the\nhue seam"))
     figure.legend(handles=lines, title="edge: HyAB", labelspacing=1.0, **_LEGEND_STYLE, bbox_to_anchor=(0.815, 0.66))
@@ -99,17 +91,13 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     off_diagonal = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
     axes.set_facecolor("#e4e4e4")
     image = axes.imshow(off_diagonal, cmap="viridis", norm=LogNorm())
-    axes.set(title=f"Similarity of the {n} colour regions (diagonal, grey: 1)", xticks=[], yticks=[])
-    along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
-    label: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold"}
-    for r, rgb in enumerate(network.mean_rgb):
-        patch: dict[str, Any] = {"facecolor": rgb / 255, "edgecolor": "white", "linewidth": 1, "clip_on": False}
-        axes.add_patch(Rectangle((r - 0.5, -0.055), 1, 0.05, transform=along, **patch))
-        axes.text(r, -0.03, str(r), transform=along, color=_contrasting(rgb), **label)
-        axes.add_patch(Rectangle((-0.055, r - 0.5), 0.05, 1, transform=down, **patch))
-        axes.text(-0.03, r, str(r), transform=down, color=_contrasting(rgb), **label)
-    axes.set_xlabel("region (swatch: mean colour)", labelpad=36)
-    axes.set_ylabel("region (swatch: mean colour)", labelpad=36)
+    axes.set_title(f"Similarity of the {n} colour regions (diagonal, grey: 1)")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_ticks(range(n))
+        axis.set_label_text("region, in its mean colour")
+        axis.labelpad = 9
+        for label, rgb in zip(axis.get_ticklabels(), network.mean_rgb, strict=True):
+            label.set(color=_contrasting(rgb), backgroundcolor=rgb / 255, fontweight="bold", fontsize=9)
     ticks = LogLocator(subs=(1, 2, 5))
     beside = figure.add_axes((0.88, 0.09, 0.03, 0.84))
     bar = figure.colorbar(image, cax=beside, ticks=ticks, format=FuncFormatter(lambda value, _: f"{value:g}"))

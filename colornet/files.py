@@ -48,8 +48,14 @@ def errors_name(path: str | Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
+def _check_path(path: str | Path) -> None:
+    if "\0" in str(path):  # Python would raise a ValueError that does not name the path
+        raise OSError(errno.EINVAL, "a path with a null character", str(path))
+
+
 def open_file(path: str | Path) -> BinaryIO:
     """Open a file to read; raise OSError for a device, pipe or socket, too, since reading it may never end."""
+    _check_path(path)
     stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
@@ -65,6 +71,7 @@ def read_file(path: str | Path) -> bytes:
 
 def check_replaceable(path: Path) -> None:
     """Raise OSError if something other than a file has this name, since replacing a device would remove it."""
+    _check_path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():

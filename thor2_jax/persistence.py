@@ -31,11 +31,8 @@ from thor2_jax.types import Diagrams, check_types, is_positive_integer, matmul
 
 __all__ = ["Diagrams", "images", "sublevel_diagrams"]
 
-_Ranges = tuple[jax.Array, jax.Array, jax.Array]
-"""Lowest vertex, highest edge and its index in the range that follows each vertex, each [N]."""
-
-_Walk = tuple[jax.Array, jax.Array, jax.Array]
-"""State of the walk from each vertex: the vertex reached, the highest edge on the way and its index, each [N]."""
+_Tables = tuple[jax.Array, jax.Array]
+"""Lowest vertex, and index of the highest edge, in the range that follows each vertex, each [N]."""
 
 
 def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Diagrams:
@@ -126,41 +123,33 @@ def _edges_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> tup
 
     The height is infinite if no vertex there is lower (or equal, with `or_equal`).
     """
-    vertices = jnp.arange(len(heights), dtype=jnp.int32)
-    # A sentinel after the last vertex is lower than all others; the edge to it is infinitely high.
+    n, vertices = len(heights), jnp.arange(len(heights), dtype=jnp.int32)
+    # A sentinel after the last vertex is lower than all others; edge n - 1, to it, is infinitely high. Edge n is none.
+    edge_heights = jnp.append(edges, jnp.array([jnp.inf, -jnp.inf], edges.dtype))
     low = jnp.append(heights[1:], -jnp.inf)  # lowest of the vertices i + 1 .. i + 2^k, for k = 0
-    high, at = jnp.append(edges, jnp.inf), vertices  # highest of the edges i .. i + 2^k - 1, and its index
 
-    def double(ranges: _Ranges, width: jax.Array) -> tuple[_Ranges, _Ranges]:
-        low, high, at = ranges
-        second = vertices + width
-        inside, second = second < len(heights), jnp.minimum(second, len(heights) - 1)
-        second_high = jnp.where(inside, high[second], jnp.inf)
-        doubled = (
-            jnp.minimum(low, jnp.where(inside, low[second], -jnp.inf)),
-            jnp.maximum(high, second_high),
-            jnp.where(second_high > high, at[second], at),
-        )
-        return doubled, ranges
+    def higher(first: jax.Array, second: jax.Array) -> jax.Array:
+        return jnp.where(edge_heights[second] > edge_heights[first], second, first)
 
-    def walk(state: _Walk, ranges: tuple[_Ranges, jax.Array]) -> tuple[_Walk, None]:
-        (low, high, at), width = ranges
-        position = state[0]
+    def double(tables: _Tables, width: jax.Array) -> tuple[_Tables, _Tables]:
+        low, highest = tables  # highest of the edges i .. i + 2^k - 1
+        inside, second = vertices + width < n, jnp.minimum(vertices + width, n - 1)
+        lowest = jnp.minimum(low, jnp.where(inside, low[second], -jnp.inf))
+        return (lowest, higher(highest, jnp.where(inside, highest[second], n - 1))), tables
+
+    def walk(reached: _Tables, tables: tuple[_Tables, jax.Array]) -> tuple[_Tables, None]:
+        """Step over a range of each vertex that has no lower vertex; note the highest edge on the way."""
+        (low, highest), width = tables
+        position, index = reached
         passed = (low[position] > heights) if or_equal else (low[position] >= heights)
-        return (jnp.where(passed, position + width, position), *_higher(state, high, at, passed)), None
+        index = jnp.where(passed, higher(index, highest[position]), index)
+        return (jnp.where(passed, position + width, position), index), None
 
-    widths = jnp.array([2**k for k in range((len(heights) - 1).bit_length())], jnp.int32)
-    _, tables = jax.lax.scan(double, (low, high, at), widths)
-    start = vertices, jnp.full_like(heights, -jnp.inf), vertices
-    state, _ = jax.lax.scan(walk, start, (tables, widths), reverse=True)
-    return _higher(state, high, at, jnp.ones_like(vertices, bool))
-
-
-def _higher(state: _Walk, high: jax.Array, at: jax.Array, passed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return height and index of the highest edge on each walk, including the next range where `passed` is True."""
-    position, highest, index = state
-    higher = passed & (high[position] > highest)
-    return jnp.where(higher, high[position], highest), jnp.where(higher, at[position], index)
+    widths = jnp.array([2**k for k in range((n - 1).bit_length())], jnp.int32)
+    _, tables = jax.lax.scan(double, (low, vertices), widths)
+    (position, index), _ = jax.lax.scan(walk, (vertices, jnp.full_like(vertices, n)), (tables, widths), reverse=True)
+    index = higher(index, position)  # the edge from the last vertex that is not lower
+    return edge_heights[index], index
 
 
 def images(

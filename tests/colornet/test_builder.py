@@ -1,16 +1,49 @@
-"""Merging nodes, relabelling edges, and the similarity matrix, on small cases and against Floyd and Warshall."""
+"""The packaged network: a build from scratch, its parts on small cases, and its values from the colours alone."""
+
+import dataclasses
+from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+from processes import finish_programs, start_program
 from scipy.sparse.csgraph import floyd_warshall
+from scipy.spatial.distance import cdist
+from sklearn.cluster import DBSCAN
 
 import colornet
-from colornet.builder import merge_redundant, relabel, similarity
-from colornet.colors import MEAN_WHITE, grid_colors, hyab, to_lab
+from colornet.builder import EPS, MIN_SAMPLES, hyab_clusters, hyab_neighbors, merge_redundant, similarity
+from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, hyab, to_lab
 
-from .test_colors import reference_hyab, reference_lab
+from .test_colors import NETWORK, reference_lab
 
-NETWORK = colornet.load_default()
+BUILD = """
+import re, sys, warnings
+warnings.simplefilter("error")
+from pathlib import Path
+import colornet
+colornet.build().save(sys.argv[1])
+# The peak of getrusage is at least that of the parent process.
+print(re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1])
+"""
+
+
+@pytest.mark.slow
+def test_packaged_network_is_built_in_little_memory(tmp_path: Path) -> None:
+    (peak,) = finish_programs(start_program(BUILD, tmp_path / "network.npz"))
+    assert int(peak) < 3 * 2**20
+    rebuilt = colornet.load(tmp_path / "network.npz")
+    for field in dataclasses.fields(NETWORK):
+        built, packaged = getattr(rebuilt, field.name), getattr(NETWORK, field.name)
+        if np.asarray(packaged).dtype == np.float64:  # another processor may round a cube root differently
+            np.testing.assert_allclose(built, packaged, rtol=1e-12, err_msg=field.name)
+        else:
+            np.testing.assert_array_equal(built, packaged, err_msg=field.name)
+    assert rebuilt.fingerprint == NETWORK.fingerprint
+
+
+def reference_hyab(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float(abs(one[0] - other[0]) + ((one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2) ** 0.5)
 
 
 def path_lengths(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -20,17 +53,46 @@ def path_lengths(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64])
     return floyd_warshall(graph, directed=False)
 
 
-def test_similarity_of_the_packaged_network() -> None:
-    """Recompute means, their CIELAB, edge weights, paths and similarity from the colours."""
-    colors = grid_colors().astype(np.float64)
+def test_values_follow_from_the_regions_of_the_colours() -> None:
+    """Recompute counts, edges, means, their CIELAB, edge weights, paths and similarity.
+
+    Regions that share colours are joined, and two pairs at the cut of the hue circle.
+    """
+    assert (NETWORK.n_raw_nodes, NETWORK.n_regions, len(NETWORK.edges)) == (23, 22, 55)
+    assert NETWORK.edges[NETWORK.cyclic].tolist() == [[0, 7], [8, 15]]
     member = (NETWORK.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
-    means = (member.T @ colors) / member.sum(axis=0)[:, None]
+    np.testing.assert_array_equal(NETWORK.edges[~NETWORK.cyclic], np.argwhere(np.triu(member.T @ member, 1)))
+    means = (member.T @ grid_colors()) / member.sum(axis=0)[:, None]
     np.testing.assert_allclose(NETWORK.mean_rgb, means, rtol=1e-13)
     lab = reference_lab(means, MEAN_WHITE)
     weights = np.array([reference_hyab(lab[i], lab[j]) for i, j in NETWORK.edges])
     np.testing.assert_allclose(NETWORK.edge_weights, weights, rtol=1e-11)
     expected = 1 / (1 + path_lengths(22, NETWORK.edges, weights))
     np.testing.assert_allclose(NETWORK.similarity, expected, rtol=1e-11)
+
+
+def test_neighbourhoods_and_clusters_are_those_of_a_dense_matrix() -> None:
+    """Of two blocks of similar colours and some random ones, and of colours on the border of the ball.
+
+    For differences in lightness only, HyAB, the Euclidean distance and the radius are equal.
+    """
+    colors = grid_colors()
+    rows = np.random.default_rng(0).choice(len(colors), 200, replace=False)
+    for center in ([180, 90, 60], [40, 60, 200]):
+        near = np.flatnonzero((np.abs(colors.astype(int) - center) <= 15).all(axis=1))[:200]
+        rows = np.union1d(rows, near)
+    some, border = to_lab(colors[rows], GRID_WHITE), np.array([[level, 3.0, 4.0] for level in (10, 17, 17.1, 24.1)])
+    for lab, least in ((some, 1000), (border, 6)):
+        distances = cdist(lab, lab, reference_hyab)
+        near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
+        neighbors = hyab_neighbors(lab, EPS).toarray()
+        assert near.sum() >= least
+        np.testing.assert_array_equal(neighbors > 0, near)
+        np.testing.assert_allclose(neighbors[near], distances[near], atol=1e-12)
+        dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(distances)
+        labels = hyab_clusters(lab)
+        assert labels.min() == -1 and (labels.max() >= 1) == (lab is some)
+        np.testing.assert_array_equal(labels, dense)
 
 
 def test_similarity_of_random_graphs() -> None:
@@ -69,9 +131,3 @@ def test_nodes_with_mean_colors_at_the_limit_merge() -> None:
     limit = float(hyab(*to_lab(np.array([[100.0] * 3, [110.0] * 3]), MEAN_WHITE)))
     for eps, regions in ((limit, [0, 0]), (np.nextafter(limit, 0), [0, 1])):
         assert merge_redundant(colors, members, eps)[1].tolist() == regions
-
-
-def test_relabel() -> None:
-    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
-    assert relabel(edges, np.array([0, 1, 0, 2])).tolist() == [[0, 1], [0, 2]]
-    assert relabel(np.zeros((0, 2), np.int64), np.array([0, 1])).shape == (0, 2)

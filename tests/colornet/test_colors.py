@@ -1,13 +1,16 @@
-"""CIELAB, HyAB and HyAB neighbourhoods against reference formulas and brute force."""
+"""CIELAB against reference formulas, and the region weights of 8-bit colours."""
 
+import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
+from hypothesis import given
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
-from sklearn.cluster import DBSCAN
 
-from colornet.builder import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
+import colornet
 from colornet.colors import GRID_WHITE, MEAN_WHITE, grid_colors, to_lab
+
+NETWORK = colornet.load_default()
+COLORS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5).map(lambda s: (*s, 3)))
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
@@ -21,52 +24,40 @@ def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArr
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
-def reference_hyab(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    return float(abs(one[0] - other[0]) + ((one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2) ** 0.5)
-
-
-@pytest.fixture(scope="module")
-def lab() -> NDArray[np.float64]:
-    """Two blocks of similar colours and some random ones, in CIELAB."""
-    colors = grid_colors()
-    rows = np.random.default_rng(0).choice(len(colors), 200, replace=False)
-    for center in ([180, 90, 60], [40, 60, 200]):
-        near = np.flatnonzero((np.abs(colors.astype(int) - center) <= 15).all(axis=1))[:200]
-        rows = np.union1d(rows, near)
-    return to_lab(colors[rows], GRID_WHITE)
-
-
 @pytest.mark.parametrize("white", [GRID_WHITE, MEAN_WHITE])
 def test_lab(white: tuple[float, float]) -> None:
     for colors in (grid_colors(), np.array([12.25, 200.5, 99.125]), np.zeros((0, 3))):
         np.testing.assert_allclose(to_lab(colors, white), reference_lab(colors, white), atol=1e-9)
 
 
-def test_neighborhoods_equal_those_of_brute_force(lab: NDArray[np.float64]) -> None:
-    distances = cdist(lab, lab, reference_hyab)
-    near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
-    neighbors = hyab_neighbors(lab, EPS).toarray()
-    assert near.sum() > 1000
-    np.testing.assert_array_equal(neighbors > 0, near)
-    np.testing.assert_allclose(neighbors[near], distances[near], atol=1e-12)
+def reference_weights(color: list[int]) -> list[float]:
+    r, g, b = (int(round(channel / 5)) for channel in color)
+    bits = int(NETWORK.region_bits[(r * 52 + g) * 52 + b])
+    regions = [k for k in range(22) if bits >> k & 1]
+    return [1 / len(regions) if k in regions else 0.0 for k in range(22)]
 
 
-def test_neighborhoods_on_the_border_of_the_ball() -> None:
-    """For differences in lightness only, HyAB, the Euclidean distance and the radius are equal."""
-    lab = np.array([[10.0, 3.0, 4.0], [17.0, 3.0, 4.0], [17.1, 3.0, 4.0], [24.1, 3.0, 4.0]])
-    neighbors = hyab_neighbors(lab, 7.0).toarray() > 0
-    expected = np.abs(lab[:, None, 0] - lab[None, :, 0]) <= 7.0
-    np.testing.assert_array_equal(neighbors, expected & ~np.eye(4, dtype=bool))
+@given(COLORS)
+def test_weights(rgb: np.ndarray) -> None:
+    before = rgb.copy()
+    weights = NETWORK.membership(rgb)
+    assert weights.shape == (*rgb.shape[:-1], 22) and weights.dtype == np.float32
+    np.testing.assert_array_equal(rgb, before)
+    expected = [reference_weights(color) for color in rgb.reshape(-1, 3).tolist()]
+    np.testing.assert_allclose(weights.reshape(-1, 22), np.reshape(expected, (-1, 22)), rtol=1e-7)
 
 
-def test_clusters_equal_those_of_a_dense_matrix(lab: NDArray[np.float64]) -> None:
-    dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, reference_hyab))
-    labels = HyabDBSCAN().fit_predict(lab)
-    assert labels.max() >= 1 and labels.min() == -1
-    np.testing.assert_array_equal(labels, dense)
+def test_every_grid_color_has_a_region() -> None:
+    colors = grid_colors()
+    assert colors.dtype == np.uint8
+    np.testing.assert_array_equal(colors, 5 * np.array(list(np.ndindex(52, 52, 52))))
+    np.testing.assert_array_equal(colornet.grid_index(colors), np.arange(52**3))
+    weights = NETWORK.membership(colors)
+    np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-6)
+    np.testing.assert_array_equal((weights > 0).sum(axis=0), NETWORK.member_counts)
 
 
-def test_lens() -> None:
-    values = lens(np.array([[50.0, 3.0, 4.0], [50.0, -1.0, 0.0], [0.0, 0.0, 0.0]]))
-    expected = [[5.0, np.pi / 8 + np.arctan(4 / 3)], [1.0, np.pi / 8 + np.pi], [0.0, np.pi / 8]]
-    np.testing.assert_allclose(values, expected, atol=1e-15)
+def test_invalid_input_is_rejected() -> None:
+    for rgb in (np.zeros((4, 3)), np.zeros((4, 3), bool), np.zeros((4, 4), np.uint8), np.uint8(3), [[1, 2, 3]]):
+        with pytest.raises(ValueError, match=r"^rgb is .*; expected uint8 \[\.\.\., 3\]$"):
+            NETWORK.membership(rgb)

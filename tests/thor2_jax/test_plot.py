@@ -56,18 +56,15 @@ def test_values_replace_the_colors(ax) -> None:
     assert plot.attribution_colors([0.0, 0.0]).norm.vmax > 0 and plot.attribution_colors([]).norm.vmax > 0
 
 
-def test_slices_have_their_borders(ax) -> None:
+def test_slices_have_borders_and_leave_out_points_without_a_place(ax) -> None:
     aligned = thor2.align(thor2.PointClouds.pack([(POINTS, COLORS)]), CONFIG)
     plot.slices(ax, *aligned.unpack()[0], CONFIG, strips=True)
     levels = sorted({float(line.get_ydata()[0]) for line in ax.lines if len(set(line.get_ydata())) == 1})
     top = float(aligned.points[..., 2].max())
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
-
-
-def test_slices_leave_out_points_without_a_place(ax) -> None:
     plot.slices(ax, np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS), COLORS, CONFIG)
-    assert len(ax.texts) == CONFIG.n_slices
+    assert len(ax.texts) == len(levels) - 1 + CONFIG.n_slices
 
 
 def test_diagram_has_every_pair(ax) -> None:

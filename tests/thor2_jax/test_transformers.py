@@ -24,10 +24,6 @@ TRANSFORMERS = (thor2.TopsTransformer, thor2.Tops2Transformer)
 SIZES = (256, 191, 153, 81, 92)
 
 
-def described(clouds: list[Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> thor2.Descriptors:
-    return thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, config)
-
-
 # The other checks of `check_estimator` fit estimators to matrices of numbers [samples, features], which are no clouds;
 # `check_estimator` itself leaves all checks out for estimators whose input is no matrix.
 CHECKS = """
@@ -47,18 +43,21 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
 def test_values_are_those_of_describe(config: thor2.DescriptorConfig | None) -> None:
     """The default is the configuration of the paper."""
     clouds = random_clouds(0, SIZES)
-    expected = described(clouds, config or thor2.DescriptorConfig(homology="closed_form"))
+    chosen = config or thor2.DescriptorConfig(homology="closed_form")
+    expected = thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, chosen)
     for transformer, values in zip(TRANSFORMERS, (expected.tops, expected.tops2), strict=True):
         rows = transformer(config=config).fit_transform(clouds)
         assert isinstance(rows, np.ndarray) and rows.dtype == np.float32
         np.testing.assert_allclose(rows, values, atol=1e-6)
 
 
-def test_more_clouds_than_the_largest_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_clouds_than_the_largest_batch_with_another_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transformers, "BATCH_BUCKETS", (1, 2, 4))
+    network = dataclasses.replace(NETWORK, similarity=np.eye(NETWORK.n_regions))
     one = random_clouds(0, SIZES)
-    rows = make_pipeline(thor2.Tops2Transformer(config=SMALL_CONFIG)).transform(one * 3)  # needs no fit
-    np.testing.assert_allclose(rows, np.tile(described(one).tops2, (3, 1)), atol=1e-6)
+    expected = thor2.describe(thor2.PointClouds.pack(one), network, SMALL_CONFIG).tops2
+    pipeline = make_pipeline(thor2.Tops2Transformer(config=SMALL_CONFIG, network=network))  # needs no fit
+    np.testing.assert_allclose(pipeline.transform(one * 3), np.tile(expected, (3, 1)), atol=1e-6)
 
 
 def test_shape_needs_no_colors() -> None:
@@ -69,14 +68,6 @@ def test_shape_needs_no_colors() -> None:
     np.testing.assert_array_equal(transformer.transform([xyz for xyz, _ in clouds]), expected)
     same_size = np.stack([clouds[0][0]] * 2)
     np.testing.assert_allclose(transformer.transform(same_size), expected[[0, 0]], atol=1e-6)
-
-
-def test_another_network() -> None:
-    network = dataclasses.replace(NETWORK, similarity=np.eye(NETWORK.n_regions))
-    clouds = random_clouds(0, SIZES[:2])
-    expected = thor2.describe(thor2.PointClouds.pack(clouds), network, SMALL_CONFIG).tops2
-    transformer = thor2.Tops2Transformer(config=SMALL_CONFIG, network=network)
-    np.testing.assert_allclose(transformer.transform(clouds), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
@@ -108,35 +99,27 @@ def test_clones_and_pickles_give_equal_values(transformer: Any) -> None:
 
 
 XYZ, RGB = np.zeros((3, 3)), np.zeros((3, 3), np.uint8)
-INVALID = {
-    "X is a int": 7,
-    "X is a str": "cloud",
-    "X is empty": [],
-    "X[1] is a int": [(XYZ, RGB), 7],
-    "X[1]: xyz[2] is [nan, nan, nan]": [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)],
-    "X[0]: xyz has rows of different lengths": [([[0.0, 1.0, 2.0], [0.0]], RGB)],
-    "X[0]: rgb is [2, 3]": [(XYZ, RGB[:2])],
-    "X[1] has 8193 points": [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))],
-}
+INVALID: list[tuple[str, Any, dict[str, Any]]] = [
+    ("X is a int", 7, {}),
+    ("X is a str", "cloud", {}),
+    ("X is empty", [], {}),
+    ("X[1] is a int", [(XYZ, RGB), 7], {}),
+    ("X[1]: xyz[2] is [nan, nan, nan]", [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)], {}),
+    ("X[0]: xyz has rows of different lengths", [([[0.0, 1.0, 2.0], [0.0]], RGB)], {}),
+    ("X[0]: rgb is [2, 3]", [(XYZ, RGB[:2])], {}),
+    ("X[1] has 8193 points", [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))], {}),
+    ("larger capacity", [(XYZ, RGB)], {"capacity": np.array([2])[0]}),  # as a grid search over an array gives it
+    ("config is 'paper'", [(XYZ, RGB)], {"config": "paper"}),
+    *((f"capacity is {value!r}", [(XYZ, RGB)], {"capacity": value}) for value in (0, 2.5, True)),
+    ("network is 3", [(XYZ, RGB)], {"network": 3}),
+]
 
 
-@pytest.mark.parametrize("message", INVALID)
-def test_bad_input_is_refused(message: str) -> None:
-    for method in ("fit", "transform"):
-        transformer = thor2.Tops2Transformer(config=SMALL_CONFIG)
-        assert_refused(re.escape(message), getattr(transformer, method), INVALID[message])
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("config", "paper"), ("capacity", 0), ("capacity", 2.5), ("capacity", True), ("network", 3)]
-)
-def test_bad_parameters_are_named(name: str, value: object) -> None:
-    assert_refused(f"^{name} is {value!r}", thor2.Tops2Transformer(**{name: value}).fit, [(XYZ, RGB)])
-
-
-def test_clouds_past_the_capacity_are_refused() -> None:
-    capacity = np.array([2])[0]  # as a grid search over an array gives it
-    assert_refused("larger capacity", thor2.Tops2Transformer(capacity=capacity).fit, [(XYZ, RGB)])
+def test_bad_input_is_refused() -> None:
+    for message, clouds, options in INVALID:
+        for method in ("fit", "transform"):
+            transformer = thor2.Tops2Transformer(**{"config": SMALL_CONFIG} | options)
+            assert_refused(re.escape(message), getattr(transformer, method), clouds)
 
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
+from thor2_jax.files import check_writable
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 from thor2_jax.service.hosts import check_host_names, check_token
 
@@ -42,7 +43,7 @@ class Settings:
         warm_why: whether explanations are compiled in the background after the start, or from the first request on.
 
     Raises:
-        InputError: a value is out of range, or the segmenter cannot be loaded.
+        InputError: a value is out of range, the cache cannot be written, or the segmenter cannot be loaded.
     """
 
     model: Path
@@ -64,8 +65,12 @@ class Settings:
         if not 0 < self.deadline <= MAX_DEADLINE:
             raise InputError(f"deadline is {self.deadline}; expected a positive number, at most {MAX_DEADLINE} seconds")
         check_host_names(self.allow_host)
-        if self.cache is not None and self.cache.exists() and not self.cache.is_dir():
-            raise InputError(f"cache is {self.cache}, a file; expected a directory, which may be new")
+        if self.cache is not None:
+            try:
+                check_writable(self.cache)
+            except OSError as error:
+                problem = f"which cannot be written ({error.strerror})"
+                raise InputError(f"cache is {self.cache}, {problem}; expected a directory, which may be new") from None
         if self.segmenter is not None:
             load_segmenter(self.segmenter)  # Its errors are reported here once, not by every process.
         if self.max_batch not in BATCH_BUCKETS:

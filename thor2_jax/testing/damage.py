@@ -5,6 +5,8 @@ def test_reader(content):
     ...
 """
 
+import re
+
 import hypothesis.strategies as st
 import numpy as np
 
@@ -51,26 +53,16 @@ def _extreme(content: bytearray, rng: np.random.Generator) -> bytearray:
 
 def _number(content: bytearray, rng: np.random.Generator) -> bytearray:
     """Replace a number in a text."""
-    digits = np.flatnonzero((np.frombuffer(bytes(content), np.uint8) - 48) < 10)
-    if len(digits) == 0:
-        return _flip(content, rng)
-    start = end = int(rng.choice(digits))
-    while end < len(content) and chr(content[end]) in "0123456789.":
-        end += 1
+    places = [match.span() for match in re.finditer(rb"\d[\d.]*", content)] or [(0, 0)]
+    start, end = places[int(rng.integers(len(places)))]
     return content[:start] + _NUMBERS[int(rng.integers(len(_NUMBERS)))] + content[end:]
 
 
 def _lines(content: bytearray, rng: np.random.Generator) -> bytearray:
-    """Delete, duplicate or exchange lines."""
+    """Delete a line, or replace it by another one or by two copies of another one."""
     lines = content.split(b"\n")
     a, b = rng.integers(len(lines), size=2)
-    choice = int(rng.integers(3))
-    if choice == 0:
-        del lines[a]
-    elif choice == 1:
-        lines.insert(b, lines[a])
-    else:
-        lines[a], lines[b] = lines[b], lines[a]
+    lines[a : a + 1] = [lines[b]] * int(rng.integers(3))
     return bytearray(b"\n").join(lines)
 
 

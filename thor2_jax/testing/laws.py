@@ -306,16 +306,13 @@ def assert_mirrored_strips(
     mirrored = strips(with_points(aligned, flipped))
     if axis == "y":
         low, high = (np.where(plain.occupied, size - np.asarray(a, np.float64), 0) for a in (plain.high, plain.low))
-        expected = plain
+        expected, rounding = vars(plain) | {"low": low, "high": high}, 2 * UNIT * size
     else:
-        reversed_axis = 2 if axis == "x" else 1
-        expected = jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain)
-        low, high = (np.asarray(a) for a in (expected.low, expected.high))
-    for name in ("occupied", "color", "overflow"):
-        np.testing.assert_array_equal(getattr(mirrored, name), getattr(expected, name), err_msg=name)
-    atol = 2 * UNIT * size if axis == "y" else 0
-    np.testing.assert_allclose(mirrored.low, low, rtol=0, atol=atol)
-    np.testing.assert_allclose(mirrored.high, high, rtol=0, atol=atol)
+        reversed_axis, rounding = 2 if axis == "x" else 1, 0.0
+        expected = vars(jax.tree.map(lambda a: np.flip(a, reversed_axis) if a.ndim > 1 else a, plain))
+    for name, values in expected.items():
+        atol = rounding if name in ("low", "high") else 0
+        np.testing.assert_allclose(getattr(mirrored, name), values, rtol=0, atol=atol, err_msg=name)
 
 
 def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
@@ -326,16 +323,17 @@ def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, s
     for label, pixels in frame.instance_pixels.items():
         labels.flat[pixels] = other[label]
     clouds = {c.label: c for c in instance_clouds(dataclasses.replace(frame, labels=labels))}
-    for cloud in instance_clouds(frame):
-        same = clouds.pop(other[cloud.label])
-        for name in ("kept_by_fallback", "reason", "points", "colors"):
-            np.testing.assert_array_equal(getattr(same, name), getattr(cloud, name), err_msg=name)
+    expected = list(instance_clouds(frame))
+    _assert_equal_clouds([clouds.pop(other[cloud.label]) for cloud in expected], expected)
     assert not clouds
 
 
 def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) -> None:
     """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
-    other = dataclasses.replace(frame, depth=frame.depth_m)
-    for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
-        for name in ("reason", "points", "colors"):
+    _assert_equal_clouds(instance_clouds(dataclasses.replace(frame, depth=frame.depth_m)), instance_clouds(frame))
+
+
+def _assert_equal_clouds(actual: Sequence[PreparedInstance], expected: Sequence[PreparedInstance]) -> None:
+    for first, second in zip(actual, expected, strict=True):
+        for name in ("kept_by_fallback", "reason", "points", "colors"):
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)

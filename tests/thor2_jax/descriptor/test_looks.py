@@ -80,21 +80,20 @@ def test_four_looks_are_those_of_changed_clouds() -> None:
             np.testing.assert_allclose(actual[1], tints, atol=1e-6)
 
 
-@pytest.mark.parametrize("n", [0, 1, 3])
-@pytest.mark.parametrize("all_rim", [False, True])
-def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
-    points, colors = wedge((0.2, 0.1, 0.06))
-    tiny = thor2.PointClouds.pack([(points[:n], colors[:n])] * 2, rim=[np.full(n, all_rim)] * 2)
-    described = describe_looks(tiny, NETWORK, CONFIG, 4)
-    aligned = aligned_looks(tiny, CONFIG, 4)
-    assert np.asarray(aligned.mask).sum(axis=1).tolist() == [n, 0 if all_rim else n, n, n] * 2
+def test_tiny_clouds_have_finite_looks() -> None:
+    sizes = (0, 1, 3, 0, 1, 3)
+    rims = [np.full(n, k > 2) for k, n in enumerate(sizes)]
+    tiny = thor2.PointClouds.pack([(LONG[0][:n], LONG[1][:n]) for n in sizes], rim=rims)
+    described, aligned = describe_looks(tiny, NETWORK, CONFIG, 4), aligned_looks(tiny, CONFIG, 4)
+    expected = [[n, 0 if rim.all() else n, n, n] for n, rim in zip(sizes, rims, strict=True)]
+    assert np.asarray(aligned.mask).sum(axis=1).reshape(-1, 4).tolist() == expected
     assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
 
 
-@pytest.mark.parametrize("count", [0, 3, 5])
-def test_other_counts_are_refused(count: int) -> None:
-    assert_refused(f"count is {count}", aligned_looks, PACKED, CONFIG, count)
-    assert_refused(f"count is {count}", describe_looks, PACKED, NETWORK, CONFIG, count)
+def test_other_counts_are_refused() -> None:
+    for count in (0, 3, 5):
+        assert_refused(f"count is {count}", aligned_looks, PACKED, CONFIG, count)
+        assert_refused(f"count is {count}", describe_looks, PACKED, NETWORK, CONFIG, count)
 
 
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])

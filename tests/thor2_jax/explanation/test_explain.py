@@ -168,17 +168,6 @@ def test_a_left_out_slice_is_an_empty_slice() -> None:
     assert left.agreement is None  # all attributions are equal
 
 
-def relaxed(scores: ClassScores, weight: float) -> float:
-    """Return the relaxed margin of name 1 with a weight for all points."""
-    config = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION)
-    aligned = scores.orient(INSTANCE)
-    weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
-    sets = region_sets(NETWORK)
-    cut = jax.vmap(lambda points, colors, mask: relaxed_strips(points.T, colors, mask, sets, config, weights))
-    oriented = scores.describe(aligned, cut(aligned.points, aligned.colors, aligned.mask), config)
-    return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
-
-
 @pytest.mark.slow
 def test_attributions_are_complete(recognizer: Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
@@ -186,7 +175,14 @@ def test_attributions_are_complete(recognizer: Recognizer, monkeypatch: pytest.M
     scores = classifier_scores(recognizer.model)
     gradients = attributions.path_gradients(scores, scores.orient(INSTANCE), 1)
     assert gradients.shape[0] == 32 and not gradients[:, len(INSTANCE.points) :].any()
-    slope = (relaxed(scores, 1.0) - relaxed(scores, 0.5)) / 0.5
+    config, aligned = dataclasses.replace(scores.config, relaxation=attributions.RELAXATION), scores.orient(INSTANCE)
+    sets, ends = region_sets(NETWORK), []
+    for weight in (0.5, 1.0):
+        weights = jnp.full(aligned.mask.shape[1], weight, jnp.float32)
+        cut = jax.vmap(lambda *cloud, w=weights: relaxed_strips(cloud[0].T, *cloud[1:], sets, config, w))
+        oriented = scores.describe(aligned, cut(aligned.points, aligned.colors, aligned.mask), config)
+        ends.append(float(scores.margin(scores.of_descriptors(oriented), 1)[0]))
+    slope = (ends[1] - ends[0]) / 0.5
     assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
 
 
@@ -258,41 +254,34 @@ def test_changed_extents_keep_the_other_sides() -> None:
 
 
 @pytest.mark.slow
-def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer) -> None:
+def test_an_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer) -> None:
+    """Its check removes the most attributed tenth; pixels have the value of their point."""
     (answer,) = [one for one in recognizer.recognize(FRAME) if one.label == 3]
     assert explanation.name == answer.name and explanation.runner_up in set(CLASSES) - {answer.name}
     assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
-    n = len(explanation.instance.points)
-    assert explanation.attributions.values.shape == (n,) and np.isfinite(explanation.attributions.values).all()
-    described = thor2.describe(pack_instances([explanation.instance], 1), NETWORK, SMALL_CONFIG)
+    instance, check, scores = explanation.instance, explanation.attributions, explanation.scores
+    n = len(instance.points)
+    assert check.values.shape == (n,) and np.isfinite(check.values).all()
+    described = thor2.describe(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
     np.testing.assert_allclose(explanation.described.images, described.images[0], atol=1e-5)
     record = explanation.as_json()
     assert len(record["points"]) == len(record["attributions"]) == n
     assert record["margin"] == pytest.approx(logit(answer.confidence), abs=1e-3)
     assert record["nearest"] == [] and {strip["slice"] for strip in record["strips"]} <= {0, 1}
 
-
-@pytest.mark.slow
-def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -> None:
-    check = explanation.attributions
-    kept = np.ones(len(check.values), bool)
-    kept[np.argsort(-check.values, kind="stable")[: attributions.tenth_of(len(check.values))]] = False
-    scores = explanation.scores
-    rest = scores.of_instances([attributions.select_points(explanation.instance, kept)])
+    kept = np.sort(np.argsort(-check.values, kind="stable")[attributions.tenth_of(n) :])
+    rest = scores.of_instances([attributions.select_points(instance, kept)])
     margin = float(scores.margin(jnp.asarray(rest), scores.names.index(explanation.name))[0])
     assert check.margin - margin == pytest.approx(check.most_attributed, abs=1e-3)
 
-
-@pytest.mark.slow
-def test_pixels_have_the_value_of_their_point(explanation: Explanation) -> None:
     painted = pixel_attributions(explanation, FRAME)
     known = np.isfinite(painted)
     assert known.sum() > 0.8 * (FRAME.labels == 3).sum() and not known[FRAME.labels != 3].any()
     row, column = np.argwhere(known)[100]
     depth = FRAME.depth[row, column] / 1000
     point = np.array([(column - 79.5) / 300 * depth, (row - 59.5) / 300 * depth, depth])
-    nearest = np.linalg.norm(explanation.instance.points - point, axis=1).argmin()
-    assert painted[row, column] == explanation.attributions.values[nearest]
+    nearest = np.linalg.norm(instance.points - point, axis=1).argmin()
+    assert painted[row, column] == check.values[nearest]
 
 
 @pytest.mark.slow

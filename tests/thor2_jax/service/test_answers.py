@@ -187,22 +187,20 @@ def test_the_client_sends_colours_and_intrinsics_of_any_type(monkeypatch: pytest
     assert_refused("color is .* ndarray", client.recognize, color=image, depth=b"", intrinsics=b"")
 
 
-@pytest.mark.parametrize(("retry_after", "seconds"), [("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)])
-def test_the_answer_of_a_proxy_is_an_error(retry_after: str, seconds: float | None, monkeypatch: Any) -> None:
-    answer = httpx.Response(503, headers={"Retry-After": retry_after}, text="<html>")
-    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: answer)
-    with pytest.raises(ServiceError) as error:
-        Client("http://robot.local").model()
-    assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
-
-
-@pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"[]", b"PK\3\4"])
-def test_the_answer_of_another_server_is_an_error(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: httpx.Response(200, content=content))
+def test_answers_of_other_servers_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[httpx.Response] = []
+    monkeypatch.setattr(httpx.Client, "request", lambda *_, **__: answers[-1])
     client = Client("http://robot.local")
-    for call in (client.model, client.objects, lambda: client.describe([(np.zeros((1, 3)), np.zeros((1, 3)))])):
-        with pytest.raises(ConnectionError, match="check the URL"):
-            call()
+    for retry_after, seconds in (("7", 7.0), ("Wed, 21 Oct 2026 07:28:00 GMT", None)):  # of a proxy
+        answers.append(httpx.Response(503, headers={"Retry-After": retry_after}, text="<html>"))
+        with pytest.raises(ServiceError) as error:
+            client.model()
+        assert (error.value.status, error.value.field, error.value.retry_after) == (503, None, seconds)
+    for content in (b"", b"<html>", b"{}", b"[]", b"PK\3\4"):
+        answers.append(httpx.Response(200, content=content))
+        for call in (client.model, client.objects, lambda: client.describe([(np.zeros((1, 3)), np.zeros((1, 3)))])):
+            with pytest.raises(ConnectionError, match="check the URL"):
+                call()
 
 
 def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:

@@ -7,7 +7,7 @@ import queue
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock, Mock
@@ -18,16 +18,14 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from processes import HANG
-from prometheus_client import values
 from service_requests import calls, check_refused
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.service import pipeline, preparation, server
+from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
-from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
@@ -61,14 +59,9 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
 FAR = time.monotonic() + HANG
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[PreparationPool]:
+def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     pool = PreparationPool(1)
-    yield pool
-    pool.close()
-
-
-def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    request.addfinalizer(pool.close)
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
         replaced = pool.submit(FAR, os.getpid).result(HANG)
@@ -246,18 +239,3 @@ def test_large_files_stay_in_memory(
     large = files | {"color": bytes(MAX_BODY - 200_000)}
     assert calls(app, frame_request(large))[0].status_code == 200
     assert recognize.await_args is not None and recognize.await_args.args[0] == large
-
-
-def test_metrics_are_those_of_all_living_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The counters of a dead worker are kept."""
-    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
-    monkeypatch.setattr(server.Multiprocess, "keep_subprocess_alive", lambda self: self.processes.clear())
-    for pid in (7, 8):
-        monkeypatch.setattr(values, "ValueClass", values.MultiProcessValue(lambda pid=pid: pid))
-        worker = Metrics()
-        for metric in (worker.ready_workers, worker.in_progress, worker.compilations):
-            metric.inc()
-    assert worker.count_ready_workers() == 2 and b"thor2_requests_waiting 2.0" in worker.text()
-    server._Supervisor.keep_subprocess_alive(Mock(server._Supervisor, processes=[Mock(pid=7)]))
-    assert worker.count_ready_workers() == 1 and b"thor2_requests_waiting 1.0" in worker.text()
-    assert b"thor2_compilations_after_warm_up_total 2.0" in worker.text()

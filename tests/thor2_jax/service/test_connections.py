@@ -3,20 +3,17 @@
 import asyncio
 import contextlib
 import socket
-import struct
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 from processes import HANG
-from starlette.staticfiles import StaticFiles
 
 from thor2_jax.service import server as serving
 
-from .conftest import SAMPLE_INDEX, served
+from .conftest import served
 
 WORK = 0.5
 HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
@@ -35,15 +32,17 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
 
 
 @contextlib.contextmanager
-def serve(app: Any, *sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
-    """Serve an application in a thread; yield its address, and connections that had sent something before it began."""
+def serve(*sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
+    """Serve the application; yield its address, and connections that had sent something before it began."""
     with contextlib.ExitStack() as stack:
         listening = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         address, connections = listening.getsockname(), []
         for content in sent:
             connections.append(stack.enter_context(socket.create_connection(address)))
             connections[-1].sendall(content)
-        stack.enter_context(served(app, listening, loop="asyncio", http=serving.TimedConnection, lifespan="off"))
+        stack.enter_context(
+            served(application, listening, loop="asyncio", http=serving.TimedConnection, lifespan="off")
+        )
         yield address, connections
 
 
@@ -52,7 +51,7 @@ def connection(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
     """A connection to the application without time limits."""
     monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
     monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", HANG)
-    with serve(application) as (address, _), socket.create_connection(address, timeout=HANG) as connected:
+    with serve() as (address, _), socket.create_connection(address, timeout=HANG) as connected:
         yield connected
 
 
@@ -88,7 +87,7 @@ def test_truncated_heads_and_slow_bytes_keep_no_connection_open(monkeypatch: pyt
         **{(SLOW + SLOW + QUICK, b""): 3, (b"", b"\r\n"): 0, (QUICK, b""): 1, (QUICK, b"\r\n"): 1, (UPLOAD, b"x"): 1},
     }
     sent, then = zip(*cases, strict=True)
-    with serve(application, *sent) as (_, connections), ThreadPoolExecutor(len(cases)) as clients:
+    with serve(*sent) as (_, connections), ThreadPoolExecutor(len(cases)) as clients:
         assert dict(zip(cases, clients.map(until_closed, connections, then), strict=True)) == cases
 
 
@@ -114,17 +113,3 @@ def test_many_pipelined_requests(connection: socket.socket, monkeypatch: pytest.
     count = 2 * serving.MAX_HEAD // len(QUICK)
     threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
     assert receive_all(connection).count(b"done") == count
-
-
-def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
-    """Pipelined requests for static files whose client resets the connection while they are answered."""
-    with serve(StaticFiles(directory=SAMPLE_INDEX.parents[1], html=True)) as (address, _):
-        for count in (1, 3, 50) * 4:
-            with socket.create_connection(address) as connection:
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                connection.sendall(HEAD % (b"GET", b"samples/clutter/color.jpg", b"") * count)
-                time.sleep(0.002 * count)
-        with socket.create_connection(address, timeout=HANG) as connection:
-            connection.sendall(HEAD % (b"GET", b"style.css", b"") * 20 + LAST)
-            assert receive_all(connection).count(b"HTTP/1.1 200") == 21
-    assert not [record for record in caplog.records if record.levelname == "ERROR"]

@@ -104,7 +104,7 @@ def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -
 
 
 @pytest.mark.parametrize("is_estimated", [False, *slow(True)])
-def test_the_service_adapts_after_enough_instances(
+def test_the_service_adapts_after_enough_instances_if_told(
     teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
@@ -126,10 +126,7 @@ def test_the_service_adapts_after_enough_instances(
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()
     assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
-
-
-def test_a_service_does_not_adapt_by_default(teaching_run: Path) -> None:
-    engine = InferenceEngine(Settings(teaching_run))
-    engine.compile_adaptation()
-    engine.correct(views(2 * EVERY), observe=True)
-    assert engine.adaptation is None
+    by_default = InferenceEngine(Settings(teaching_run))
+    by_default.compile_adaptation()
+    by_default.correct(views(2 * EVERY), observe=True)
+    assert by_default.adaptation is None

@@ -182,7 +182,7 @@ def test_bad_fields_are_refused_in_one_line(http: httpx.Client, files: Files, ga
     enroll(http, files, "tall")
     before = files_of(gallery)
     for change in BAD_FIELDS:
-        answer = http.post("/v1/objects", files=files, data={"name": "new", "instance": "200", **change})
+        answer = enroll(http, files, **({"name": "new"} | change))
         check_refused(answer, 422, list(change)[-1], change.get("instance", "")[:18])
         assert files_of(gallery) == before and known(http) == {"tall": 1}, change
 

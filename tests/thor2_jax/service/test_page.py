@@ -263,7 +263,7 @@ def test_page_asks_for_the_token(open_page: Open) -> None:
     choose_sample(page)
 
 
-def test_the_page_shows_that_a_ready_service_has_stopped(open_page: Open) -> None:
+def test_states_and_errors_of_a_ready_service_are_shown(open_page: Open) -> None:
     page = open_page()
     expect(page.locator("#ready")).to_have_text("Ready")
     stopping = {"field": None, "message": "The service is stopping."}
@@ -271,10 +271,6 @@ def test_the_page_shows_that_a_ready_service_has_stopped(open_page: Open) -> Non
     expect(page.locator("#ready")).to_have_text("Stopping")
     page.unroute("**/readyz")
     expect(page.locator("#ready")).to_have_text("Ready")
-
-
-def test_error_responses_are_shown(open_page: Open) -> None:
-    page = open_page()
     busy = {"field": None, "message": "Too many wait."}
     for answer, message in (
         ({"status": 429, "headers": {"Retry-After": "1"}, "json": busy}, "Too many wait. Try again in a moment."),

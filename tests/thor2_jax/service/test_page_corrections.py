@@ -37,11 +37,6 @@ def keep_labels(images: list[np.ndarray]) -> Callable[[Route], None]:
     return handle
 
 
-@pytest.fixture
-def labels(scene: thor2.RGBDFrame) -> np.ndarray:
-    return segment_table(scene)
-
-
 def click(page: Page, x: float, y: float) -> None:
     """Click at a position in pixels of the frame."""
     scale = page.evaluate("overlay.clientWidth") / 320
@@ -53,8 +48,8 @@ def count(page: Page, objects: int) -> None:
     expect(page.locator("#objects button")).to_have_count(objects)
 
 
-def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
-    sent: list[np.ndarray] = []
+def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Files, scene: thor2.RGBDFrame) -> None:
+    sent, labels = list[np.ndarray](), segment_table(scene)
     page = open_page(keep_labels(sent), files=unlabelled)
     count(page, 3)
     expect(page.locator("#masks-title")).to_contain_text("table")
@@ -82,8 +77,8 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
     assert_fits(page, 360)
 
 
-def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
-    sent: list[np.ndarray] = []
+def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, scene: thor2.RGBDFrame) -> None:
+    sent, labels = list[np.ndarray](), segment_table(scene)
     page = open_page(keep_labels(sent), size=(1280, 900), files=unlabelled)
     count(page, 3)
     rows, columns = np.nonzero(labels == 1)
@@ -151,6 +146,7 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
 
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#notice-text")).to_contain_text("taken back")
+    expect(page.locator("#notice-text")).to_be_focused()
     expect(page.get_by_role("button", name="Undo")).to_be_hidden()
     expect(invitations).to_have_count(3)
     expect(page.locator("#classes li")).to_have_count(2)

@@ -32,6 +32,7 @@ function showNotice(text, generation = null) {
   byId("notice-text").textContent = text;
   byId("undo").hidden = generation === null;
   byId("undo").dataset.generation = generation;
+  if (generation === null) byId("notice-text").focus(); // The button, which had the focus, is hidden now.
 }
 
 /**
