@@ -151,7 +151,7 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
     """Return the answers for all scenes, with the instances of each scene grouped by their degree of occlusion."""
     frames = (LabelledFrame(f"scene {number}", scene.frame, scene.truth, {}) for number, scene in enumerate(scenes))
     grouped = []
-    for number, (_, answers) in enumerate(answer_frames([run], frames)):
+    for number, answers in enumerate(answer_frames([run], frames)):
         for degree in ("none", "low", "high"):
             instances = [i for i in answers.instances if scenes[number].occlusion(i.label) == degree]
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))

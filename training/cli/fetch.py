@@ -23,7 +23,7 @@ def ycb(
 ) -> None:
     """Download scans of the YCB Object and Model Set (CC BY 4.0), about 10 MB for each object.
 
-    An interrupted download resumes, and existing objects are not downloaded again. Pass the directory to
+    Existing objects are not downloaded again, so an interrupted command can be repeated. Pass the directory to
     `thor2 train --meshes`.
     """
     from training.objects.fetch_ycb import LICENCE, YCB_URL, fetch_ycb

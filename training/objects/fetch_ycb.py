@@ -8,9 +8,11 @@ import gzip
 import re
 import shutil
 import tarfile
+import tempfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 import httpx
 
@@ -44,8 +46,7 @@ def fetch_ycb(
 ) -> dict[str, Path]:
     """Download the meshes of YCB objects: object name -> mesh file, in the order of `objects`.
 
-    Objects whose mesh is already in the directory are not downloaded again. An interrupted download resumes. A damaged
-    archive is removed.
+    Objects whose mesh is already in the directory are not downloaded again, so an interrupted download can be repeated.
 
     Args:
         objects: names as in the set, such as "003_cracker_box".
@@ -76,53 +77,42 @@ def fetch_ycb(
                 raise InputError(
                     f"out: {directory / name} exists without {MESH_FILE}; move it, or choose another directory"
                 )
-            archive = directory / f".{name}.tgz"
-            _download(f"{url.rstrip('/')}/{name}_google_16k.tgz", archive, name, progress)
-            _extract(archive, directory, name)
+            with tempfile.TemporaryFile() as archive:
+                _download(f"{url.rstrip('/')}/{name}_google_16k.tgz", archive, name, progress)
+                archive.seek(0)
+                _extract(archive, directory, name)
     return meshes
 
 
-def _download(address: str, archive: Path, name: str, progress: Progress) -> None:
-    """Download an archive; continue after the bytes that `archive` already contains."""
-    have = archive.stat().st_size if archive.exists() else 0
-    if have:
-        with archive.open("rb") as stream:
-            if stream.read(2) != b"\x1f\x8b":
-                raise InputError(f"out: {archive} is not a download of this command (gzip); move it")
-    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
+def _download(address: str, archive: BinaryIO, name: str, progress: Progress) -> None:
+    """Write an archive to a file."""
+    have, headers = 0, {"Accept-Encoding": "identity"}
     try:
         with httpx.stream("GET", address, headers=headers, timeout=TIMEOUT, follow_redirects=True) as answer:
-            if answer.status_code == 416:  # the archive is complete; `_extract` removes a damaged one
-                return
             if answer.status_code in (403, 404):
                 raise InputError(f"objects has {name!r}, but there is no {address}; see the names at ycbbenchmarks.com")
             answer.raise_for_status()
-            if answer.status_code != 206:  # the server sends the whole archive
-                have = 0
-            total = have + int(answer.headers.get("Content-Length", 0))
-            with archive.open("ab" if have else "wb") as stream:
-                for block in answer.iter_raw():
-                    have += len(block)
-                    if max(have, total) > MAX_BYTES:
-                        archive.unlink()
-                        size = f"more than {MAX_BYTES:,} bytes"
-                        raise InputError(f"url: {archive.name[1:]} has {size}; expected an archive of the YCB set")
-                    stream.write(block)
-                    progress(name, have // 1000, max(have, total) // 1000, "kB")
+            total = int(answer.headers.get("Content-Length", 0))
+            for block in answer.iter_raw():
+                have += len(block)
+                if max(have, total) > MAX_BYTES:
+                    raise InputError(f"url: {address} has more than {MAX_BYTES:,} bytes; expected an archive of YCB")
+                archive.write(block)
+                progress(name, have // 1000, max(have, total) // 1000, "kB")
     except InputError:
         raise
     # ImportError is raised for proxies of other kinds, ValueError by name resolution.
     except (httpx.HTTPError, httpx.InvalidURL, ImportError, ValueError) as error:
         raise InputError(
             f"url: {address} cannot be read ({reason_of(error)}); expected an address such as {YCB_URL}; check the "
-            "network, then repeat the command, it resumes"
+            "network, then repeat the command"
         ) from None
 
 
-def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, even after an error.
+def _extract(archive: BinaryIO, directory: Path, name: str) -> None:
+    """Write the files of the archive to `directory / name`.
 
-    Only regular files in `google_16k` are moved, without their folders. The archive is read to its end, so that the
+    Only regular files in `google_16k` are written, without their folders. The archive is read to its end, so that the
     checksum of gzip is verified.
     """
     total = 0
@@ -150,5 +140,3 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         raise InputError(
             f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
         ) from None
-    finally:
-        archive.unlink()

@@ -111,13 +111,14 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
     assert len((report / "answers.jsonl").read_text().splitlines()) == 1 + 5
     with (report / "answers.jsonl").open("a") as file:
         file.write('{"frame": "frame5", "attrib')  # as after a kill during a write
+    (report / "frames").mkdir()
     for folder in (report, report / "frames"):
         with temporary_directory(folder) as temporary:
             shutil.copytree(temporary, folder / ".thor2-killed")
     dataset = ToyDataset(9)
     resumed = evaluate_toys(tmp_path / "stopped", dataset)
     assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
-    assert dataset.numbers == [5, 6, 7, 8]
+    assert dataset.numbers[:4] == [5, 6, 7, 8]  # the pictures are drawn afterwards
     assert without_times(resumed) == without_times(whole)
     for pictures in ("frames", "confusions"):
         assert files_of(report / pictures) == files_of(tmp_path / "whole" / "report" / pictures) != {}
@@ -271,8 +272,8 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     recognizer: Any = UntaughtRecognizer(("mug", "bowl", "can"), ("tops", "tops2"))
     recognizer.describe = lambda _: described(instances, {"tops": np.array(tops), "tops2": np.array(tops2)})
     recognizer.probabilities = lambda table: table
-    ((item, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
-    assert item is frame and answers.frame == "f1" and answers.attributes == {"light": "1"}
+    (answers,) = answer_frames([Run("run", "", recognizer)], [frame])
+    assert answers.frame == "f1" and answers.attributes == {"light": "1"}
     assert [(i.label, i.truth) for i in answers.instances] == sorted(truth.items())
     reasons = [None] * 3 + ["too few points"] * 2 + ["no pixels in the label image"]
     assert [i.reason for i in answers.instances] == reasons
@@ -281,7 +282,7 @@ def test_every_labelled_instance_gets_an_answer() -> None:
     np.testing.assert_allclose(probabilities[:3], np.stack([tops, tops2], axis=1)[:3], rtol=1e-6)
     assert probabilities[3:] == [None] * 3
     recognizer.describe, recognizer.probabilities = lambda _: described(instances[3:], {}), None  # is not called
-    ((_, answers),) = answer_frames([Run("run", "", recognizer)], [frame])
+    (answers,) = answer_frames([Run("run", "", recognizer)], [frame])
     assert [i.probabilities for i in answers.instances] == [None] * 6
 
 
@@ -292,5 +293,5 @@ def test_position_is_the_median_of_the_points() -> None:
     labels[1], labels[2, 0] = [0, 1, 1, 1, 1], 2
     frame = thor2.RGBDFrame(np.zeros((3, 5, 3), np.uint8), depth, labels, thor2.Intrinsics(10.0, 10.0, 0.0, 0.0))
     truth = dict.fromkeys((1, 2, 3), "mug")
-    ((_, answers),) = answer_frames([Run("run", "", NamesInOrder())], [LabelledFrame("f", frame, truth, {})])
+    (answers,) = answer_frames([Run("run", "", NamesInOrder())], [LabelledFrame("f", frame, truth, {})])
     assert [instance.position for instance in answers.instances] == [[0.4, 0.2, 2.0], None, None]
