@@ -181,7 +181,7 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     check_trained(stored["digest"], job.out, job.protocol)
     remove_leftovers(job.out)
     with contextlib.suppress(InputError):
-        if ViewDataset.open(job.out / VIEWS).manifest.job == stored["job"]:
+        if ViewDataset.open(job.out / VIEWS).job == stored["job"]:
             remove_views(job.out / VIEWS)
 
 

@@ -33,7 +33,7 @@ from training.objects.mesh import TexturedMesh
 from training.storage.jobs import MANIFEST, locked, write_checked
 from training.storage.workers import local_workers, ray_workers
 from training.views import mesh_views, normalized_views
-from training.views.dataset import Manifest, Shard, ViewDataset, encode, remove_views, render_dataset
+from training.views.dataset import Shard, ViewDataset, encode, remove_views, render_dataset
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
 from training.views.normalized_views import NormalizedViews, normalize_views, padded_batches
 
@@ -163,14 +163,15 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
 def test_a_dataset_of_an_earlier_version_stays_as_it_is(copied: Path) -> None:
     """It has neither surfaces nor cameras."""
     (copied / SURFACES_FILE).unlink()
-    manifest, shards = ViewDataset.open(copied).manifest, list[Shard]()
-    for shard in manifest.shards:
+    dataset, shards = ViewDataset.open(copied), list[Shard]()
+    for shard in dataset.shards:
         arrays = safetensors.numpy.load((copied / shard.file).read_bytes())
         del arrays["camera"]
         shards.append(
             dataclasses.replace(shard, sha256=write_checked(copied / shard.file, safetensors.numpy.save(arrays)))
         )
-    Manifest(manifest.job, tuple(shards)).write(copied)
+    old = dataclasses.replace(dataset, shards=tuple(shards), surfaces_sha256=None)
+    (copied / MANIFEST).write_text(old.manifest)
     before = files_of(copied)
     dataset = render_dataset(JOB, copied)
     assert files_of(copied) == before
@@ -329,10 +330,10 @@ def test_incomplete_and_other_datasets_are_refused(copied: Path) -> None:
         damage()
         check_refused(copied, "0000-0001.safetensors is missing or damaged")
     assert len(ViewDataset.open(copied).read(0)) == 4
-    manifest, path = ViewDataset.open(copied).manifest, copied / "manifest.json"
-    Manifest({**manifest.job, "descriptor_version": 99}, manifest.shards).write(copied)
+    dataset, path = ViewDataset.open(copied), copied / MANIFEST
+    path.write_text(dataclasses.replace(dataset, job={**dataset.job, "descriptor_version": 99}).manifest)
     check_refused(copied, "descriptor version 99")
-    dataclasses.replace(manifest, shards=manifest.shards[:1]).write(copied)
+    path.write_text(dataclasses.replace(dataset, shards=dataset.shards[:1]).manifest)
     check_refused(copied, "1 of 4 shards")
     for content in ("[]", "{}", "[" * 100_000, path.read_text().replace('"label": 0', '"label": 1')):
         path.write_text(content)
