@@ -293,14 +293,11 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     if n_unknown:
         table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", values["unknown_named_at_threshold"]])
     header = ["objects", "without rejection", f"threshold {values['threshold']}"]
-    text = f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected "
-    text += "as unknown. "
-    if shares["threshold"]["runs"]:
-        text += "The threshold is stored in the models. Enrolled objects have thresholds that depend on their numbers "
-        text += "of views; the median is shown."
-    else:
-        header, table = header[:2], [row[:2] for row in table]
-        text += "These models store no threshold."
+    text = (
+        f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected as "
+        "unknown. The threshold is stored in the models; a dash means that they have none. Enrolled objects have "
+        "thresholds that depend on their numbers of views; the median is shown."
+    )
     pictures = []
     if curve is not None:
         statistics = report["confidence"][main]["unknown_named"]

@@ -38,6 +38,7 @@ Image networks are trained on crops of the same views, which `render_crops` adds
 import contextlib
 import dataclasses
 import functools
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -54,7 +55,7 @@ from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
 from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import CROPS, ViewCrops, read_crops
+from training.views.crops import CROPS, ViewCrops, crop_file, read_crop_manifest
 from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
 from training.views.normalized_views import NormalizedViews, normalize_views
 
@@ -247,7 +248,18 @@ class ViewDataset:
         Raises:
             InputError: the dataset has no crops or smaller ones, or a file is missing or damaged.
         """
-        return read_crops(self, index, size)
+        directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
+        stored, files = read_crop_manifest(directory)
+        if stored["dataset"] != self.digest:
+            raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
+        if stored["crops"] < size:
+            raise InputError(
+                f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
+                f"render with --crops {size}"
+            )
+        content = self.content(f"{CROPS}/{name}", files.get(name, ""), "`thor2 render` with --crops")
+        with np.load(io.BytesIO(content)) as arrays:
+            return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)
 
 
 def _begin(directory: Path, job: Mapping[str, Any]) -> ViewDataset:
