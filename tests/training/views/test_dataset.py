@@ -9,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -31,7 +30,7 @@ from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.storage.jobs import MANIFEST, locked, write_checked
-from training.storage.workers import local_workers, ray_workers
+from training.storage.workers import local_workers
 from training.views import mesh_views, normalized_views
 from training.views.dataset import Shard, ViewDataset, encode, remove_views, render_dataset
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
@@ -73,27 +72,6 @@ def resized(factor: float) -> TexturedMesh:
 @pytest.mark.slow
 def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
     render_dataset(JOB, tmp_path / "views", local_workers(2))
-    assert files_of(tmp_path / "views") == files_of(whole)
-
-
-@pytest.mark.slow
-def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The task is repeated, and the cluster ends with the job."""
-    ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    died = tmp_path / "died"
-
-    def pool(function: Any, tasks: Any) -> Any:
-        def dying(task: Any) -> Any:
-            if not died.exists():
-                died.touch()
-                os._exit(3)
-            return function(task)
-
-        return ray_workers(2)(dying, tasks)
-
-    render_dataset(JOB, tmp_path / "views", pool)
-    assert died.exists() and not ray.is_initialized()
     assert files_of(tmp_path / "views") == files_of(whole)
 
 
@@ -236,14 +214,10 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     ):
         assert_refused(message, render_dataset, dataclasses.replace(JOB, **changes), out)
         assert not out.exists()
-
-
-def test_other_files_are_kept(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("text")
-    assert_refused(f"out: {tmp_path} already contains notes.txt", render_dataset, JOB, tmp_path)
+    assert_refused(f"out: {tmp_path} already contains bad.ply", render_dataset, JOB, tmp_path)
     (tmp_path / MANIFEST).write_text('{"format": 1}')
     assert_refused("manifest.json has format 1; expected 2", render_dataset, JOB, tmp_path)
-    assert files_of(tmp_path) == {"notes.txt": b"text", MANIFEST: b'{"format": 1}'}
+    assert files_of(tmp_path) == {"bad.ply": b"not a mesh", MANIFEST: b'{"format": 1}'}
 
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
