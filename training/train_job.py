@@ -227,16 +227,14 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         job.protocol.distractors.check(classes)
     if len(classes) < 2 and (labelled or job.protocol.classifiers):
         raise InputError(f"the objects are {classes[0]}; expected at least two; add another one")
-    if labelled is None:
-        return
     folded: dict[str, str] = {}
     for name in classes:
         other = folded.setdefault(normal_name(name).casefold(), name)
         if other != name:
             raise InputError(
-                f"frames: the names {other!r} and {name!r} differ only by case or form; expected one name of an object"
+                f"the objects {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-        if name not in names and len(labelled.views[name]) < 2:
+        if labelled and name not in names and len(labelled.views[name]) < 2:
             raise InputError(
                 f"frames: {name!r} has one usable instance; expected at least two: label it in another frame, "
                 "or leave it out (leave_out)"
