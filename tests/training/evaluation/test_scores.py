@@ -32,8 +32,8 @@ def test_metrics_without_answers_are_nan() -> None:
 def test_unknown_named_matches_a_search_of_thresholds() -> None:
     """The oracle tries every threshold and takes the largest one that keeps enough."""
     rng = np.random.default_rng(3)
-    correct, unknown = rng.integers(0, 12, 20) / 11, rng.integers(0, 12, 15) / 11
-    kept = np.array([0.05, 0.55, 0.95, 1.0])  # 0.55 * 20 is more than 11 in floating point
+    correct, unknown = rng.integers(0, 30, 25) / 29, rng.integers(0, 30, 90) / 29
+    kept = np.array([0.05, 0.28, 0.56, 0.95, 1.0])  # 0.28 * 25 is more than 7 in floating point
     by_search = []
     for share in kept:
         enough = [t for t in np.unique(correct) if (correct >= t).sum() >= share * len(correct) - 1e-9]
