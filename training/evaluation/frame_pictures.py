@@ -47,15 +47,13 @@ def draw_pictures(
         InputError: a frame cannot be read.
         OSError: a file cannot be written.
     """
-    highest: dict[tuple[str, str | None], tuple[float, int, int]] = {}
-    for number, of_frame in enumerate(answers):
-        for _, instance, name, confidence in named_answers(of_frame.instances, runs):
-            if confidence > highest.get((instance.truth, name), (-1.0,))[0]:
-                highest[instance.truth, name] = confidence, number, instance.label
-    for k, pair in enumerate(confusions):
-        _, number, label = highest[pair]
-        frame = frames[number].frame
-        draw_crop(frame.color, frame.label_image == label, out / "confusions" / f"{k}.jpg")
+    instances = [instance for each in answers for instance in each.instances]
+    frame_of = {id(instance): number for number, each in enumerate(answers) for instance in each.instances}
+    named = [(confidence, i, (i.truth, name)) for _, i, name, confidence in named_answers(instances, runs)]
+    for k, confusion in enumerate(confusions):
+        _, instance, _ = max((each for each in named if each[-1] == confusion), key=lambda each: each[0])
+        frame = frames[frame_of[id(instance)]].frame
+        draw_crop(frame.color, frame.label_image == instance.label, out / "confusions" / f"{k}.jpg")
     numbers = sorted({int(n) for n in np.linspace(0, len(frames) - 1, FRAMES)})
     for k, number in enumerate(numbers):
         frame = frames[number].frame
