@@ -240,20 +240,6 @@ def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
     }
 
 
-def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]:
-    """Return the intact files of an interrupted rendering, file name -> checksum.
-
-    Raises:
-        InputError: the crops have another size or belong to another dataset.
-    """
-    check_output_directory(directory, MANIFEST)
-    if not (directory / MANIFEST).is_file():
-        return {}
-    stored, files = read_crop_manifest(directory)
-    check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
-    return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
-
-
 def render_crops(
     job: RenderJob,
     dataset: "ViewDataset",
@@ -271,12 +257,16 @@ def render_crops(
         progress: called with (crops done, total crops) at the start and after each shard.
 
     Raises:
-        InputError: the dataset has crops of another size.
+        InputError: the directory of the crops has crops of another size or of other views, or files of the user.
         OSError: a file cannot be written; the rendering can be resumed.
     """
-    directory = dataset.directory / CROPS
+    directory, done = dataset.directory / CROPS, dict[str, str]()  # file name -> checksum
     with locked(directory):
-        done = _begin(directory, dataset, size)
+        check_output_directory(directory, MANIFEST)
+        if (directory / MANIFEST).is_file():
+            stored, files = read_crop_manifest(directory)
+            check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
+            done = {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
         missing = [index for index, shard in enumerate(dataset.shards) if crop_file(shard.file) not in done]
         n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
         progress(n_done, len(dataset))
