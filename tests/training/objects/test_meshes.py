@@ -74,15 +74,16 @@ def test_colours_of_faces_and_of_parts(tmp_path: Path) -> None:
     colors = [[10, 20, 30], [40, 50, 60]]
     trimesh.Trimesh(QUAD, QUAD_FACES, face_colors=colors, process=False).export(tmp_path / "quad.ply")
     assert quadrant_colors(load_mesh(tmp_path / "quad.ply"))[1::2] == colors
-    scene = trimesh.Scene()
-    for index, color in enumerate(colors):
-        part = textured_quad(PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), tuple(color))))
-        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, index * 0.2]))
-    scene.export(tmp_path / "two.glb")
-    mesh = load_mesh(tmp_path / "two.glb")
-    index = (mesh.vertices[mesh.faces[:, 0], 2] > 0.1).astype(int)
-    assert sorted(index) == [0, 0, 1, 1]
-    np.testing.assert_array_equal(mesh.colors_at(np.arange(4), np.full((4, 2), 0.3)), np.array(colors)[index])
+    textured = [textured_quad(PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), tuple(c)))) for c in colors]
+    for parts in (textured, [colored(QUAD, [color] * 4) for color in colors]):
+        scene = trimesh.Scene()
+        for index, part in enumerate(parts):
+            scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, index * 0.2]))
+        scene.export(tmp_path / "two.glb")
+        mesh = load_mesh(tmp_path / "two.glb")
+        of_face = (mesh.vertices[mesh.faces[:, 0], 2] > 0.1).astype(int)
+        assert sorted(of_face) == [0, 0, 1, 1]
+        np.testing.assert_array_equal(mesh.colors_at(np.arange(4), np.full((4, 2), 0.3)), np.array(colors)[of_face])
 
 
 def test_texture_repeats_outside_the_unit_square() -> None:
