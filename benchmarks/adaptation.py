@@ -45,7 +45,7 @@ def only_labelled(item: LabelledFrame) -> RGBDFrame:
 def answers_with(run: Run, frames: Sequence[LabelledFrame], transform: Any) -> list[FrameAnswers]:
     """Return the answers of a run for frames with colours corrected by a transform, or not corrected if it is None."""
     run.recognizer.model = dataclasses.replace(run.model, color_transform=transform)
-    return [answers for _, answers in answer_frames([run], frames)]
+    return [*answer_frames([run], frames)]
 
 
 def measure_camera(

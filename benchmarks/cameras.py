@@ -111,8 +111,7 @@ def answers_by_camera(
     answers: dict[str, list[FrameAnswers]] = {}
     for camera in (None, *cameras):
         name = ORIGINAL if camera is None else camera.name
-        answered = answer_frames(runs, (seen_by(camera, item) for item in frames))
-        answers[name] = [of_frame for _, of_frame in answered]
+        answers[name] = [*answer_frames(runs, (seen_by(camera, item) for item in frames))]
         report(name)
     return answers
 

@@ -243,7 +243,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
             trained.append(train(samples, source.classes, fit, learn=name == "THOR2-L"))
             for title, frames in sets.items():
                 run = Run(name, "", thor2.Recognizer(trained[-1]))
-                results = compute_results("frames", [run], [answers for _, answers in answer_frames([run], frames)])
+                results = compute_results("frames", [run], [*answer_frames([run], frames)])
                 cell = results["accuracy"][results["rule"]][0]["cells"][0]
                 accuracy[title][name].append([cell["accuracy"][fusion]["mean"] for fusion in names])
                 print(

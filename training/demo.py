@@ -136,7 +136,7 @@ def _answer_scenes(
     for number, (scene_seed, camera) in enumerate(seeds):
         scene = compose_scene(objects, np.random.default_rng(scene_seed))
         frame = through_camera(scene.frame, camera)
-        ((_, answers),) = answer_frames([run], [LabelledFrame(f"scene {number}", frame, scene.truth, {})])
+        (answers,) = answer_frames([run], [LabelledFrame(f"scene {number}", frame, scene.truth, {})])
         for degree in ("none", "low", "high"):
             instances = [i for i in answers.instances if scene.occlusion(i.label) == degree]
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))

@@ -177,7 +177,7 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     check_trained(stored["digest"], job.out, job.protocol)
     remove_leftovers(job.out)
     with contextlib.suppress(InputError):
-        if ViewDataset.open(job.out / VIEWS).manifest.job == stored["job"]:
+        if ViewDataset.open(job.out / VIEWS).job == stored["job"]:
             remove_views(job.out / VIEWS)
 
 
@@ -223,16 +223,15 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         job.protocol.distractors.check(classes)
     if len(classes) < 2 and (labelled or job.protocol.classifiers):
         raise InputError(f"the objects are {classes[0]}; expected at least two; add another one")
-    if labelled is None:
-        return
     folded: dict[str, str] = {}
     for name in classes:
         other = folded.setdefault(normal_name(name).casefold(), name)
         if other != name:
             raise InputError(
-                f"frames: the names {other!r} and {name!r} differ only by case or form; expected one name of an object"
+                f"the objects {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-    if single := [name for name in classes if name not in names and len(labelled.views[name]) < 2]:
+    views = labelled.views if labelled else {}
+    if single := [name for name in classes if name not in names and len(views[name]) < 2]:
         raise InputError(
             f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "
             "label it in another frame, or leave it out with --leave-out"

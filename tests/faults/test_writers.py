@@ -23,8 +23,6 @@ from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines.baseline import StoredBaseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.storage.jobs import MANIFEST
-from training.views.dataset import Manifest
 
 
 class Disk:
@@ -95,7 +93,6 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "text.json": lambda path: write_text(path, "new" * 1000),
     "overlay.png": lambda path: draw_overlay(FRAME, [thor2.Recognition(1, "mug", 1.0)], path),
     "forest.safetensors": lambda path: write_baseline(path, StoredBaseline({"w": np.zeros(9)}, None), ("a",), 1.0),
-    MANIFEST: lambda path: Manifest({"shards": 0, "objects": []}).write(path.parent),
 }
 
 

@@ -21,7 +21,7 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
 from training.storage.jobs import MANIFEST
-from training.views.dataset import Manifest, Shard, ViewDataset, encode
+from training.views.dataset import Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews
 
 from .conftest import other_content
@@ -56,7 +56,8 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     content = encode(NormalizedViews(xyz, rgb, np.array([5, 7]), 0, *numbers, xyz[:2]))
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
-    Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
+    job = {"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}
+    (path / MANIFEST).write_text(ViewDataset(path, job, (shard,)).manifest)
     return path
 
 

@@ -66,5 +66,5 @@ def render(
         dataset = render_dataset(job, out, pool, progress)
         if crops is not None:
             render_crops(job, dataset, crops, pool, of_stage(progress, "render crops"))
-    views = f"views in {out}: {len(dataset)} (objects: {len(dataset.classes)}, left out: {dataset.manifest.left_out})"
+    views = f"views in {out}: {len(dataset)} (objects: {len(dataset.classes)}, left out: {dataset.left_out})"
     finish(views, "train on them", "train", dataset=out, out="run")

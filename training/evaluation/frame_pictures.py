@@ -1,4 +1,4 @@
-"""Pictures of an evaluation, drawn while the frames are in memory: frames with judged answers, and instance crops."""
+"""Pictures of an evaluation: frames with judged answers, and crops of instances."""
 
 import math
 from collections.abc import Sequence
@@ -11,91 +11,67 @@ from PIL import Image
 
 from thor2_jax.files import atomic_write
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
-from training.evaluation.answers import FrameAnswers, InstancePrediction
+from training.evaluation.answers import FrameAnswers
 from training.evaluation.results import named_answers
 from training.evaluation.runs import Run
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrames
 
-__all__ = ["CORRECT", "FramePictures", "INCORRECT", "draw_crop", "draw_judged"]
+__all__ = ["CORRECT", "INCORRECT", "draw_crop", "draw_judged", "draw_pictures"]
 
 FRAMES = 12
 """Number of frames drawn, evenly spread over the dataset."""
 
 
-class FramePictures:
-    """Pictures of some frames with the answers of the first run, and of the most confident instance of each confusion.
+def draw_pictures(
+    frames: LabelledFrames,
+    answers: Sequence[FrameAnswers],
+    runs: Sequence[Run],
+    confusions: Sequence[tuple[str, str]],
+    out: Path,
+) -> list[str]:
+    """Draw some frames with the answers of the first run, and the most confident instance of each confusion.
 
-    The files are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<name>.jpg` with class indices; unknown
-    objects have the indices after the classes.
+    The pictures are `frames/<k>.jpg` and `confusions/<k>.jpg`, with k counted from 0.
 
-    Attributes:
-        shown: numbers of the frames that are drawn.
+    Args:
+        frames: the dataset.
+        answers: answers for all of its frames.
+        runs: evaluated runs.
+        confusions: object and wrong name of confusions that occur in the answers.
+        out: directory of the report.
+
+    Returns:
+        The identifiers of the drawn frames.
+
+    Raises:
+        InputError: a frame cannot be read.
+        OSError: a file cannot be written.
     """
+    instances = [instance for each in answers for instance in each.instances]
+    frame_of = {id(instance): number for number, each in enumerate(answers) for instance in each.instances}
+    named = [(confidence, i, (i.truth, name)) for _, i, name, confidence in named_answers(instances, runs)]
+    for k, confusion in enumerate(confusions):
+        _, instance, _ = max((each for each in named if each[-1] == confusion), key=lambda each: each[0])
+        frame = frames[frame_of[id(instance)]].frame
+        draw_crop(frame.color, frame.label_image == instance.label, out / "confusions" / f"{k}.jpg")
+    numbers = sorted({int(n) for n in np.linspace(0, len(frames) - 1, FRAMES)})
+    for k, number in enumerate(numbers):
+        frame = frames[number].frame
+        draw_judged(frame.color, frame.label_image, _judge(answers[number], runs), out / "frames" / f"{k}.jpg")
+    return [frames.identifiers[number] for number in numbers]
 
-    def __init__(self, out: Path, runs: Sequence[Run], n_frames: int) -> None:
-        """Create the directories in `out`.
 
-        Args:
-            out: directory of the report.
-            runs: evaluated runs.
-            n_frames: number of frames of the dataset.
-
-        Raises:
-            OSError: a directory cannot be created.
-        """
-        self._out, self._runs, self._names = out, runs, list(runs[0].classes)
-        self.shown = sorted({int(n) for n in np.linspace(0, n_frames - 1, FRAMES)})
-        self._highest: dict[tuple[str, str], float] = {}
-        for name in ("frames", "confusions"):
-            (out / name).mkdir(parents=True, exist_ok=True)
-
-    def frame_path(self, number: int) -> Path:
-        """Return the path of the picture of a frame."""
-        return self._out / "frames" / f"{number}.jpg"
-
-    def confusion_path(self, truth: str, name: str) -> Path:
-        """Return the path of the picture of an object that is recognized as another one."""
-        return self._out / "confusions" / f"{self._names.index(truth)}-{self._names.index(name)}.jpg"
-
-    def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
-        """Draw the frame if it is shown, and its confusions that are the most confident ones so far.
-
-        Raises:
-            OSError: a file cannot be written.
-        """
-        color, labels = item.frame.color, item.frame.label_image
-        for instance, name in self.record(answers):
-            draw_crop(color, labels == instance.label, self.confusion_path(instance.truth, name))
-        if number in self.shown:
-            draw_judged(color, labels, self._judge(answers), self.frame_path(number))
-
-    def record(self, answers: FrameAnswers) -> list[tuple[InstancePrediction, str]]:
-        """Record the confidences of a frame, which may have been drawn before the evaluation was interrupted.
-
-        Returns:
-            Instances with their wrong names; each is the most confident one so far of its confusion.
-        """
-        most_confident = []
-        for _, instance, name, confidence in named_answers(answers.instances, self._runs):
-            if instance.truth not in self._names:
-                self._names.append(instance.truth)
-            if name in (None, instance.truth) or confidence <= self._highest.get((instance.truth, str(name)), -1.0):
-                continue
-            self._highest[instance.truth, str(name)] = confidence
-            most_confident.append((instance, str(name)))
-        return most_confident
-
-    def _judge(self, answers: FrameAnswers) -> list[Annotation]:
-        """Return the answers of the first run, incorrect ones first; unknown objects should be rejected."""
-        names = {i.label: name for run, i, name, _ in named_answers(answers.instances, self._runs) if run == 0}
-        judged = []
-        for instance in answers.instances:
-            name, is_known = names.get(instance.label), instance.truth in self._runs[0].classes
-            color = CORRECT if name == (instance.truth if is_known else None) else INCORRECT
-            text = name or ("unknown" if instance.label in names else "none")
-            text = text if name == instance.truth else f"{text} ({instance.truth})"
-            judged.append(Annotation(instance.label, color, text))
-        return sorted(judged, key=lambda each: each.paint == CORRECT)
+def _judge(answers: FrameAnswers, runs: Sequence[Run]) -> list[Annotation]:
+    """Return the answers of the first run, incorrect ones first; unknown objects should be rejected."""
+    names = {i.label: name for run, i, name, _ in named_answers(answers.instances, runs) if run == 0}
+    judged = []
+    for instance in answers.instances:
+        name, is_known = names.get(instance.label), instance.truth in runs[0].classes
+        color = CORRECT if name == (instance.truth if is_known else None) else INCORRECT
+        text = name or ("unknown" if instance.label in names else "none")
+        text = text if name == instance.truth else f"{text} ({instance.truth})"
+        judged.append(Annotation(instance.label, color, text))
+    return sorted(judged, key=lambda each: each.paint == CORRECT)
 
 
 CORRECT, INCORRECT = COLORS[2], UNRECOGNIZED
@@ -109,6 +85,7 @@ _CROP_SIDE = 240
 
 
 def _save(picture: Image.Image, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         picture.save(temporary, format="JPEG", quality=85, subsampling=0)
 

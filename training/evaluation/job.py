@@ -24,7 +24,7 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
-from training.evaluation.frame_pictures import FramePictures
+from training.evaluation.frame_pictures import draw_pictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import check_known, compute_results
 from training.evaluation.runs import Run, all_predictors, load_runs, load_sequence_runs
@@ -34,8 +34,8 @@ from training.storage.workers import WorkerPool
 
 __all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
 
-Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None, None]]
-"""Function that yields the frames with these numbers and their answers, such as `answer_frames_in_pool`."""
+Answering = Callable[[range], Generator[FrameAnswers, None, None]]
+"""Function that yields the answers for the frames with these numbers, such as `answer_frames_in_pool`."""
 
 ANSWERS = "answers.jsonl"
 
@@ -94,17 +94,13 @@ def evaluate_dataset(
         }
         file = AnswerFile(out / ANSWERS, header)
         _check_unchanged(file, frames, out, progress)
-        pictures = FramePictures(out, runs, len(frames))
-        for answers in file.frames:
-            pictures.record(answers)
         first, start = len(file.frames), time.perf_counter()
         progress("evaluate", first, len(frames), "")
         with contextlib.closing(answering(range(first, len(frames)))) as answered:
-            for number, (item, answers) in enumerate(answered, first):
-                pictures.draw(number, item, answers)  # before the frame counts as done
+            for number, answers in enumerate(answered, first):
                 file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
                 rate = (number + 1 - first) / (time.perf_counter() - start)
-                progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
+                progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {answers.frame}")
         report = {"dataset": description, "digests": digests, **compute_results(dataset["kind"], runs, file.frames)}
         report["no_pixels"] = [
             {"frame": answers.frame, "label": instance.label, "truth": instance.truth}
@@ -112,8 +108,9 @@ def evaluate_dataset(
             for instance in answers.instances
             if instance.reason == NO_PIXELS
         ]
-        report["shown"] = [file.frames[number].frame for number in pictures.shown]
-        write_report_page(report, pictures, out)
+        confusions = [(pair["truth"], pair["answer"]) for pair in report["worst"]]
+        report["shown"] = draw_pictures(frames, file.frames, runs, confusions, out)
+        write_report_page(report, out)
         write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
         return report
 
@@ -139,10 +136,8 @@ def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progre
         progress("check files", number + 1, len(file.frames), "")
 
 
-def answer_frames(
-    runs: Sequence[Run], frames: Iterable[LabelledFrame]
-) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
-    """Yield every frame with its answers; a frame is described once for all runs.
+def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Generator[FrameAnswers, None, None]:
+    """Yield the answers for every frame; a frame is described once for all runs.
 
     Args:
         runs: runs that share classes, descriptor and colour network, see `load_runs`.
@@ -154,7 +149,7 @@ def answer_frames(
     start = time.perf_counter()
     for item in frames:
         instances = _answer(runs, item)
-        yield item, FrameAnswers(item.identifier, item.attributes, time.perf_counter() - start, instances)
+        yield FrameAnswers(item.identifier, item.attributes, time.perf_counter() - start, instances)
         start = time.perf_counter()
 
 
@@ -179,10 +174,10 @@ def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None =
 
 def answer_frames_in_pool(
     load: Load, frames: LabelledFrames, pool: WorkerPool, numbers: range
-) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
-    """Yield the frames with these numbers and the answers of `answer_frames`, computed by workers.
+) -> Generator[FrameAnswers, None, None]:
+    """Yield the answers of `answer_frames` for the frames with these numbers, computed by workers.
 
-    If a frame cannot be read, the frames before it are yielded before its error is raised.
+    If a frame cannot be read, the answers for the frames before it are yielded before its error is raised.
 
     Args:
         load: arguments of `load_evaluated`, with which each worker process loads the runs.
@@ -194,16 +189,14 @@ def answer_frames_in_pool(
         InputError: as `answer_frames`.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
-    answer = functools.partial(_answer_first, load)
-    with contextlib.closing(pool(answer, (frames.only(number) for number in numbers))) as answered:
-        yield from answered
+    return pool(functools.partial(_answer_first, load), map(frames.only, numbers))
 
 
 _loaded = functools.lru_cache(1)(load_evaluated)
 """Cached `load_evaluated`, which loads the runs only once in each worker process."""
 
 
-def _answer_first(load: Load, frames: LabelledFrames) -> tuple[LabelledFrame, FrameAnswers]:
+def _answer_first(load: Load, frames: LabelledFrames) -> FrameAnswers:
     return next(answer_frames(_loaded(*load), frames))
 
 

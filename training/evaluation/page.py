@@ -9,7 +9,6 @@ import numpy as np
 
 from training.baselines.job import TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, main_fusion
-from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.published import published_seconds
 from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
@@ -102,20 +101,19 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
     return header, rows
 
 
-def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> None:
+def write_report_page(report: Mapping[str, Any], out: Path) -> None:
     """Draw the plots and write the page.
 
     Args:
         report: content of report.json, with scored instances.
-        pictures: pictures of the frames.
-        out: directory of the report.
+        out: directory of the report, with the pictures of `draw_pictures`.
 
     Raises:
         OSError: a file cannot be written.
     """
     main = report["main"]
     sections = [
-        _answer_section(report, pictures, out),
+        _answer_section(report, out),
         *_accuracy_sections(report, out),
         *(
             Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
@@ -125,7 +123,7 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
         *_placement_sections(report),
         _confidence_section(report, out),
         *_unknown_sections(report, out),
-        _frame_section(report, pictures, out),
+        _frame_section(report),
         _measurement_section(report),
     ]
     dataset, runs = report["dataset"], len(report["runs"])
@@ -152,14 +150,12 @@ def answer_texts(report: Mapping[str, Any]) -> list[str]:
     return texts + [f"Wrong names: {', '.join(pairs)}."] * bool(pairs)
 
 
-def _answer_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
+def _answer_section(report: Mapping[str, Any], out: Path) -> Section:
     shown, rows = [], []
-    for pair in report["worst"]:
+    for k, pair in enumerate(report["worst"]):
         truth, name = f"{pair['truth']}{'' if pair['known'] else ' (unknown object)'}", pair["answer"]
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
-        crop = pictures.confusion_path(pair["truth"], name)
-        if crop.is_file():
-            shown.append(Picture(crop.relative_to(out).as_posix(), f"{truth}, recognized as {name}", "small"))
+        shown.append(Picture(f"confusions/{k}.jpg", f"{truth}, recognized as {name}", "small"))
     models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
     text = " ".join(answer_texts(report)[:2]) + models
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
@@ -297,14 +293,11 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     if n_unknown:
         table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", values["unknown_named_at_threshold"]])
     header = ["objects", "without rejection", f"threshold {values['threshold']}"]
-    text = f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected "
-    text += "as unknown. "
-    if shares["threshold"]["runs"]:
-        text += "The threshold is stored in the models. Enrolled objects have thresholds that depend on their numbers "
-        text += "of views; the median is shown."
-    else:
-        header, table = header[:2], [row[:2] for row in table]
-        text += "These models store no threshold."
+    text = (
+        f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected as "
+        "unknown. The threshold is stored in the models; a dash means that they have none. Enrolled objects have "
+        "thresholds that depend on their numbers of views; the median is shown."
+    )
     pictures = []
     if curve is not None:
         statistics = report["confidence"][main]["unknown_named"]
@@ -348,15 +341,12 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     return _main_row(Section("Confidence", text, (["", *columns], rows), pictures), report["main"])
 
 
-def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
+def _frame_section(report: Mapping[str, Any]) -> Section:
     text = (
         "Answers of the first model. Green: correct, including rejected unknown objects. Orange: incorrect. The true "
         "object is in brackets, or none if the instance could not be described."
     )
-    shown = [
-        Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", "half")
-        for number, name in zip(pictures.shown, report["shown"], strict=True)
-    ]
+    shown = [Picture(f"frames/{k}.jpg", f"Frame {name}.", "half") for k, name in enumerate(report["shown"])]
     return Section("Frames", text, pictures=shown)
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -111,52 +111,35 @@ def compare_with_published(
                     for method, (mean, std) in cell["accuracy"].items()
                 }
                 accuracy = {t: summarize_runs([marks[rows].mean() for marks in each]) for t, each in correct.items()}
-                counts = {"instances": int(rows.sum())}
-                cells.append({"where": cell["where"], **counts, "published": published, "accuracy": accuracy})
+                measured = {"instances": int(rows.sum()), "published": published, "accuracy": accuracy}
+                cells.append({"where": cell["where"], **measured})
         if cells:
             methods = dict.fromkeys(method for cell in table["cells"] for method in cell["accuracy"])
             columns = {method: _measured_column(method, real_views, correct) for method in methods}
             ours = {method: title for method, title in columns.items() if title is not None}
             n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
-            differences = _differences(kind, table, n_frames, n_objects, len(cells), len(runs))
-            differences += _network_differences(ours.values(), scratch_networks(runs))
+            counts = f"{n_frames:,} frames, {n_objects} objects and {len(runs)} models"
+            titles = dict.fromkeys(ours.values())
+            differences = _differences(table, counts, len(cells), titles, scratch_networks(runs))
             kept = {name: table[name] for name in ("number", "title", "source", "notes")}
             comparisons.append({**kept, "differences": differences, "ours": ours, "cells": cells})
     return comparisons
 
 
-def _network_differences(titles: Iterable[str], scratch: Collection[str]) -> list[str]:
-    """Return the limits of the measured image networks."""
-    sentences = []
-    for title in dict.fromkeys(titles):
-        if title.endswith(_SMALL):
-            sentences.append(f"{title} is a smaller network than the published one.")
-        if title in scratch:
-            sentences.append(
-                f"{title} was trained from scratch, without pretrained weights: its accuracy does not represent the "
-                "published network."
-            )
-    return sentences
-
-
 def _differences(
-    kind: str, table: Mapping[str, Any], n_frames: int, n_objects: int, n_rows: int, n_models: int
+    table: Mapping[str, Any], counts: str, n_rows: int, titles: Collection[str], scratch: Collection[str]
 ) -> list[str]:
-    """Return one sentence for each known difference between the data of the table and of the evaluation."""
-    data = _read()["datasets"][kind]
-    size = ""
-    if data["frames"] and data["instances"]:
-        size = f" ({data['frames']:,} frames, {data['instances']:,} instances)"
-    rows = len(table["cells"])
-    sentences = [f"The published figures concern {data['concerns']}{size}. Number of frames here: {n_frames:,}."]
-    if table["objects"] is None:
-        sentences.append(f"Number of objects that are scored here: {n_objects}.")
-    elif table["objects"] != n_objects:
-        sentences.append(f"The publication scores {table['objects']} objects, this evaluation {n_objects}.")
-    if n_rows < rows:
-        sentences.append(f"{rows - n_rows} of the table's {rows} rows have no instance here.")
-    models = "models of its own" if table["models"] is None else f"{table['models']} models"
-    sentences.append(f"The publication uses {models}. Models here: {n_models}, trained on other views and folds.")
-    if any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"]):
-        sentences.append(f"The publication fuses classifiers by the rule max, this table by {DEFAULT_RULE}.")
-    return sentences
+    """Return sentences on the data of a table and of the evaluation, with its `counts`, and on its image networks."""
+    published = " and ".join(f"{table[name] or 'an unstated number of'} {name}" for name in ("objects", "models"))
+    return [
+        f"The published figures concern {_read()['datasets'][table['kind']]}, with {published}.",
+        f"Here: {counts}, trained on other views and folds and fused by the rule {DEFAULT_RULE}; {n_rows} of the "
+        f"table's {len(table['cells'])} rows have instances.",
+        *(f"{title} is a smaller network than the published one." for title in titles if title.endswith(_SMALL)),
+        *(
+            f"{title} was trained from scratch, without pretrained weights: its accuracy does not represent the "
+            "published network."
+            for title in titles
+            if title in scratch
+        ),
+    ]

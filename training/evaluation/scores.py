@@ -106,7 +106,7 @@ def accuracy_at_coverage(confidence: Floats, correct: Flags) -> tuple[float, flo
 
 def _threshold(confidence: Floats, kept: ArrayLike) -> NDArray[np.float64]:
     """Return the largest thresholds that keep fractions `kept` [...] of the confidences; infinity keeps nothing."""
-    # 0.95 * 20 is slightly more than 19 in floating point.
+    # 0.28 * 25 is slightly more than 7 in floating point.
     count = np.ceil(np.round(np.asarray(kept) * len(confidence), 9)).astype(np.intp)
     return np.append(np.sort(confidence), np.inf)[len(confidence) - count]
 

@@ -99,9 +99,9 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
 
 def _check_glb(path: Path) -> None:
     """Raise InputError if a GLB uses an extension of glTF that is not supported, or holds a damaged base texture."""
-    content = read_file(path) if path.suffix.lower() == ".glb" else b""
-    if not content.startswith(b"glTF"):  # trimesh refuses it
-        return
+    content = read_file(path)
+    if not content.startswith(b"glTF"):
+        raise InputError("it is not a GLB file; export or copy it again")
     end = 20 + int.from_bytes(content[12:16], "little")
     header = json.loads(content[20:end])
     if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
@@ -176,7 +176,8 @@ def read_mesh(path: Path) -> TexturedMesh:
                 raise
 
     try:
-        _check_glb(path)  # before trimesh fails with another message
+        if path.suffix.lower() == ".glb":
+            _check_glb(path)  # before trimesh fails with another message
         # Processing would silently drop vertices that are not finite.
         scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
         if missing:
@@ -212,16 +213,12 @@ def _mesh_in(folder: Path) -> Path | None:
         InputError: there are several mesh files, and none takes precedence.
     """
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
-    named = [file for file in files if file.stem.lower() == "textured"]
-    binary = [file for file in named or files if file.suffix.lower() == ".glb"]
-    for choice in (files, named, binary):
-        if len(choice) == 1:
-            return choice[0]
-    if files:
-        raise InputError(
-            f"mesh folder {folder}: {len(files)} mesh files ({', '.join(f.name for f in files)}); keep one"
-        )
-    return None
+    files = [file for file in files if file.stem.lower() == "textured"] or files
+    files = [file for file in files if file.suffix.lower() == ".glb"] or files
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        raise InputError(f"mesh folder {folder}: {len(files)} mesh files ({names}); keep one")
+    return files[0] if files else None
 
 
 def find_meshes(folder: str | Path, names: Mapping[str, str] | Path | None = None) -> dict[str, Path]:

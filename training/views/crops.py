@@ -33,7 +33,7 @@ from training.views.mesh_views import RenderJob, ViewTask, all_views
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from training.views.dataset import ViewDataset
 
-__all__ = ["CROPS", "Crop", "ViewCrops", "read_crops", "render_crops", "rgbd_crop", "stacked"]
+__all__ = ["CROPS", "Crop", "ViewCrops", "crop_file", "read_crop_manifest", "render_crops", "rgbd_crop", "stacked"]
 
 CROP_SIZE = 224
 """Side of a crop, pixels."""
@@ -205,7 +205,7 @@ def _encode(crops: ViewCrops) -> bytes:
     return stream.getvalue()
 
 
-def _read_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
+def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the job of a directory of crops (their size, and the digest of their dataset) and file name -> SHA-256.
 
     Raises:
@@ -228,7 +228,7 @@ def _read_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
         ) from None
 
 
-def _crop_file(shard: str) -> str:
+def crop_file(shard: str) -> str:
     """Return the file name of a shard's crops, given the file name of the shard."""
     return Path(shard).with_suffix(".npz").name
 
@@ -238,20 +238,6 @@ def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
     return {
         (number, copy): rgbd_crop(view.frame, 1, size) for number, copy, view in all_views(task) if view.depth.any()
     }
-
-
-def _begin(directory: Path, dataset: "ViewDataset", size: int) -> dict[str, str]:
-    """Return the intact files of an interrupted rendering, file name -> checksum.
-
-    Raises:
-        InputError: the crops have another size or belong to another dataset.
-    """
-    check_output_directory(directory, MANIFEST)
-    if not (directory / MANIFEST).is_file():
-        return {}
-    stored, files = _read_manifest(directory)
-    check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
-    return {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
 
 
 def render_crops(
@@ -271,19 +257,23 @@ def render_crops(
         progress: called with (crops done, total crops) at the start and after each shard.
 
     Raises:
-        InputError: the dataset has crops of another size.
+        InputError: the directory of the crops has crops of another size or of other views, or files of the user.
         OSError: a file cannot be written; the rendering can be resumed.
     """
-    directory = dataset.directory / CROPS
+    directory, done = dataset.directory / CROPS, dict[str, str]()  # file name -> checksum
     with locked(directory):
-        done = _begin(directory, dataset, size)
-        missing = [index for index, shard in enumerate(dataset.shards) if _crop_file(shard.file) not in done]
+        check_output_directory(directory, MANIFEST)
+        if (directory / MANIFEST).is_file():
+            stored, files = read_crop_manifest(directory)
+            check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
+            done = {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
+        missing = [index for index, shard in enumerate(dataset.shards) if crop_file(shard.file) not in done]
         n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
         progress(n_done, len(dataset))
         tasks = job.tasks(dataset.shards[index].file for index in missing)
         with contextlib.closing(pool(functools.partial(_crops_of, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
-                views, name = dataset.read(index), _crop_file(dataset.shards[index].file)
+                views, name = dataset.read(index), crop_file(dataset.shards[index].file)
                 of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
                 done[name] = write_checked(directory / name, _encode(stacked(of_shard, size)))
                 files = dict(sorted(done.items()))
@@ -291,19 +281,3 @@ def render_crops(
                 write_text(directory / MANIFEST, json.dumps(content) + "\n")
                 n_done += len(views)
                 progress(n_done, len(dataset))
-
-
-def read_crops(dataset: "ViewDataset", index: int, size: int) -> ViewCrops:
-    """Read the crops of a shard; arguments and exceptions as `ViewDataset.read_crops`."""
-    directory, name = dataset.directory / CROPS, _crop_file(dataset.shards[index].file)
-    stored, files = _read_manifest(directory)
-    if stored["dataset"] != dataset.digest:
-        raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
-    if stored["crops"] < size:
-        raise InputError(
-            f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
-            f"render with --crops {size}"
-        )
-    content = dataset.content(f"{CROPS}/{name}", files.get(name, ""), "`thor2 render` with --crops")
-    with np.load(io.BytesIO(content)) as arrays:
-        return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)

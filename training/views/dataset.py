@@ -38,7 +38,7 @@ Image networks are trained on crops of the same views, which `render_crops` adds
 import contextlib
 import dataclasses
 import functools
-import itertools
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,11 +55,11 @@ from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
 from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, locked, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import CROPS, ViewCrops, read_crops
+from training.views.crops import CROPS, ViewCrops, crop_file, read_crop_manifest
 from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
 from training.views.normalized_views import NormalizedViews, normalize_views
 
-__all__ = ["Manifest", "Shard", "ViewDataset", "encode", "remove_views", "render_dataset"]
+__all__ = ["Shard", "ViewDataset", "encode", "remove_views", "render_dataset"]
 
 MANIFEST_FORMAT = 2
 
@@ -67,7 +67,7 @@ MANIFEST_FORMAT = 2
 def remove_views(directory: Path) -> None:
     """Remove a dataset of views and their crops; files that `thor2 render` did not write are kept."""
     with contextlib.suppress(OSError, InputError):
-        Manifest.parse(read_file(directory / MANIFEST), directory / MANIFEST)
+        ViewDataset.read_manifest(directory)
         names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz)|surfaces\.safetensors)"
         remove_written(directory, rf"({CROPS}/)?{names}")
 
@@ -105,80 +105,21 @@ def _dump(table: Mapping[str, Any]) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Manifest:
-    """The contents of a dataset.
-
-    Attributes:
-        job: everything that determines the views, in JSON types. `objects` is a list of tables with `name` and `mesh`
-            (the mesh's checksum); `shards` is the number of shards.
-        shards: finished shards, in the order of the job.
-        surfaces: checksum of the file of the surfaces; None without this file.
-    """
-
-    job: Mapping[str, Any]
-    shards: tuple[Shard, ...] = ()
-    surfaces: str | None = None
-
-    @property
-    def views(self) -> int:
-        """Number of clouds in all shards."""
-        return sum(shard.views for shard in self.shards)
-
-    @property
-    def left_out(self) -> int:
-        """Number of clouds that were left out, over all shards."""
-        return sum(shard.left_out for shard in self.shards)
-
-    def write(self, directory: Path) -> None:
-        """Write the manifest to the dataset's directory, replacing the one there.
-
-        Raises:
-            OSError: the directory cannot be written.
-        """
-        table = {
-            "format": MANIFEST_FORMAT,
-            "views": self.views,
-            "left_out": self.left_out,
-            "job": self.job,
-            "shards": [dataclasses.asdict(shard) for shard in self.shards],
-            **({} if self.surfaces is None else {"surfaces": self.surfaces}),
-        }
-        checksum = content_digest([_dump(table)])
-        write_text(directory / MANIFEST, _dump({**table, "sha256": checksum}))
-
-    @classmethod
-    def parse(cls, content: bytes, path: Path) -> "Manifest":
-        """Parse the manifest from the bytes of a file.
-
-        Raises:
-            InputError: the manifest is damaged or has another format; the message names `path`.
-        """
-        try:
-            table = json.loads(content)
-            if table["format"] == MANIFEST_FORMAT:
-                checksum = table.pop("sha256")
-                if checksum != content_digest([_dump(table)]):
-                    raise ValueError("its checksum differs")
-                shards = tuple(Shard(**shard) for shard in table["shards"])
-                return cls(table["job"], shards, table.get("surfaces"))
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
-        raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
-
-
-@dataclasses.dataclass(frozen=True)
 class ViewDataset:
-    """A finished dataset; its length is the number of clouds.
+    """A dataset, which may be unfinished unless it comes from `open`; its length is the number of clouds.
 
     Attributes:
         directory: path of the dataset.
-        manifest: contents of the dataset.
-        digest: SHA-256 of the manifest, which contains the checksums of all shards.
+        job: everything that determines the views, in JSON types. `objects` is a list of tables with `name` and `mesh`
+            (the mesh's checksum); `shards` is the number of shards.
+        shards: finished shards, ordered by class and view.
+        surfaces_sha256: checksum of the file of the surfaces; None without this file.
     """
 
     directory: Path
-    manifest: Manifest
-    digest: str
+    job: Mapping[str, Any]
+    shards: tuple[Shard, ...] = ()
+    surfaces_sha256: str | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> "ViewDataset":
@@ -188,51 +129,85 @@ class ViewDataset:
             InputError: the directory or its manifest is missing, the manifest is damaged or of another format or
                 descriptor version, or the rendering is not finished.
         """
-        directory = Path(path)
+        directory, manifest = Path(path), Path(path) / MANIFEST
         if not directory.is_dir():
             raise InputError(f"dataset: {directory} is not a directory; expected the output of `thor2 render`")
         try:
-            content = read_file(directory / MANIFEST)
+            dataset = cls.read_manifest(directory)
         except OSError as error:
             raise InputError(
-                f"dataset: {directory / MANIFEST} cannot be read ({error.strerror}); expected output of `thor2 render`"
+                f"dataset: {manifest} cannot be read ({error.strerror}); expected output of `thor2 render`"
             ) from None
-        manifest = Manifest.parse(content, directory / MANIFEST)
-        version = manifest.job["descriptor_version"]
+        version, n_shards = dataset.job["descriptor_version"], dataset.job["shards"]
         if version != DESCRIPTOR_VERSION:
             raise InputError(
-                f"dataset: {directory / MANIFEST} has views for descriptor version {version}; expected version "
+                f"dataset: {manifest} has views for descriptor version {version}; expected version "
                 f"{DESCRIPTOR_VERSION}; render the views again"
             )
-        if len(manifest.shards) != manifest.job["shards"]:
+        if len(dataset.shards) != n_shards:
             raise InputError(
-                f"dataset: {directory / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
-                "repeat the `thor2 render` command to finish it"
+                f"dataset: {manifest} lists {len(dataset.shards)} of {n_shards} shards; repeat the `thor2 render` "
+                "command to finish it"
             )
-        return cls(directory, manifest, content_digest([content]))
+        return dataset
+
+    @classmethod
+    def read_manifest(cls, directory: Path) -> "ViewDataset":
+        """Read the manifest of a dataset that may be unfinished.
+
+        Raises:
+            InputError: the manifest is damaged or has another format.
+            OSError: the manifest cannot be read.
+        """
+        path = directory / MANIFEST
+        content = read_file(path)
+        try:
+            table = json.loads(content)
+            if table["format"] == MANIFEST_FORMAT:
+                checksum = table.pop("sha256")
+                if checksum != content_digest([_dump(table)]):
+                    raise ValueError("its checksum differs")
+                shards = tuple(Shard(**shard) for shard in table["shards"])
+                return cls(directory, table["job"], shards, table.get("surfaces"))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
+        raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
+
+    @functools.cached_property
+    def manifest(self) -> str:
+        """The content of the manifest."""
+        table = {
+            "format": MANIFEST_FORMAT,
+            "views": len(self),
+            "left_out": self.left_out,
+            "job": self.job,
+            "shards": [dataclasses.asdict(shard) for shard in self.shards],
+            **({} if self.surfaces_sha256 is None else {"surfaces": self.surfaces_sha256}),
+        }
+        return _dump({**table, "sha256": content_digest([_dump(table)])})
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the manifest, which contains the checksums of all shards."""
+        return content_digest([self.manifest])
 
     def __len__(self) -> int:
-        return self.manifest.views
+        return sum(shard.views for shard in self.shards)
+
+    @property
+    def left_out(self) -> int:
+        """Number of clouds that were left out, over all shards."""
+        return sum(shard.left_out for shard in self.shards)
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the objects; labels are indices into this tuple."""
-        return tuple(entry["name"] for entry in self.manifest.job["objects"])
-
-    @property
-    def shards(self) -> tuple[Shard, ...]:
-        """The shards, ordered by class and view."""
-        return self.manifest.shards
+        return tuple(entry["name"] for entry in self.job["objects"])
 
     @property
     def record(self) -> Mapping[str, Any]:
         """Description of the dataset for the record of a run, in JSON types."""
-        return {
-            "digest": self.digest,
-            "views": self.manifest.views,
-            "left_out": self.manifest.left_out,
-            "job": self.manifest.job,
-        }
+        return {"digest": self.digest, "views": len(self), "left_out": self.left_out, "job": self.job}
 
     @functools.cached_property
     def surfaces(self) -> Surfaces | None:
@@ -241,7 +216,7 @@ class ViewDataset:
         Raises:
             InputError: their file is missing or damaged.
         """
-        digest = self.manifest.surfaces
+        digest = self.surfaces_sha256
         return None if digest is None else Surfaces.of_content(self.content(SURFACES_FILE, digest))
 
     def content(self, file: str, digest: str, command: str = "`thor2 render`") -> bytes:
@@ -273,26 +248,35 @@ class ViewDataset:
         Raises:
             InputError: the dataset has no crops or smaller ones, or a file is missing or damaged.
         """
-        return read_crops(self, index, size)
+        directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
+        stored, files = read_crop_manifest(directory)
+        if stored["dataset"] != self.digest:
+            raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
+        if stored["crops"] < size:
+            raise InputError(
+                f"dataset: {directory} has crops of {stored['crops']} pixels; expected at least {size}; delete it and "
+                f"render with --crops {size}"
+            )
+        content = self.content(f"{CROPS}/{name}", files.get(name, ""), "`thor2 render` with --crops")
+        with np.load(io.BytesIO(content)) as arrays:
+            return ViewCrops(arrays["color"], arrays["normals"]).reduced(size)
 
 
-def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
-    """Return the manifest with the intact shards; write it if it is missing or lists damaged shards.
+def _begin(directory: Path, job: Mapping[str, Any]) -> ViewDataset:
+    """Return the dataset with its intact shards; write the manifest if it is missing or lists damaged shards.
 
     Raises:
         InputError: the directory holds another job.
         OSError: the directory cannot be written.
     """
-    path = directory / MANIFEST
-    stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
-    if stored:
-        check_same_job(directory, stored.job, job)
-    shards = stored.shards if stored else ()
-    is_intact = [intact_content(directory, shard.file, shard.sha256) is not None for shard in shards]
-    manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)), stored.surfaces if stored else None)
-    if manifest != stored:
-        manifest.write(directory)
-    return manifest
+    exists = (directory / MANIFEST).exists()
+    stored = ViewDataset.read_manifest(directory) if exists else ViewDataset(directory, job)
+    check_same_job(directory, stored.job, job)
+    intact = (shard for shard in stored.shards if intact_content(directory, shard.file, shard.sha256) is not None)
+    dataset = dataclasses.replace(stored, shards=tuple(intact))
+    if dataset != stored or not exists:
+        write_text(directory / MANIFEST, dataset.manifest)
+    return dataset
 
 
 def _store(path: Path, label: int, planned: int, rendered: Sequence[tuple[int, int, Cloud]]) -> Shard:
@@ -336,26 +320,22 @@ def render_dataset(
     record, labels = job.record(), {name: label for label, name in enumerate(job.meshes)}
     total = len(labels) * len(job.angles) * job.copies
     with locked(out):
-        manifest = _begin(out, record)
-        done = {shard.file: shard for shard in manifest.shards}
-        digest = manifest.surfaces
+        dataset = _begin(out, record)
+        done = {shard.file: shard for shard in dataset.shards}
+        digest = dataset.surfaces_sha256
         is_missing = digest is not None and intact_content(out, SURFACES_FILE, digest) is None
         if is_missing or not (digest or done):  # a dataset of an earlier version has shards and no surfaces
             digest = write_checked(out / SURFACES_FILE, surfaces_of(job.read_meshes(progress)).content)
-            manifest = dataclasses.replace(manifest, surfaces=digest)
-            manifest.write(out)
-        progress("render", _clouds(done), total, "")
+            dataset = dataclasses.replace(dataset, surfaces_sha256=digest)
+            write_text(out / MANIFEST, dataset.manifest)
+        progress("render", len(dataset) + dataset.left_out, total, "")
         missing = [file for file in job.shards if file not in done]
         with contextlib.closing(pool(render_task, job.tasks(missing))) as results:
             for file, rendered in zip(missing, results, strict=True):
                 name, views = job.shards[file]
                 with with_context(f"object {name!r}"):
                     done[file] = _store(out / file, labels[name], job.copies * len(views), rendered)
-                shards = tuple(done[file] for file in job.shards if file in done)
-                dataclasses.replace(manifest, shards=shards).write(out)
-                progress("render", _clouds(done), total, "")
-    return ViewDataset.open(out)
-
-
-def _clouds(shards: Mapping[str, Shard]) -> int:
-    return sum(shard.views + shard.left_out for shard in shards.values())
+                dataset = dataclasses.replace(dataset, shards=tuple(done[each] for each in job.shards if each in done))
+                write_text(out / MANIFEST, dataset.manifest)
+                progress("render", len(dataset) + dataset.left_out, total, "")
+    return dataset

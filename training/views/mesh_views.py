@@ -142,18 +142,14 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
                 yield number, copy, augment(other, task.augmentations, rng)
 
 
-def _clouds(task: ViewTask) -> Iterator[tuple[int, int, "Cloud"]]:
-    clouds = ((number, copy, cloud_of(view)) for number, copy, view in all_views(task))
-    return ((number, copy, cloud) for number, copy, cloud in clouds if len(cloud[0]) >= MIN_VIEW_POINTS)
-
-
 def render_task(task: ViewTask) -> list[tuple[int, int, "Cloud"]]:
     """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy.
 
     Each entry has the index of the view among all views of the object, the number of the copy (0 is the view as
     rendered), and the cloud.
     """
-    return list(_clouds(task))
+    clouds = ((number, copy, cloud_of(view)) for number, copy, view in all_views(task))
+    return [(number, copy, cloud) for number, copy, cloud in clouds if len(cloud[0]) >= MIN_VIEW_POINTS]
 
 
 def _read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
@@ -167,13 +163,21 @@ def _checked_meshes(
     """Yield each object's name and mesh, one at a time, so that unusable meshes are found before the long rendering.
 
     Raises:
-        InputError: there are no meshes, or a mesh is unreadable or has no view of at least `MIN_VIEW_POINTS` points.
+        InputError: there are no meshes, or a mesh is unreadable, has views that may be too large to be normalized, or
+            has no view of at least `MIN_VIEW_POINTS` points.
     """
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
         mesh = _read_mesh(source)
-        if next(_clouds(ViewTask(name, mesh, angles)), None) is None:
+        diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        if SIGMA_S * diameter > MAX_VIEW_LENGTH:
+            raise InputError(
+                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
+                "stored; scale the mesh to metres"
+            )
+        views = all_views(ViewTask(name, mesh, angles))
+        if not any(len(cloud_of(view)[0]) >= MIN_VIEW_POINTS for *_, view in views):
             raise InputError(
                 f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
                 "mesh or leave it out"
@@ -228,8 +232,7 @@ class RenderJob:
         """
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be at least 0")
-        augmentations, camera = self.augmentations, TRAINING_CAMERA
-        checked = ((name, _checked_size(name, mesh)) for name, mesh in _checked_meshes(self.meshes, self.angles))
+        augmentations, camera, checked = self.augmentations, TRAINING_CAMERA, _checked_meshes(self.meshes, self.angles)
         # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
         intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
         return {
@@ -263,17 +266,6 @@ class RenderJob:
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
 
 
-def _checked_size(name: str, mesh: TexturedMesh) -> TexturedMesh:
-    """Return a mesh; raise InputError if its views may be too large to be stored."""
-    diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    if SIGMA_S * diameter > MAX_VIEW_LENGTH:
-        raise InputError(
-            f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
-            "stored; scale the mesh to metres"
-        )
-    return mesh
-
-
 def render_views(
     meshes: Mapping[str, Path | TexturedMesh], azimuth_step: float = 5.0, polar_step: float = 5.0
 ) -> dict[str, list["Cloud"]]:
@@ -289,11 +281,11 @@ def render_views(
         `view_angles`; views with fewer than `MIN_VIEW_POINTS` points are left out.
 
     Raises:
-        InputError: there are no meshes, a mesh is unreadable or never visible, or a step is invalid.
+        InputError: there are no meshes, a mesh is unreadable, too large or never visible, or a step is invalid.
     """
     angles = view_angles(azimuth_step, polar_step)
     tasks = (ViewTask(name, mesh, angles) for name, mesh in _checked_meshes(meshes, angles))
-    return {task.name: [cloud for _, _, cloud in _clouds(task)] for task in tasks}
+    return {task.name: [cloud for _, _, cloud in render_task(task)] for task in tasks}
 
 
 MESH_VIEWS = 60
@@ -317,7 +309,7 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int 
     name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
     augmentations = Augmentations.of_names(KINDS, copies=1)
     task = ViewTask(name, loaded, _evenly_spread(cameras), augmentations=augmentations)
-    clouds = enumerate(_clouds(task))
+    clouds = enumerate(render_task(task))
     views = [PreparedInstance(k, xyz, rgb, np.zeros(len(xyz), bool)) for k, (_, _, (xyz, rgb)) in clouds]
     if not views:
         raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")

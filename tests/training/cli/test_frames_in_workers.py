@@ -68,10 +68,10 @@ def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, 
             yield answer(part)
 
     with pytest.raises(InputError, match="depth"):
-        for _, answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
+        for answer in answer_frames_in_pool(arguments, frames, pool, range(len(frames))):
             answers.append(answer)
     assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(6)]
-    for one, (_, other) in zip(answers, expected, strict=False):
+    for one, other in zip(answers, expected, strict=False):
         for instance, again in zip(one.instances, other.instances, strict=True):
             np.testing.assert_array_equal(instance.probabilities, again.probabilities)
 

@@ -52,12 +52,17 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, r
 @pytest.mark.slow
 @pytest.mark.usefixtures("unfitted")
 def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
-    """The brick has a mesh and frames, the box a mesh, the book frames."""
+    """The brick has a mesh and frames, the box a mesh, the book frames; left out, it is not enrolled."""
     run = tmp_path / "run"
     command = ("--meshes", meshes, "--frames", frames, "--out", run, *STEPS, *TINY)
     with mock.patch.object(train_job, "train_run", wraps=train_job.train_run) as trained:
-        assert run_thor2("train", *command) == 0
-    assert list(trained.call_args.args[-1]) == ["book"]
+        for options, enrolled in (
+            ((*command, "--leave-out", "book", "--out", tmp_path / "less"), []),
+            (command, ["book"]),
+        ):
+            assert run_thor2("train", *options) == 0
+            assert list(trained.call_args.args[-1]) == enrolled
+    assert Recognizer.load(tmp_path / "less").classes == ("box", "brick")
     record: Any = load_run(run).record["dataset"]
     assert {entry["name"] for entry in record["job"]["objects"]} == {"box", "brick"}
     assert record["frames"]["instances"] == {"brick": 2, "book": 2}
@@ -81,6 +86,7 @@ def invalid(meshes: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory
         (frame / "labels.json").write_text(json.dumps({"labels": labels}))
     (folder / "full" / "file").touch()
     (folder / "names.json").write_text(json.dumps({"mug": "no_such_scan"}))
+    (folder / "case.json").write_text(json.dumps({"Box": "box", "box": "brick"}))
     return folder
 
 
@@ -90,6 +96,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("", "give one of --meshes and --dataset, --frames, or both"),
         ("--meshes absent", "absent: no such folder"),
         ("--meshes meshes --names names.json", "no_such_scan"),
+        ("--meshes meshes --names case.json", "'Box' and 'box' differ only by case"),
         ("--meshes meshes --leave-out nobody", "--leave-out has 'nobody'"),
         ("--meshes meshes --leave-out brick,box", "--leave-out has box, brick, all"),
         ("--meshes meshes --leave-out brick", "the objects are box; expected at least two"),

@@ -1,7 +1,5 @@
 """Scores and placements against values computed by hand."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -31,20 +29,11 @@ def test_metrics_without_answers_are_nan() -> None:
     assert np.isnan([error, area, *scores.accuracy_at_coverage(nothing, nothing), *unknown]).all()
 
 
-def test_coverage_matches_hand_calculation() -> None:
-    confidence = np.arange(1, 21) / 20
-    correct = np.ones(20, bool)
-    correct[[0, 5]] = False
-    assert scores.accuracy_at_coverage(confidence, correct) == pytest.approx((0.1, 18 / 19))
-    confidence[0] = 0.1  # as confident as the next answer, so that both are accepted
-    assert scores.accuracy_at_coverage(confidence, correct) == pytest.approx((0.1, 18 / 20))
-
-
 def test_unknown_named_matches_a_search_of_thresholds() -> None:
     """The oracle tries every threshold and takes the largest one that keeps enough."""
     rng = np.random.default_rng(3)
-    correct, unknown = rng.integers(0, 12, 20) / 11, rng.integers(0, 12, 15) / 11
-    kept = np.array([0.05, 0.5, 0.95, 1.0])
+    correct, unknown = rng.integers(0, 30, 25) / 29, rng.integers(0, 30, 90) / 29
+    kept = np.array([0.05, 0.28, 0.56, 0.95, 1.0])  # 0.28 * 25 is more than 7 in floating point
     by_search = []
     for share in kept:
         enough = [t for t in np.unique(correct) if (correct >= t).sum() >= share * len(correct) - 1e-9]
@@ -95,13 +84,3 @@ def test_moved_renamed_and_new_objects_have_new_placements() -> None:
         ({k: (f"object {k}", (0.1 * k, 0.2, 1)) for k in (2, 3)}, [4, 5, 6, 7]),
     ):
         assert numbers(video([FOUR, FOUR | changes])) == [[0, 1, 2, 3], expected]
-
-
-def test_accuracy_and_steadiness_by_hand() -> None:
-    """Placement 7 has one of four correct, 9 is all correct; its two answers of three agree, so do three of four."""
-    placement, correct = np.array([[7, 9, 7, 9, 7, 9, 7, 4], [1, 1, 0, 1, 0, 1, 0, 0]])
-    assert scores.placement_accuracy(placement, correct) == pytest.approx((0.25 + 1 + 0) / 3)
-    answers, nothing = np.array([3, 0, 2, 0, 2, 1, 2, 5]), placement[:0]
-    assert scores.steadiness(placement, answers) == pytest.approx((3 + 2) / (4 + 3))
-    assert math.isnan(scores.steadiness(placement[:2], answers[:2])) and math.isnan(scores.steadiness(nothing, nothing))
-    assert math.isnan(scores.placement_accuracy(nothing, nothing))

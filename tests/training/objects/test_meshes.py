@@ -1,6 +1,5 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
-import functools
 import json
 import logging
 import os
@@ -16,7 +15,7 @@ from refusals import assert_refused
 from rendered_objects import write_box
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from training.objects.mesh import TexturedMesh, merge_meshes
+from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh, read_mesh, read_names, scaled_meshes
 from training.rendering.camera import RayCaster
 
@@ -71,23 +70,20 @@ def test_colours_are_those_of_the_file(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(mesh.centre, [0.05, 0.05, 0])
 
 
-def test_face_colours(tmp_path: Path) -> None:
+def test_colours_of_faces_and_of_parts(tmp_path: Path) -> None:
     colors = [[10, 20, 30], [40, 50, 60]]
     trimesh.Trimesh(QUAD, QUAD_FACES, face_colors=colors, process=False).export(tmp_path / "quad.ply")
     assert quadrant_colors(load_mesh(tmp_path / "quad.ply"))[1::2] == colors
-
-
-def test_parts_of_a_scene_are_placed_and_merged(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    for index, color in enumerate([(255, 0, 0), (0, 0, 255)]):
-        part = textured_quad(PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), color)))
-        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, index * 0.2]))
-    scene.export(tmp_path / "two.glb")
-    mesh = load_mesh(tmp_path / "two.glb")
-    assert len(mesh.faces) == 4 and len(mesh.textures) == 2
-    height = mesh.vertices[mesh.faces[:, 0], 2]
-    colors = mesh.colors_at(np.arange(4), np.full((4, 2), 0.3))
-    assert colors[height < 0.1].tolist() == [[255, 0, 0]] * 2 and colors[height > 0.1].tolist() == [[0, 0, 255]] * 2
+    textured = [textured_quad(PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), tuple(c)))) for c in colors]
+    for parts in (textured, [colored(QUAD, [color] * 4) for color in colors]):
+        scene = trimesh.Scene()
+        for index, part in enumerate(parts):
+            scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, index * 0.2]))
+        scene.export(tmp_path / "two.glb")
+        mesh = load_mesh(tmp_path / "two.glb")
+        of_face = (mesh.vertices[mesh.faces[:, 0], 2] > 0.1).astype(int)
+        assert sorted(of_face) == [0, 0, 1, 1]
+        np.testing.assert_array_equal(mesh.colors_at(np.arange(4), np.full((4, 2), 0.3)), np.array(colors)[of_face])
 
 
 def test_texture_repeats_outside_the_unit_square() -> None:
@@ -96,14 +92,6 @@ def test_texture_repeats_outside_the_unit_square() -> None:
     corners = mesh.colors_at(np.zeros(3, int), np.array([[0, 0], [1, 0], [0, 1.0]]))
     assert corners.tolist() == [[0, 255, 0], [0, 0, 255], [255, 255, 255]]
     assert mesh.colors_at(np.zeros(0, int), np.zeros((0, 2))).shape == (0, 3)
-
-
-def test_meshes_of_one_kind_of_colours_are_merged() -> None:
-    painted = TexturedMesh(QUAD, QUAD_FACES.astype(np.int32), corner_colors=np.full((2, 3, 3), 7, np.uint8))
-    assert merge_meshes([painted, painted]).corner_colors.shape == (4, 3, 3)
-    corner_uv = np.zeros((2, 3, 2), np.float32)
-    textured = TexturedMesh(QUAD, QUAD_FACES.astype(np.int32), corner_uv, (CHECKERS,), np.zeros(2, np.int32))
-    assert_refused("vertex colours", merge_meshes, [painted, textured])
 
 
 ASCII_PLY = trimesh.exchange.ply.export_ply(colored(QUAD), encoding="ascii")
@@ -115,8 +103,12 @@ def check_refused(path: Path, message: str) -> None:
 
 def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
     check_refused(tmp_path / "missing.glb", "no such file")
-    (tmp_path / "mesh.stl").touch()
-    check_refused(tmp_path / "mesh.stl", ".glb, .obj, .ply")
+    for name, message in (("mesh.stl", ".glb, .obj, .ply"), ("mesh.glb", "not a GLB file")):
+        (tmp_path / name).touch()
+        check_refused(tmp_path / name, message)
+    mixed = trimesh.Scene([colored(QUAD), textured_quad(PBR)])
+    mixed.export(tmp_path / "mixed.glb")
+    check_refused(tmp_path / "mixed.glb", "some parts .* vertex colours")
     for mesh, message in (
         (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
         (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
@@ -159,20 +151,17 @@ def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
         np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
 
 
-def test_unsupported_extensions_of_gltf(tmp_path: Path) -> None:
-    quad, path = textured_quad(PBR), tmp_path / "quad.glb"
-    for name in ("KHR_texture_transform", "KHR_draco_mesh_compression"):
-        quad.export(path, tree_postprocessor=functools.partial(dict.update, extensionsUsed=[name]))
-        check_refused(path, f"it uses {name}")
+@pytest.mark.parametrize("name", ["KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"])
+def test_unsupported_extensions_of_gltf(tmp_path: Path, name: str) -> None:
+    """The buffer has no content, as in the files of gltfpack."""
 
     def compress(tree: dict[str, Any]) -> None:
-        """Refer to a buffer without content, as the files of gltfpack do."""
-        tree["extensionsUsed"] = ["EXT_meshopt_compression"]
+        tree["extensionsUsed"] = [name]
         for view in tree["bufferViews"]:
             view["buffer"] = 1
 
-    quad.export(path, tree_postprocessor=compress)
-    check_refused(path, "it uses EXT_meshopt_compression")
+    textured_quad(PBR).export(tmp_path / "quad.glb", tree_postprocessor=compress)
+    check_refused(tmp_path / "quad.glb", f"it uses {name}")
 
 
 def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
@@ -208,22 +197,6 @@ def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:
         check_refused(path, "texture coordinates are not finite, or beyond")
 
 
-def test_damaged_lines_of_an_obj(tmp_path: Path) -> None:
-    lines = "v 0.0 0.0 0.0\nv 0.1 0.0 0.0\nv 0.1 0.1 0.0\nvt 0.0 0.0\nvt 1.0 0.0\nvt 1.0 1.0\nf 1/1 2/2 3/3\n"
-    content, path = f"mtllib material.mtl\nusemtl material_0\n{lines}", tmp_path / "quad.obj"
-    textured_quad(SIMPLE).export(tmp_path / "whole.obj")
-    path.write_text(content)
-    assert len(load_mesh(path).faces) == 1
-    for line, other, message in (
-        ("vt 1.0 1.0", "vt 1.0", r"shape \(1,3,2\)"),
-        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"shape \(3,3\)"),
-        ("v 0.1 0.1 0.0", "v", "cannot be read"),
-        ("3/3", "9/3", "cannot be read|faces"),
-    ):
-        path.write_text(content.replace(line, other))
-        check_refused(path, message)
-
-
 def put(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -252,26 +225,23 @@ def test_names_of_meshes_are_normal(tmp_path: Path) -> None:
 def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     assert_refused("nowhere: no such folder", find_meshes, tmp_path / "nowhere")
     assert_refused("no .glb, .obj, .ply file", find_meshes, tmp_path)
-    put(tmp_path, "mug.glb")
-    assert_refused("no mesh for bowl, dish", find_meshes, tmp_path, {"a": "dish", "b": "bowl", "c": "mug"})
-    put(tmp_path, "mug.obj")
-    assert_refused("'mug'", find_meshes, tmp_path)
+    put(tmp_path, "mug.glb", "mug.obj")
+    assert_refused("no mesh for bowl, dish", find_meshes, tmp_path, {"a": "dish", "b": "bowl"})
+    assert_refused("'mug' is there twice", find_meshes, tmp_path)
 
 
 def test_names_files(tmp_path: Path) -> None:
     (tmp_path / "names.json").write_text(json.dumps({"mug": "025_mug"}))
     (tmp_path / "names.yaml").write_text("mug: 025_mug\n")
     assert read_names(tmp_path / "names.json") == read_names(tmp_path / "names.yaml") == {"mug": "025_mug"}
-    for file, content, message in (
-        ("names.yaml", "", "holds a NoneType"),
-        ("names.json", "{", "is damaged"),
-        ("names.json", "{}", "it is empty"),
-        ("names.json", '{"mug": 25}', "both strings, not 'mug': 25"),
-        ("names.yaml", "25: mug", "both strings, not 25: 'mug'"),
-        ("names.json", '{"mug": ""}', "both strings"),
+    for content, message in (
+        ("{}", "it is empty"),
+        ('{"mug": 25}', "both strings, not 'mug': 25"),
+        ("25: mug", "both strings, not 25: 'mug'"),
+        ("mug: ''", "both strings"),
     ):
-        (tmp_path / file).write_text(content)
-        assert_refused(f"names file {tmp_path / file}.*{message}", read_names, tmp_path / file)
+        (tmp_path / "names.yaml").write_text(content)
+        assert_refused(f"names file {tmp_path / 'names.yaml'}.*{message}", read_names, tmp_path / "names.yaml")
     assert_refused("absent.json is missing", read_names, tmp_path / "absent.json")
 
 

@@ -34,12 +34,3 @@ def test_siblings_share_shape_or_paint() -> None:
         assert not np.array_equal(first.textures[0], second.textures[0])
         assert np.array_equal(third.textures[0], fourth.textures[0])
         assert third.vertices.shape != fourth.vertices.shape or not np.allclose(third.vertices, fourth.vertices)
-
-
-def test_shapes_and_colors_differ() -> None:
-    extents = np.array([np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in OBJECTS[::5]])
-    means = [[texture.reshape(-1, 3).mean(axis=0) for texture in mesh.textures] for mesh in OBJECTS[::5]]
-    colors = np.array([np.mean(of_textures, axis=0) for of_textures in means])
-    for values, least in ((extents, 1e-3), (colors, 2)):
-        distance = np.linalg.norm(values[:, None] - values, axis=-1)
-        assert distance[~np.eye(len(values), dtype=bool)].min() > least

@@ -76,14 +76,11 @@ def test_matches_another_intersector_and_crops_nothing_visible(azimuth: float, p
     assert np.abs(depth - expected * 1000).max() <= 0.501
 
 
-def test_an_object_outside_the_image_leaves_it_empty() -> None:
+def test_objects_outside_the_image_and_cameras_inside_an_object() -> None:
     mesh = surface(trimesh.creation.box([0.1] * 3), RED)
     for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):
         view = render_view(RayCaster([mesh]), camera_pose(0.0, 1.5, np.array(centre)), CAMERA)
         assert not view.depth.any() and not view.color.any()
-
-
-def test_camera_inside_the_bounding_box_sees_the_whole_image() -> None:
     view = render_view(RayCaster([surface(trimesh.creation.box([1.0] * 3), RED)]), np.eye(4), CAMERA)
     assert view.depth.shape == (CAMERA.height, CAMERA.width) and set(np.unique(view.depth)) == {500}
     assert view.corner == (0, 0) and view.intrinsics == CAMERA.intrinsics

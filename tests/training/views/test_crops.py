@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 from unittest import mock
 
@@ -150,15 +149,6 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
     np.testing.assert_array_equal(box.color, dataset.read_crops(1 - index, SIZE).color)
 
 
-def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
-    copied = shutil.copytree(dataset.directory, tmp_path / "views", ignore=shutil.ignore_patterns("crops"))
-    (copied / "crops").mkdir()
-    for file in (dataset.directory / "crops").glob("*.npz"):
-        (copied / "crops" / file.name).write_text("a user's")
-    assert_refused("already contains", render_crops, RenderJob(find_meshes(meshes)), ViewDataset.open(copied), SIZE)
-    assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
-
-
 def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """The damaged file alone is written again; the dataset keeps its digest."""
     directory = dataset.directory / "crops"
@@ -181,6 +171,12 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
     training = TrainJob(tmp_path / "run", DEFAULT, dataset=plain.directory, baselines=["vit-cnn-small"])
     assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
+    mine = plain.directory / "crops" / "0000-0000.npz"
+    mine.parent.mkdir()
+    mine.write_text("a user's")
+    assert_refused("already contains", render_crops, job, plain, 8)
+    assert mine.read_text() == "a user's"
+    mine.unlink()
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
     other = json.loads(manifest.read_text()) | {"dataset": "0"}

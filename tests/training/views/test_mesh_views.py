@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from refusals import assert_refused
 from scipy.spatial import cKDTree
 
@@ -15,34 +14,31 @@ from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.camera import camera_pose, view_angles
 from training.views import mesh_views as views
 
-
-def ball(radius: float = 0.05) -> TexturedMesh:
-    shape = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    colors = np.where(shape.vertices[:, 2:] > 0, [220, 40, 30], [20, 60, 200]).astype(np.uint8)
-    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors[shape.faces])
+OBJECTS = builtin_objects()
+BALL = OBJECTS["tennis_ball"]
 
 
 def test_all_views_of_all_objects_in_order() -> None:
-    meshes = {"ball": ball(), "marble": ball(0.02)}
+    meshes = {"ball": BALL, "mug": OBJECTS["mug_blue"]}
     clouds = views.render_views(meshes, 120, 90)
     assert list(clouds) == list(meshes)
     for name, mesh in meshes.items():
         for cloud, angles in zip(clouds[name], view_angles(120, 90), strict=True):
-            for part, expected in zip(cloud, views.view_cloud(mesh, camera_pose(*angles, np.zeros(3))), strict=True):
+            for part, expected in zip(cloud, views.view_cloud(mesh, camera_pose(*angles, mesh.centre)), strict=True):
                 np.testing.assert_array_equal(part, expected, strict=True)
-    assert_refused("^pose", views.view_cloud, ball(), camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
+    assert_refused("^pose", views.view_cloud, BALL, camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
 
 
 def test_copies_depend_only_on_name_view_and_seed() -> None:
     """Copies do not depend on the angles of the task, and the view itself is not augmented."""
     angles, augmentations = view_angles(90, 90), Augmentations(illumination=Illumination(), copies=2)
-    whole = views.render_task(views.ViewTask("ball", ball(), angles, 0, augmentations, 7))
+    whole = views.render_task(views.ViewTask("ball", BALL, angles, 0, augmentations, 7))
     assert [numbers for *numbers, _ in whole] == [[view, copy] for view in range(12) for copy in range(3)]
-    part = views.render_task(views.ViewTask("ball", ball(), angles[5:7], 5, augmentations, 7))
+    part = views.render_task(views.ViewTask("ball", BALL, angles[5:7], 5, augmentations, 7))
     np.testing.assert_equal(part, whole[15:21])
-    np.testing.assert_equal(views.render_task(views.ViewTask("ball", ball(), angles)), whole[::3])
+    np.testing.assert_equal(views.render_task(views.ViewTask("ball", BALL, angles)), whole[::3])
     tasks = (("bowl", 0, 7), ("ball", 0, 8), ("ball", 1, 7))
-    others = [views.render_task(views.ViewTask(n, ball(), angles[:1], k, augmentations, seed)) for n, k, seed in tasks]
+    others = [views.render_task(views.ViewTask(n, BALL, angles[:1], k, augmentations, seed)) for n, k, seed in tasks]
     copies = [clouds[copy][2][1].tobytes() for clouds in (whole, *others) for copy in (1, 2)]
     assert len(set(copies)) == len(copies)
 
@@ -71,7 +67,7 @@ def test_golden_clouds(golden_files: tuple[Path, ...]) -> None:
 
 def golden_mesh(path: Path) -> TexturedMesh:
     """The mesh of a golden file: a built-in object, or a scan that stands beside it."""
-    if path.stem in (objects := builtin_objects()):
-        return objects[path.stem]
+    if path.stem in OBJECTS:
+        return OBJECTS[path.stem]
     name = path.stem.rpartition("_")[0]
     return load_mesh(find_meshes(path.parents[1] / "data" / "meshes", {name: name})[name])
