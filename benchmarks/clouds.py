@@ -15,7 +15,7 @@ import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import FEATURES, MLP, input_size
+from thor2_jax.networks.networks import FEATURES, MLP, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh

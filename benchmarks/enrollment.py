@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.gallery.compact_clouds import CompactClouds
-from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import LOOKS, augmented_view, embed_looks
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.networks.embedding import Embedding, load_default
 from training.evaluation.scores import auroc
 from training.readers.frames import FrameFolder
 

@@ -57,7 +57,7 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
 
     import colornet
     from thor2_jax import DescriptorConfig
-    from thor2_jax.networks import HIDDEN, MLP
+    from thor2_jax.networks.networks import HIDDEN, MLP
     from training.fitting.fit import FitContext, FitState, shard_batch, train_step
     from training.fitting.samples import describe_batch, sample_views
     from training.objects.builtin_objects import builtin_objects

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from benchmarks.timing import time_calls
 from thor2_jax.frames.prepared_instance import instance_view
 from thor2_jax.gallery.compact_clouds import CompactClouds
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import NEAREST, GalleryObject
 from thor2_jax.gallery.search import ExactSearch, IndexSearch
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
+from thor2_jax.networks.embedding import Embedding
 from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of

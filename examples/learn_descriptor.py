@@ -32,7 +32,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.files import check_output_directory
 from thor2_jax.model.run_directory import TrainedRun, save_run
-from thor2_jax.networks import MLP, feature_of, input_size
+from thor2_jax.networks.networks import MLP, feature_of, input_size
 from thor2_jax.recognizer import THOR2
 from training.evaluation.answers import fusions
 from training.evaluation.job import answer_frames

@@ -39,7 +39,8 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
-FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", "thor2_jax/model")
+ROOMS = "descriptor frames model networks surfaces".split()
+FOLDERS = ("colornet", "thor2_jax", *(f"thor2_jax/{room}" for room in ROOMS))
 """Directories whose modules are mutated."""
 
 MORE_TESTS = {

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.inference import infer
 from thor2_jax.model.run_directory import TrainedRun, save_run
-from thor2_jax.networks import FEATURES, MLP, EmbeddingSizes, input_size
+from thor2_jax.networks.embedding import Embedding
+from thor2_jax.networks.networks import FEATURES, MLP, EmbeddingSizes, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 from training.views.normalized_views import ViewSource

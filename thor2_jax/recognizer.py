@@ -31,7 +31,6 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import as_path
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, pack_instances, prepare_instance
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
@@ -40,10 +39,11 @@ from thor2_jax.model.inference import Inference, answers, compute_by_chunks, inf
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from thor2_jax.networks import THOR2
+from thor2_jax.networks.embedding import Embedding
+from thor2_jax.networks.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
-from thor2_jax.surface_evidence import compile_comparison, fit_poses
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surfaces.evidence import compile_comparison, fit_poses
+from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.networks import FEATURES
+from thor2_jax.networks.networks import FEATURES
 from training.augmentation.simulated_cameras import CHOOSE, through_camera
 from training.embedding.distractors import AUGMENTATIONS
 from training.evaluation.answers import FrameAnswers

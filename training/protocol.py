@@ -8,7 +8,7 @@ from typing import Any
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.networks import EMBEDDING, FEATURES, Feature, check_features
+from thor2_jax.networks.networks import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
 from training.embedding.distractors import AUGMENTATIONS, Distractors
 from training.fitting.loop import FitOptions

@@ -30,12 +30,12 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
-from thor2_jax.networks import EMBEDDING, MLP, Feature
+from thor2_jax.networks.embedding import Embedding
+from thor2_jax.networks.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import Distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views

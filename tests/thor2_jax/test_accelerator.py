@@ -20,10 +20,10 @@ import thor2_jax as thor2
 from benchmarks import run_gpu
 from benchmarks.timing import time_calls
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import References
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.networks import FEATURES, MLP
+from thor2_jax.networks.embedding import References
+from thor2_jax.networks.networks import FEATURES, MLP
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64

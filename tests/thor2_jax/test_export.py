@@ -16,7 +16,7 @@ from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.export import export_recognizer
 from thor2_jax.model.inference import infer
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import FEATURES
+from thor2_jax.networks.networks import FEATURES
 
 CONFIG = dataclasses.replace(SMALL_CONFIG, homology="gudhi", looks=4)
 

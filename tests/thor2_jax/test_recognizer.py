@@ -26,9 +26,9 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import feature_of
+from thor2_jax.networks.networks import feature_of
 from thor2_jax.recognizer import THOR2, Recognizer
-from thor2_jax.surface_evidence import fit_poses, sample_points, with_evidence
+from thor2_jax.surfaces.evidence import fit_poses, sample_points, with_evidence
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 

@@ -15,7 +15,7 @@ from small_clouds import random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.networks import feature_of
+from thor2_jax.networks.networks import feature_of
 
 RNG = np.random.default_rng(0)
 

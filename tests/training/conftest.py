@@ -15,8 +15,8 @@ from rendered_objects import write_box
 from small_runs import random_classifier
 
 from thor2_jax import figures
-from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
-from thor2_jax.networks import MLP, EmbeddingSizes, input_size
+from thor2_jax.networks.embedding import BACKGROUND, Embedding, References
+from thor2_jax.networks.networks import MLP, EmbeddingSizes, input_size
 from training import train_run
 from training.embedding import fit
 from training.fitting.fit import FitContext

@@ -18,7 +18,7 @@ from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from thor2_jax.networks import model_arrays
+from thor2_jax.networks.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting import loop

@@ -29,12 +29,12 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, Gallery
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import ColorTransform, Model
-from thor2_jax.networks import EMBEDDING, Classifier
+from thor2_jax.networks.embedding import Embedding
+from thor2_jax.networks.networks import EMBEDDING, Classifier
 from thor2_jax.types import PointClouds, matmul
 
 __all__ = ["Adaptation", "OnlineAdaptation", "adaptation_criterion", "camera_instances", "estimate_transform"]

@@ -25,7 +25,7 @@ from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.networks import EMBEDDING
+from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.types import PointClouds, Strips, matmul
 
 __all__ = ["ClassScores", "classifier_scores", "gallery_scores"]

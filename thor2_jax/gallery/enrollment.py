@@ -24,8 +24,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import MIN_POINTS, PreparedInstance, pack_instances
 from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
-from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.networks.embedding import Embedding, load_default
 
 __all__ = [
     "LOOKS",

@@ -26,9 +26,9 @@ from thor2_jax.gallery.search import ExactSearch, IndexSearch, one_blas_thread
 from thor2_jax.printable import check_name, find_name, first_names
 
 if TYPE_CHECKING:
-    from thor2_jax.gallery.embedding import References
-    from thor2_jax.surface_evidence import Sample
-    from thor2_jax.surfaces import Surfaces
+    from thor2_jax.networks.embedding import References
+    from thor2_jax.surfaces.evidence import Sample
+    from thor2_jax.surfaces.surfaces import Surfaces
 
 __all__ = ["Gallery", "GalleryObject"]
 
@@ -277,18 +277,18 @@ class Gallery:
     @functools.cached_property
     def surfaces(self) -> "dict[int, Surfaces]":
         """The surfaces of those objects that were enrolled with a mesh, by the number of the object."""
-        from thor2_jax.surfaces import Surfaces  # imports JAX, which a list of the objects does not need
+        from thor2_jax.surfaces.surfaces import Surfaces  # imports JAX, which a list of the objects does not need
 
         arrays = {number: views.surface for number, views in enumerate(self.objects.values())}
         return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
 
     def compared(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
-        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surface_evidence.compared`.
+        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surfaces.evidence.compared`.
 
         The probability of an object is its share of the odds of all objects with a surface and of 1. If a changed score
         exceeds 1, those of all objects with a surface are divided by it. Other objects keep their scores.
         """
-        from thor2_jax.surface_evidence import compared
+        from thor2_jax.surfaces.evidence import compared
 
         number = list(self.surfaces)
         odds = _score_odds(scores[:, number].astype(np.float64))

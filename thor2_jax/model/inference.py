@@ -24,8 +24,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
-from thor2_jax.networks import EMBEDDING
-from thor2_jax.surface_evidence import Sample, sample_points, with_evidence
+from thor2_jax.networks.networks import EMBEDDING
+from thor2_jax.surfaces.evidence import Sample, sample_points, with_evidence
 from thor2_jax.types import PointClouds
 
 __all__ = [

@@ -21,12 +21,12 @@ from colornet.colors import LUMA
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import EMBEDDING, MLP, THOR2, Classifier, Compiled, Feature, feature_of
+from thor2_jax.networks.embedding import Embedding, load_default
+from thor2_jax.networks.networks import EMBEDDING, MLP, THOR2, Classifier, Compiled, Feature, feature_of
 
 __all__ = ["ColorTransform", "Model"]
 

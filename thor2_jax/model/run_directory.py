@@ -40,9 +40,9 @@ from thor2_jax.files import (
     read_file,
     unpack_arrays,
 )
-from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.model.run_record import FORMAT_WITH_SURFACES, RUN_FILE, RUN_FORMAT, read_description
-from thor2_jax.networks import (
+from thor2_jax.networks.embedding import REFERENCES_FILE, Embedding
+from thor2_jax.networks.networks import (
     MLP,
     Classifier,
     Feature,
@@ -51,7 +51,7 @@ from thor2_jax.networks import (
     model_arrays,
     model_from_arrays,
 )
-from thor2_jax.surfaces import SURFACES_FILE, Surfaces
+from thor2_jax.surfaces.surfaces import SURFACES_FILE, Surfaces
 
 __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file"]
 

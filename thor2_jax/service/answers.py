@@ -20,7 +20,7 @@ from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.networks import THOR2
+from thor2_jax.networks.networks import THOR2
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest

@@ -28,7 +28,7 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.service.settings import Settings
-from thor2_jax.surface_evidence import compile_comparison
+from thor2_jax.surfaces.evidence import compile_comparison
 
 __all__ = ["Batcher", "CloudResult", "ExplanationPrograms", "InferenceEngine", "recognize"]
 

@@ -23,7 +23,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import Compiled
+from thor2_jax.networks.networks import Compiled
 from thor2_jax.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature

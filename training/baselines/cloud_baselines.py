@@ -21,7 +21,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import Linear, model_arrays, model_from_arrays
+from thor2_jax.networks.networks import Linear, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds, Strips
 from training.baselines.baseline import (
     BaselineInputs,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import model_arrays, model_from_arrays
+from thor2_jax.networks.networks import model_arrays, model_from_arrays
 from training.baselines.architectures import ARCHITECTURES, TEMPLATES, network_inputs
 from training.baselines.baseline import (
     FitTask,

@@ -27,7 +27,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import MLP, model_arrays, model_from_arrays
+from thor2_jax.networks.networks import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, as_given, compiled_network
 from training.fitting.calibration import sample_probabilities

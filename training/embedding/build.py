@@ -19,7 +19,7 @@ import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, reason_of
 from thor2_jax.files import check_output_file, remove_written
-from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.networks.embedding import Embedding
 from training.embedding.distractors import ObjectSource, sample_objects, samples_record
 from training.embedding.fit import fit_embedding, reference_views
 from training.fitting.loop import Checkpoints, fit_progress

@@ -24,8 +24,8 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, is_color
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import BACKGROUND, Embedding, References
-from thor2_jax.networks import EmbeddingSizes, class_cosines, projected_features
+from thor2_jax.networks.embedding import BACKGROUND, Embedding, References
+from thor2_jax.networks.networks import EmbeddingSizes, class_cosines, projected_features
 from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 from training.fitting.samples import Batch, Samples, describe_batch

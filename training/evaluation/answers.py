@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
-from thor2_jax.networks import FEATURES
+from thor2_jax.networks.networks import FEATURES
 from training.baselines.job import TITLES
 from training.storage.jobs import check_same_job
 

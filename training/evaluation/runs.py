@@ -21,7 +21,7 @@ from thor2_jax.model.inference import infer, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
-from thor2_jax.networks import EMBEDDING
+from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.recognizer import DescribedFrame, Recognizer
 from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file

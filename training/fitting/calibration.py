@@ -18,7 +18,7 @@ from thor2_jax.model.fusion import MAX_ODDS, Calibration, answer_features
 from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from thor2_jax.networks import EMBEDDING, MLP, feature_of
+from thor2_jax.networks.networks import EMBEDDING, MLP, feature_of
 from thor2_jax.types import Cloud
 from training.fitting.fit import FitContext
 from training.fitting.samples import Batch, Samples, describe_batch

@@ -1,4 +1,4 @@
-"""Surfaces of meshes, with which recognition compares the points of instances (`thor2_jax.surface_evidence`)."""
+"""Surfaces of meshes, with which recognition compares the points of instances (`thor2_jax.surfaces.evidence`)."""
 
 from collections.abc import Iterable
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from thor2_jax.descriptor.slicing import to_lab
-from thor2_jax.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
+from thor2_jax.surfaces.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
 from training.objects.mesh import TexturedMesh
 
 __all__ = ["surfaces_of"]

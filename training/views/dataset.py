@@ -18,8 +18,8 @@ object:
     copy    [V] int32       0 is the view as rendered, others are augmented copies
     camera  [V, 3] float32  position of the camera, scaled units; missing in datasets of earlier versions
 
-`surfaces.safetensors` has the surfaces of the objects (`thor2_jax.surfaces`); datasets of earlier versions lack
-this file.
+`surfaces.safetensors` has the surfaces of the objects (`thor2_jax.surfaces`); datasets of earlier versions lack this
+file.
 
 The manifest contains the job, that is, everything that determines the views, and the finished shards and the surfaces
 with their checksums. It contains no time stamps, so the same job always gives the same bytes.
@@ -50,7 +50,7 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import check_output_directory, content_digest, read_file, remove_written, write_text
-from thor2_jax.surfaces import SURFACES_FILE, Surfaces
+from thor2_jax.surfaces.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
 from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, locked, write_checked

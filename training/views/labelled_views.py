@@ -17,7 +17,7 @@ from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import augmented_view
 from thor2_jax.printable import check_name, normal_name
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surfaces.surfaces import Surfaces
 from training.readers.frames import FrameFolder
 from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
 from training.views.normalized_views import MemoryViews, NormalizedViews, SourceShard, ViewSource, normalize_views

@@ -26,7 +26,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds, matmul
 from training.views.crops import ViewCrops
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH

@@ -16,10 +16,10 @@ from small_clouds import random_clouds
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import search
 from thor2_jax.gallery.compact_clouds import CompactClouds
-from thor2_jax.gallery.embedding import BACKGROUND, References
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
-from thor2_jax.surface_evidence import evidence, sample_points
+from thor2_jax.networks.embedding import BACKGROUND, References
+from thor2_jax.surfaces.evidence import evidence, sample_points
 from thor2_jax.types import PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of

@@ -20,10 +20,10 @@ from written_files import files_of
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
-from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
+from thor2_jax.networks.embedding import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.surfaces import SURFACES_FILE
+from thor2_jax.surfaces.surfaces import SURFACES_FILE
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")

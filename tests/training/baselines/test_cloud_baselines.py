@@ -10,7 +10,7 @@ from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.networks import model_arrays
+from thor2_jax.networks.networks import model_arrays
 from training.baselines import cloud_baselines as module
 from training.baselines.baseline import BaselineInputs, Predictor
 from training.baselines.cloud_baselines import POINTS, PointNet, forest_features, load_pointnet

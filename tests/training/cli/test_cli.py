@@ -19,7 +19,7 @@ import colornet
 from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
 from thor2_jax.model.run_directory import load_run, save_run
-from thor2_jax.networks import FEATURES
+from thor2_jax.networks.networks import FEATURES
 from training import protocol, train_job
 from training.protocol import DEFAULT, PAPER, QUICK
 from training.readers.frames import frame_files

@@ -20,8 +20,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
-from thor2_jax.gallery.embedding import REFERENCES_FILE, Embedding
-from thor2_jax.networks import EmbeddingSizes, model_arrays
+from thor2_jax.networks.embedding import REFERENCES_FILE, Embedding
+from thor2_jax.networks.networks import EmbeddingSizes, model_arrays
 from training.embedding import build, fit
 from training.embedding import distractors as module
 from training.embedding.build import build_embedding

@@ -5,7 +5,7 @@ import pytest
 from sklearn.metrics import confusion_matrix
 from toy_recognizers import ToyRun, UntaughtRecognizer, toy_answer
 
-from thor2_jax.networks import FEATURES
+from thor2_jax.networks.networks import FEATURES
 from training.evaluation.answers import (
     ALL_CLASSIFIERS,
     EMBEDDED,

@@ -16,7 +16,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
-from thor2_jax.networks import MLP, Feature, feature_of, input_size
+from thor2_jax.networks.networks import MLP, Feature, feature_of, input_size
 from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.fit import FitContext

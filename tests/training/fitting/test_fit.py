@@ -15,7 +15,7 @@ from small_clouds import random_clouds
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.networks import MLP, model_arrays
+from thor2_jax.networks.networks import MLP, model_arrays
 from training import train_run
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions

@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from colornet.colors import MEAN_WHITE, to_lab
-from thor2_jax.surfaces import FAR, GRID, rotations
+from thor2_jax.surfaces.surfaces import FAR, GRID, rotations
 from training.objects.mesh import TexturedMesh
 from training.objects.surfaces import surfaces_of
 

@@ -23,7 +23,7 @@ from written_files import files_of
 
 import thor2_jax
 from thor2_jax.errors import InputError
-from thor2_jax.surfaces import SURFACES_FILE
+from thor2_jax.surfaces.surfaces import SURFACES_FILE
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination

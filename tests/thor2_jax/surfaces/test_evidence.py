@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_clouds import random_clouds
 
-from thor2_jax.surface_evidence import (
+from thor2_jax.surfaces.evidence import (
     REACH,
     SAMPLED,
     _fit_rows,
@@ -18,7 +18,7 @@ from thor2_jax.surface_evidence import (
     sample_points,
     with_evidence,
 )
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.descriptor.slicing import to_lab
-from thor2_jax.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
+from thor2_jax.surfaces.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
 from thor2_jax.types import PointClouds, matmul
 
 __all__ = ["Sample", "compared", "compile_comparison", "evidence", "fit_poses", "sample_points", "with_evidence"]

@@ -1,4 +1,4 @@
-"""Surfaces of classes, with which recognition compares the points of instances (`thor2_jax.surface_evidence`)."""
+"""Surfaces of classes, with which recognition compares the points of instances (`thor2_jax.surfaces.evidence`)."""
 
 import dataclasses
 import functools

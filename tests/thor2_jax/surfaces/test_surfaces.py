@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from thor2_jax.surfaces import Surfaces
+from thor2_jax.surfaces.surfaces import Surfaces
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 

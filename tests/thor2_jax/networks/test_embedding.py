@@ -17,8 +17,8 @@ from small_runs import SMALL_CONFIG
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.gallery.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
-from thor2_jax.networks import EmbeddingSizes
+from thor2_jax.networks.embedding import BACKGROUND, REFERENCES_FILE, Embedding, References, load_default
+from thor2_jax.networks.networks import EmbeddingSizes
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
 

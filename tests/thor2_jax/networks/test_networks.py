@@ -11,7 +11,7 @@ from flax import nnx
 from refusals import assert_refused
 from slow_tier import slow
 
-from thor2_jax.networks import FEATURES, MLP, SPARSE_BATCH, check_features
+from thor2_jax.networks.networks import FEATURES, MLP, SPARSE_BATCH, check_features
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))

@@ -30,7 +30,7 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, describe_looks, is_color
 from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays
-from thor2_jax.networks import (
+from thor2_jax.networks.networks import (
     Compiled,
     EmbeddingNetwork,
     EmbeddingSizes,

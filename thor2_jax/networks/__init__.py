@@ -1,0 +1,1 @@
+"""Neural networks: classifiers of descriptors, and embeddings of clouds."""

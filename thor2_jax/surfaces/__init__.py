@@ -1,0 +1,1 @@
+"""Surfaces of objects, with which the points of instances are compared."""
