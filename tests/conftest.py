@@ -222,7 +222,7 @@ def small_classifiers() -> Iterator[None]:
     """
     import small_runs
 
-    from thor2_jax import networks
+    from thor2_jax.networks import networks
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "HIDDEN", (32, 16))

@@ -9,9 +9,10 @@ from commands import Command, Recognize, json_lines
 from small_runs import SMALL_CONFIG, untrained_run
 from small_runs import small_embedding as embedding_of_tests
 
-from thor2_jax.gallery import embedding, enrollment
+from thor2_jax.gallery import enrollment
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
+from thor2_jax.networks import embedding
 from training import protocol
 from training.protocol import DEFAULT, PAPER
 from training.views import mesh_views
