@@ -43,8 +43,8 @@ def test_invalid_values_are_rejected_by_name(record: type, name: str, value: obj
 
 
 def test_released_convention_fixes_the_widths_and_borders() -> None:
-    assert_refused(r"sigma_1, sigma_2 are 0\.2, 0\.025", DescriptorConfig.released, sigma_1=0.2)
-    assert_refused(r"sigma_1, sigma_2 are 0\.1, 0\.05", DescriptorConfig.released, sigma_2=0.05)
+    assert_refused(r"sigma_1 is 0\.2; expected 0\.1 ", DescriptorConfig.released, sigma_1=0.2)
+    assert_refused(r"sigma_2 is 0\.05; expected 0\.025 ", DescriptorConfig.released, sigma_2=0.05)
     assert_refused("relaxation is Relaxation", DescriptorConfig.released, relaxation=Relaxation())
 
 
