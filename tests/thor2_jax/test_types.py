@@ -78,17 +78,13 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     [
         ({"clouds": []}, ["clouds is empty"]),
         ({"clouds": None}, ["clouds is a NoneType"]),
-        ({"clouds": iter([(POINTS, COLORS)])}, ["clouds is a list_iterator"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
-        ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb", "int64"]),
         ({"clouds": [(changed(POINTS, np.nan), COLORS)]}, ["clouds[0]", "xyz[1]", "nan"]),
-        ({"clouds": [(changed(POINTS, -np.inf), COLORS)]}, ["clouds[0]", "xyz[1]", "-inf"]),
         ({"clouds": [(changed(POINTS, 1e39), COLORS)]}, ["clouds[0]", "xyz[1]", "1e+39"]),
         ({"clouds": [(POINTS, changed(COLORS, 1.5))]}, ["clouds[0]", "rgb[1]", "1.5"]),
         ({"clouds": [(POINTS, changed(COLORS, -0.5))]}, ["clouds[0]", "rgb[1]", "-0.5"]),
-        ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
         ({"capacity": 2}, ["clouds[0]", "3", "at most 2, the capacity"]),
@@ -105,7 +101,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
-        ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
