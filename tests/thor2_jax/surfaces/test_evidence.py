@@ -114,8 +114,7 @@ def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> N
 
 def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views: list[Cloud]) -> None:
     whole = np.asarray(evidence(surfaces, PointClouds.pack(views), OWN))
-    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    padded = PointClouds.pack([views[4], empty, views[0]], 8192)
+    padded = PointClouds.pack([views[4], *random_clouds(0, [0]), views[0]], 8192)
     values = np.asarray(evidence(surfaces, padded, np.array([1, 2, 0])))
     assert np.array_equal(values, [whole[4], np.zeros(4), whole[0]])
 
@@ -197,8 +196,7 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
 
 
 def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
-    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    clouds = with_background([*views, empty], [3.0] * 10, [*views, views[0]])
+    clouds = with_background([*views, *random_clouds(0, [0])], [3.0] * 10, [*views, views[0]])
     samples = sample_points(clouds)
     each = [jax.tree.map(lambda field, k=k: field[k : k + 1], surfaces) for k in range(3)]
     for n in (3, 1):
@@ -221,9 +219,8 @@ def test_only_points_well_in_front_of_what_is_seen_are_in_free_space(surfaces: S
         assert (free == 0) != is_free, free
     for shift, expected in ((0, 1), (2, 0)):  # everything, nothing
         seen[..., :2] += shift
-        assert (
-            evidence(surfaces, dataclasses.replace(clouds, around=jnp.asarray(seen)), np.array([1]))[0, 3] == expected
-        )
+        moved = dataclasses.replace(clouds, around=jnp.asarray(seen))
+        assert evidence(surfaces, moved, np.array([1]))[0, 3] == expected
 
 
 @pytest.mark.usefixtures("x64")
