@@ -112,15 +112,12 @@ class DescriptorConfig:
             raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; expected a finite angle in radians")
         if not (self.relaxation is None or isinstance(self.relaxation, Relaxation)):
             raise InputError(f"DescriptorConfig.relaxation is {self.relaxation!r}; expected a Relaxation or None")
-        if self.convention == "released" and self.relaxation is not None:
-            raise InputError(
-                f"DescriptorConfig.relaxation is {self.relaxation}; expected None in the released convention"
-            )
-        if self.convention == "released" and (self.sigma_1, self.sigma_2) != (0.1, 0.025):
-            raise InputError(
-                f"DescriptorConfig.sigma_1, sigma_2 are {self.sigma_1}, {self.sigma_2}; expected 0.1, 0.025, the only "
-                "values of the released convention"
-            )
+        fixed = {"relaxation": None, "sigma_1": 0.1, "sigma_2": 0.025} if self.convention == "released" else {}
+        for name, value in fixed.items():
+            if getattr(self, name) != value:
+                raise InputError(
+                    f"DescriptorConfig.{name} is {getattr(self, name)}; expected {value} in the released convention"
+                )
 
     @classmethod
     def released(cls, **changes: Any) -> "DescriptorConfig":

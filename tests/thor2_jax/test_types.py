@@ -38,23 +38,17 @@ def test_pack_pads_copies_of_every_size_and_unpack_undoes_it() -> None:
     assert not packed.camera.any() and not packed.boundary.any() and packed.rim is None
 
 
-def test_packing_on_the_host_gives_equal_numpy_arrays() -> None:
-    clouds, boundary = random_clouds(0, (3, 0)), [np.array([True, False, True]), None]
-    packed = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, rim=boundary)
-    on_host = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, rim=boundary, on_host=True)
-    assert packed.around is None and on_host.around is None
-    for field in dataclasses.fields(packed)[:6]:
-        expected, actual = getattr(packed, field.name), getattr(on_host, field.name)
-        assert isinstance(expected, jax.Array) and isinstance(actual, np.ndarray)
-        assert actual.dtype == expected.dtype
-        np.testing.assert_array_equal(actual, expected)
-
-
 def test_pack_takes_colors_capacity_camera_boundary_and_rim() -> None:
     cloud = RNG.random((5, 3)), RNG.random((5, 3))
     marks = np.array([True, False, True, False, False])
     padded = [[False] * 9, [*marks, *[False] * 4]]
-    packed = thor2.PointClouds.pack([cloud] * 2, 9, camera=[1, 2, 3], boundary=[None, marks], rim=[None, marks])
+    packed, on_host = (
+        thor2.PointClouds.pack([cloud] * 2, 9, [1, 2, 3], [None, marks], rim=[None, marks], on_host=on_host)
+        for on_host in (False, True)
+    )
+    for expected, actual in zip(list(vars(packed).values())[:6], vars(on_host).values(), strict=False):
+        assert isinstance(expected, jax.Array) and isinstance(actual, np.ndarray)
+        np.testing.assert_array_equal(actual, expected, strict=True)
     assert packed.points.shape == (2, 9, 3)
     np.testing.assert_array_equal(packed.colors[0, :5], cloud[1].astype(np.float32))
     np.testing.assert_array_equal(packed.camera, [[1, 2, 3]] * 2)
@@ -78,17 +72,13 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     [
         ({"clouds": []}, ["clouds is empty"]),
         ({"clouds": None}, ["clouds is a NoneType"]),
-        ({"clouds": iter([(POINTS, COLORS)])}, ["clouds is a list_iterator"]),
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
-        ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb", "int64"]),
         ({"clouds": [(changed(POINTS, np.nan), COLORS)]}, ["clouds[0]", "xyz[1]", "nan"]),
-        ({"clouds": [(changed(POINTS, -np.inf), COLORS)]}, ["clouds[0]", "xyz[1]", "-inf"]),
         ({"clouds": [(changed(POINTS, 1e39), COLORS)]}, ["clouds[0]", "xyz[1]", "1e+39"]),
         ({"clouds": [(POINTS, changed(COLORS, 1.5))]}, ["clouds[0]", "rgb[1]", "1.5"]),
         ({"clouds": [(POINTS, changed(COLORS, -0.5))]}, ["clouds[0]", "rgb[1]", "-0.5"]),
-        ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
         ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
         ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
         ({"capacity": 2}, ["clouds[0]", "3", "at most 2, the capacity"]),
@@ -105,7 +95,6 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
         ({"boundary": True}, ["boundary", "bool", "1 clouds"]),
-        ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:

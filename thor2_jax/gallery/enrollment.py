@@ -61,22 +61,9 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
-    """Return an object's views and their augmented copies; the arguments are those of `_embed_views`."""
+    """Return an object's views and their `augmented_copies`."""
     views = list(clouds.views())
     return views + augmented_copies(views, source)
-
-
-def _embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float32]:
-    """Return the embeddings [V, K, D] of the looks at an object's views.
-
-    Args:
-        embedding: the embedding.
-        clouds: the views.
-        source: source of the views, see `augmented_copies`.
-    """
-    # Views of similar size share a bucket.
-    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    return embed_looks(embedding, views)
 
 
 def enrolled_object(
@@ -86,6 +73,14 @@ def enrolled_object(
     date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     flat = embeddings.reshape(-1, embeddings.shape[-1]).astype(np.float16)
     return GalleryObject(flat, clouds, source, date, surface)
+
+
+def _embedded_object(
+    embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None
+) -> GalleryObject:
+    # Views of similar size share a bucket.
+    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
+    return enrolled_object(embed_looks(embedding, views), clouds, source, surface)
 
 
 def enrolled_views(
@@ -101,8 +96,7 @@ def enrolled_views(
     """
     if not views:
         raise InputError("views is empty; expected at least one view of the object")
-    clouds = CompactClouds.of(views)
-    return enrolled_object(_embed_views(embedding, clouds, source), clouds, source, surface)
+    return _embedded_object(embedding, CompactClouds.of(views), source, surface)
 
 
 MAX_COPIES = 8
@@ -253,8 +247,7 @@ class ObjectGallery:
     def _reembedded(self, gallery: Gallery) -> Gallery:
         objects = {}
         for name, views in gallery.objects.items():
-            embeddings = _embed_views(self.embedding, views.clouds, views.source)
-            again = enrolled_object(embeddings, views.clouds, views.source, views.surface)
+            again = _embedded_object(self.embedding, views.clouds, views.source, views.surface)
             objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 

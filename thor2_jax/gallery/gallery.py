@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thor2_jax.surfaces.evidence import Sample
     from thor2_jax.surfaces.surfaces import Surfaces
 
-__all__ = ["Gallery", "GalleryObject"]
+__all__ = ["Gallery", "GalleryObject", "known_probability"]
 
 NEAREST = 128
 """Number of views in the regression of a query; using all views gives the same accuracy on held-out frames."""
@@ -109,6 +109,11 @@ Values = NDArray[np.floating[Any]]
 def _score_odds(scores: NDArray[Any]) -> NDArray[Any]:
     """Return the odds of scores against everything that is not enrolled."""
     return np.asarray((scores / EVEN) ** STEEPNESS)
+
+
+def known_probability(confidence: Any, share: Any) -> Any:
+    """Return the probability that an object is known, from the confidence of its best class and its gallery share."""
+    return (confidence + share) / (1 + share)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -335,11 +340,9 @@ class Gallery:
         return self._spread(scores, self.names)
 
     def _spread(self, values: Values, owners: tuple[str | None, ...]) -> Values:
-        result = np.zeros((len(values), len(self.answered_names)), values.dtype)
         column = {name: index for index, name in enumerate(owners)}
-        known = [index for index, name in enumerate(self.answered_names) if name in column]
-        result[:, known] = values[:, [column[self.answered_names[index]] for index in known]]
-        return result
+        padded = np.concatenate([values, np.zeros((len(values), 1), values.dtype)], axis=1)
+        return np.take(padded, [column.get(name, -1) for name in self.answered_names], axis=1)
 
     def combine(self, probabilities: Values | None, scores: Values) -> Values:
         """Combine the confidences of the classifiers with the scores of the gallery.
@@ -347,9 +350,8 @@ class Gallery:
         Each name gets a share. The share of a trained class is its confidence. The share of an enrolled object is 1 - c
         times the odds of its score, where c is the largest confidence of a class; a class with enrolled views gets the
         sum of both. The name with the largest share is the answer. Its value is c if its share is not larger than c.
-        Otherwise it is the probability that the object is known, (c + m) / (1 + m), where m is the largest share of an
-        enrolled object. The values of the other names are proportional to their shares. So an enrolled object is the
-        answer only if its score is high.
+        Otherwise it is `known_probability(c, m)`, where m is the largest share of an enrolled object. The values of the
+        other names are proportional to their shares. So an enrolled object is the answer only if its score is high.
 
         Args:
             probabilities: [B, C] fused probabilities; None if the gallery alone answers.
@@ -366,5 +368,5 @@ class Gallery:
         enrolled = (1 - c).clip(0) * self.of_gallery(odds)
         shares, m = trained + enrolled, enrolled.max(axis=1, keepdims=True, initial=0)
         largest = shares.max(axis=1, keepdims=True, initial=0)
-        value = np.where(largest > c, (c + m) / (1 + m), c)
+        value = np.where(largest > c, known_probability(c, m), c)
         return shares / np.maximum(largest, np.finfo(np.float32).tiny) * value

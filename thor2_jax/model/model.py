@@ -21,7 +21,7 @@ from colornet.colors import LUMA
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.gallery import Gallery
+from thor2_jax.gallery.gallery import Gallery, known_probability
 from thor2_jax.model.fusion import DEFAULT_RULE, FUSION_RULES, Calibration, FusionRule, fused_probabilities
 from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
@@ -228,8 +228,8 @@ class Model:
         if self.answers_by(answer_by) == "gallery":
             return thresholds
         c = self.calibration.unknown_below if self.calibration else 0.0
-        m = (1 - c) * thresholds / (1 - thresholds)
-        return np.where(self.gallery.has_output, (c + m) / (1 + m) if c else 0.0, thresholds)
+        both = known_probability(c, (1 - c) * thresholds / (1 - thresholds))
+        return np.where(self.gallery.has_output, both if c else 0.0, thresholds)
 
     def corrected(self, instance: PreparedInstance) -> PreparedInstance:
         """Return an instance with its colours corrected by `color_transform`."""

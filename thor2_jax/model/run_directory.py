@@ -30,7 +30,7 @@ from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import (
     as_path,
     atomic_directory,
@@ -57,6 +57,9 @@ __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file
 
 EMBEDDING_FILE = "embedding.safetensors"
 """File of a run's embedding, which replaces the packaged one."""
+
+INTACT_FILE = "the file of this run; copy the whole run directory"
+"""What messages about damaged files expect."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,11 +152,8 @@ def load_run(path: str | Path) -> TrainedRun:
         raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
     if names and not classes:
         raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
-    try:
+    with decoding(f"model: {path / 'network.npz'} cannot be read", INTACT_FILE):
         network = colornet.load(path / "network.npz")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"model: {path / 'network.npz'} cannot be read: {reason}") from None
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
     classifiers = {}
@@ -161,11 +161,9 @@ def load_run(path: str | Path) -> TrainedRun:
         sizes = input_size(name, config, network.n_regions), len(classes)
         classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
+    if "embedding" in description:
+        _intact(file, description["embedding"])  # the fingerprint of an embedding is the digest of its file
     embedding = Embedding.load(file, network) if file.is_file() else None
-    stored = None if embedding is None else embedding.fingerprint
-    if description.get("embedding", stored) != stored:
-        state = "is missing" if embedding is None else "is not the embedding that run.json names"
-        raise InputError(f"model: {file} {state}; copy the whole run directory")
     if embedding is not None and embedding.references is None and description.get("references"):
         raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
     surfaces = None
@@ -197,13 +195,13 @@ def _intact(path: Path, digest: str) -> bytes:
     except OSError as error:
         raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
     if content_digest([content]) != digest:
-        raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
+        raise InputError(
+            f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}; copy the whole run directory"
+        )
     return content
 
 
 def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
     content = _intact(path, digest)
-    try:
+    with decoding(f"model: {path} does not fit the classifier", INTACT_FILE):
         return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])
-    except ValueError as error:
-        raise InputError(f"model: {path} does not fit the classifier ({error})") from None

@@ -88,6 +88,7 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
     return _fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
 
 
+@jax.jit
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
@@ -96,7 +97,13 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     the distractors then become o^`ODDS_EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class
     that is most probable after this step.
     """
-    return _reweight(probabilities, surfaces, samples)
+    largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
+    is_compared = largest >= RIVAL * largest[:, :1]
+    rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
+    rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
+    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
+    changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
+    return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
 
 
 @jax.jit
@@ -164,17 +171,6 @@ def compared(
 def compile_comparison(samples: Sample) -> None:
     """Compile the programs of `compared`, which do not depend on the number of instances and names."""
     compared(np.ones((1, 1)) / 2, [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
-
-
-@jax.jit
-def _reweight(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
-    largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
-    is_compared = largest >= RIVAL * largest[:, :1]
-    rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
-    rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
-    changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
-    return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
 
 
 @jax.jit

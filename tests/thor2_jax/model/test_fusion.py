@@ -66,12 +66,6 @@ CALIBRATION = Calibration(-1.0, 0.5, 2.0, 0.25, 0.3, 0.6, 1.5)
 RECORD = dataclasses.asdict(CALIBRATION)
 
 
-def test_features_are_log_odds_of_answer_and_classes() -> None:
-    expected = np.log([[0.7 / 0.3, 0.9 / 0.1], [0.6 / 0.4, 0.011 / 0.989]])
-    np.testing.assert_allclose(answer_features(FUSED, EMBEDDED), expected)
-    np.testing.assert_array_equal(answer_features(np.array([[1.0, 0.0]]), np.zeros((1, 2))), [[8, -8]])
-
-
 def test_the_largest_probability_is_the_confidence() -> None:
     correct = 1 / (1 + np.exp(1 - 0.5 * np.log(0.7 / 0.3)))
     known = 1 / (1 + np.exp(-2 - 0.25 * np.log(0.9 / 0.1)))
@@ -83,7 +77,8 @@ def test_the_largest_probability_is_the_confidence() -> None:
     assert values[1, 2] < values[0, 0]
 
 
-def test_the_score_is_below_one() -> None:
+def test_extreme_probabilities_have_a_score_below_one() -> None:
+    np.testing.assert_array_equal(answer_features(np.array([[1.0, 0.0]]), np.zeros((1, 2))), [[8, -8]])
     steep = dataclasses.replace(CALIBRATION, correct_factor=100.0, known_factor=100.0)
     score = steep.score(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]))
     assert 0.999 < score[0] < 1

@@ -62,7 +62,11 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_a_run_directory_has_its_files_and_is_readable(saved: Path) -> None:
+def test_a_run_directory_has_its_files_and_is_readable(saved: Path, tmp_path: Path) -> None:
+    """A second one, in place of an empty directory, has equal bytes."""
+    (tmp_path / "run").mkdir()
+    save_run(make_run(), tmp_path / "run")
+    assert files_of(tmp_path) == {f"run/{name}": content for name, content in files_of(saved).items()}
     stems = ("embedding", "references", "surfaces", "weights/ce", "weights/tops")
     assert set(files_of(saved)) == {"network.npz", "run.json", *(f"{stem}.safetensors" for stem in stems)}
     assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
@@ -87,13 +91,6 @@ def edited(**changes: Any) -> Callable[[Path], None]:
         (path / "run.json").write_text(json.dumps(description | changes))
 
     return edit
-
-
-def test_an_equal_run_in_an_empty_directory_has_equal_bytes(saved: Path, tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    save_run(make_run(), tmp_path / "run")
-    assert [p.name for p in tmp_path.iterdir()] == ["run"]
-    assert files_of(tmp_path / "run") == files_of(saved)
 
 
 def flip_a_bit(path: Path) -> None:
@@ -123,31 +120,19 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "one string": (edited(classes="abc"), "classes is 'abc'"),
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
     "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
-    "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
-    "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
-    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
     "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
-    "other embedding": (other_embedding, "embedding.safetensors is not the embedding"),
+    "other embedding": (other_embedding, "embedding.safetensors is damaged: its"),
     "no embedding": (lambda path: (path / EMBEDDING_FILE).unlink(), "embedding.safetensors is missing"),
     "no references": (lambda path: (path / REFERENCES_FILE).unlink(), "references.safetensors is missing; copy"),
     "other surfaces": (lambda path: (path / SURFACES_FILE).write_bytes(b"0"), "surfaces.safetensors is damaged: its"),
-    "no surfaces": (lambda path: (path / SURFACES_FILE).unlink(), "surfaces.safetensors is missing; copy"),
     "no weights": (lambda path: weights_file(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 
 
-@pytest.fixture(scope="module")
-def small_heap() -> None:
-    """Freeze the objects that exist, for the rest of the process, so that a garbage collection takes milliseconds."""
-    gc.collect()
-    gc.freeze()
-
-
-@pytest.mark.usefixtures("small_heap")
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_run_directory_is_refused_in_one_line(name: str, saved: Path, tmp_path: Path) -> None:
     """A failed read leaves no open file, which would warn at garbage collection; warnings are errors here."""
