@@ -272,8 +272,9 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-MAX_YAML_SIZE = 2**24
-"""Largest size of a YAML file, also after its aliases are expanded: a few lines can expand to gigabytes."""
+MAX_YAML_BYTES = 2**24
+MAX_YAML_VALUES = 10**6
+"""Largest number of values in a YAML file after its aliases are expanded; a few lines can expand to gigabytes."""
 
 
 def parse_json(content: bytes) -> Any:
@@ -292,30 +293,38 @@ def parse_yaml(content: bytes) -> Any:
     """Return the value in a YAML file, built from plain types.
 
     Raises:
-        ValueError: the file is damaged, or larger than `MAX_YAML_SIZE`.
+        ValueError: the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
     """
     import yaml
 
-    too_large = f"expected at most {MAX_YAML_SIZE}"
-    if len(content) > MAX_YAML_SIZE:
-        raise ValueError(f"it has {len(content)} bytes; {too_large}")
+    if len(content) > MAX_YAML_BYTES:
+        raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:
         if b"<<" in content and any(
             isinstance(token, yaml.ScalarToken) and token.value == "<<" for token in yaml.scan(content)
         ):
             raise ValueError("it has a merge key (<<), which can repeat its entries without a limit")
         value = yaml.safe_load(content)
-        # The encoder refuses values that contain themselves, and integers of thousands of digits, which messages could
-        # not show.
-        size = 0
-        for text in json.JSONEncoder(ensure_ascii=False, skipkeys=True, default=str).iterencode(value):
-            size += len(text)
-            if size > MAX_YAML_SIZE:
-                raise ValueError(f"it has more characters after its aliases are expanded; {too_large}")
+        size = _expanded_size(value, {})
     # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.
     except Exception as error:
         raise ValueError(reason_of(error)) from None
+    if size > MAX_YAML_VALUES:
+        raise ValueError(f"its aliases expand to more than {MAX_YAML_VALUES} values")
     return value
+
+
+def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
+    """Return the number of values in `value`, counting shared ones each time they occur."""
+    if not isinstance(value, (dict, list, set, tuple)):
+        if isinstance(value, int):
+            str(value)  # raises ValueError for integers of thousands of digits, which messages could not show
+        return 1
+    if id(value) not in sizes:
+        sizes[id(value)] = math.inf  # a value that contains itself is infinite
+        parts = [*value, *value.values()] if isinstance(value, dict) else value
+        sizes[id(value)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
+    return sizes[id(value)]
 
 
 def read_table(path: Path, kinds: tuple[type, ...] = (dict,)) -> Any:

@@ -196,10 +196,11 @@ def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
 
 
 def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second file has 20 bytes, and its value 20 characters: [[1, 2], [1, 2], 34]."""
-    monkeypatch.setattr("thor2_jax.files.MAX_YAML_SIZE", 20)
-    assert parse_yaml(b"[&a [1,2],   *a, 34]") == [[1, 2], [1, 2], 34]
-    for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[&a [1,2],*a,345]", "aliases")):
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_BYTES", 20)
+    monkeypatch.setattr("thor2_jax.files.MAX_YAML_VALUES", 5)
+    assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
+    many = "more than 5 values"
+    for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[{1},1,1]", many), (b"[&a [1,2],*a,*a]", many)):
         with pytest.raises(ValueError, match=message):
             parse_yaml(content)
 

@@ -7,9 +7,8 @@ GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one obj
                                         and the surface of its mesh
 
 A writer holds the lock, writes the files of new objects and then replaces index.json, so the gallery on disk is always
-in the state before or after a change, also if the writer fails or is killed. The next writer removes object files that
-index.json does not name; all other files stay. If index.json is lost, `thor2 objects --reembed` writes it again from
-the object files.
+in the state before or after a change. The next writer removes object files that index.json does not name; all other
+files stay. If index.json is lost, `thor2 objects --reembed` writes it again from the object files.
 """
 
 import contextlib
@@ -247,7 +246,7 @@ def update_gallery(
     Raises:
         GalleryError: the gallery cannot be read.
         GalleryBusyError: another process holds the lock.
-        OSError: a file cannot be written; the gallery is unchanged. The next change removes the files of new objects.
+        OSError: a file cannot be written; the gallery is unchanged.
     """
     with _lock(directory, lock_seconds):
         is_lost = rebuild and gallery_stamp(directory) is None
@@ -255,12 +254,28 @@ def update_gallery(
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
         (directory / "objects").mkdir(exist_ok=True)
         _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
-        if before.stamp is None and not before.objects:
-            # The index is written first, so that an interrupted writer leaves an empty gallery, not objects without it.
-            write_text(directory / INDEX_FILE, _index_content(Gallery(changed.embedding)))
-        objects = {name: _stored(directory, name, views) for name, views in changed.objects.items()}
-        changed = dataclasses.replace(changed, objects=objects)
-        write_text(directory / INDEX_FILE, _index_content(changed))
+        objects = dict(changed.objects)
+        written: list[Path] = []
+        try:
+            if before.stamp is None and not before.objects:
+                # The index is written first, so that a killed writer leaves an empty gallery, not objects without it.
+                written.append(directory / INDEX_FILE)
+                write_text(written[0], _index_content(Gallery(changed.embedding)))
+            for name, views in changed.objects.items():
+                if views.file is None:
+                    content = _object_content(name, views)
+                    file = content_digest([content])
+                    objects[name] = dataclasses.replace(views, file=file)
+                    path = _object_file(directory, file)
+                    if not path.exists():
+                        written.append(path)
+                        _write_durably(path, content)
+            changed = dataclasses.replace(changed, objects=objects)
+            write_text(directory / INDEX_FILE, _index_content(changed))
+        except BaseException:
+            for path in reversed(written):
+                path.unlink(missing_ok=True)
+            raise
         # The change is complete. If this write fails, or if previous.json is another file, it only cannot be undone.
         with contextlib.suppress(OSError, GalleryError):
             _read_index(directory / PREVIOUS_FILE)
@@ -293,17 +308,6 @@ def previous_gallery(directory: Path, generation: int, gallery: Gallery) -> Gall
     with contextlib.suppress(FileNotFoundError):
         return _load_objects(directory, index, gallery)
     raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
-
-
-def _stored(directory: Path, name: str, views: GalleryObject) -> GalleryObject:
-    """Write the file of an object that has none, and return the object with its file."""
-    if views.file is not None:
-        return views
-    content = _object_content(name, views)
-    file = content_digest([content])
-    if not (path := _object_file(directory, file)).exists():
-        _write_durably(path, content)
-    return dataclasses.replace(views, file=file)
 
 
 def _write_durably(path: Path, content: bytes) -> None:

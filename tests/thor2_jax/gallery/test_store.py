@@ -94,8 +94,11 @@ def test_what_is_loaded_is_what_was_stored(directory: Path) -> None:
     assert {**first, "file": ""} == {"name": "mug", "file": "", "views": 2, "source": "frames", "date": "2026-01-02"}
 
 
-def test_a_missing_gallery_is_empty_and_a_file_is_none(tmp_path: Path) -> None:
-    assert load_gallery(tmp_path / "gallery", FINGERPRINT).names == () and list(tmp_path.iterdir()) == []
+def test_a_missing_gallery_is_empty_and_not_created(tmp_path: Path) -> None:
+    assert load_gallery(tmp_path / "none", FINGERPRINT).names == () and list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_no_gallery(tmp_path: Path) -> None:
     (tmp_path / "gallery").write_text("mine")
     with pytest.raises(GalleryError, match="is no directory"):
         check_index(tmp_path / "gallery")
@@ -115,7 +118,7 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     assert all(after[name] == before[name] for name in before if not name.endswith(".json"))
 
 
-def test_undo_restores_the_gallery_and_its_files(directory: Path, tmp_path: Path) -> None:
+def test_undo_restores_the_gallery_and_its_files(directory: Path) -> None:
     before = load_gallery(directory)
     changed = update_gallery(directory, add("mug", 5, replace=True), FINGERPRINT)
     undone = update_gallery(directory, undo(directory, changed.generation), FINGERPRINT, changed)
@@ -126,8 +129,13 @@ def test_undo_restores_the_gallery_and_its_files(directory: Path, tmp_path: Path
     np.testing.assert_array_equal(again.objects["mug"].embeddings, enrolled(0).embeddings)
     update_gallery(directory, undo(directory, undone.generation))  # restores the change
     assert object_files(load_gallery(directory)) == object_files(changed)
-    first = update_gallery(tmp_path, add("mug", 0), FINGERPRINT)
-    assert update_gallery(tmp_path, undo(tmp_path, first.generation), FINGERPRINT).names == ()
+
+
+def test_undo_of_the_first_change_empties_the_gallery(tmp_path: Path) -> None:
+    changed = update_gallery(tmp_path, add("mug", 0), FINGERPRINT)
+    undone = update_gallery(tmp_path, undo(tmp_path, changed.generation), FINGERPRINT)
+    assert undone.names == ()
+    assert update_gallery(tmp_path, add("mug", 0), FINGERPRINT).names == ("mug",)
 
 
 ENTRY = {"name": "a", "file": 64 * "0", "source": "", "date": ""}
@@ -148,25 +156,30 @@ def test_undo_refuses_in_one_line_and_changes_nothing(fault: str, directory: Pat
     assert files_of(directory) == before
 
 
-def test_a_known_state_is_not_read_again_and_other_changes_stay(directory: Path) -> None:
-    stale = load_gallery(directory)
-    changed = update_gallery(directory, add("new", 5), FINGERPRINT, stale)
+def test_a_known_state_is_not_read_again(directory: Path) -> None:
+    stored = load_gallery(directory)
+    changed = update_gallery(directory, add("new", 5), FINGERPRINT, stored)
     again = load_gallery(directory, FINGERPRINT, changed)
+    assert again.names == ("mug", "bowl", "new")
     assert [v.clouds for v in again.objects.values()] == [v.clouds for v in changed.objects.values()]
+
+
+def test_another_writers_change_is_kept(directory: Path) -> None:
+    stale = load_gallery(directory, FINGERPRINT)
+    update_gallery(directory, add("new", 5), FINGERPRINT)
     assert update_gallery(directory, add("box", 6), FINGERPRINT, stale).names == ("mug", "bowl", "new", "box")
 
 
-@pytest.mark.parametrize("failing", ["write_text", "_write_durably"])
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("failing", ["_object_content", "write_text", "_write_durably"])
 def test_a_failed_change_leaves_the_gallery_as_it_was(
-    failing: str, directory: Path, monkeypatch: pytest.MonkeyPatch
+    failing: str, error: type[BaseException], directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = files_of(directory)
-    with monkeypatch.context() as patch, pytest.raises(OSError):
-        patch.setattr(store, failing, mock.Mock(side_effect=OSError))
+    monkeypatch.setattr(store, failing, mock.Mock(side_effect=error))
+    with pytest.raises(error):
         update_gallery(directory, add("new", 5), FINGERPRINT)
-    assert load_gallery(directory, FINGERPRINT).names == ("mug", "bowl")
-    update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
-    assert files_of(directory).keys() == before.keys()
+    assert files_of(directory) == before
 
 
 def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
