@@ -44,7 +44,7 @@ FOLDERS = ("colornet", "thor2_jax", *(f"thor2_jax/{room}" for room in ROOMS))
 """Directories whose modules are mutated."""
 
 MORE_TESTS = {
-    "colornet/network.py": ["tests/colornet/test_files.py", "tests/colornet/test_membership.py"],
+    "colornet/network.py": ["tests/colornet/test_files.py", "tests/colornet/test_colors.py"],
     "thor2_jax/types.py": ["tests/thor2_jax/test_types.py"],
 }
 """Module -> test files that do not import it by its name."""

@@ -57,8 +57,12 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
 
 
 def _copy_files(model: Path, run: Path) -> None:
-    """Copy a run directory's content, without modes and without hidden files; raise OSError for devices."""
-    for folder, folders, names in os.walk(model, followlinks=True):
+    """Copy a run directory's content, without modes and hidden files; raise OSError for devices and unreadable ones."""
+
+    def fail(error: OSError) -> None:  # os.walk would leave out a folder that cannot be read
+        raise error
+
+    for folder, folders, names in os.walk(model, onerror=fail, followlinks=True):
         folders[:] = [name for name in folders if name not in UNFINISHED and not name.startswith(".")]
         target = run / Path(folder).relative_to(model)
         target.mkdir(exist_ok=True)

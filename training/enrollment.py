@@ -6,7 +6,7 @@ enroll_objects(Path("run"), FrameFolder("labelled-frames"))
 
 import contextlib
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,8 @@ def enroll_objects(
         objects = recognizer.objects
         if name is not None:
             objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        views: Iterable[Sequence[PreparedInstance]]
-        surfaces: Iterable[Any] = itertools.repeat(None)
+        views: Iterator[Sequence[PreparedInstance]]
+        surfaces: Iterator[Any] = itertools.repeat(None)
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
             labelled, skipped = instances.views, instances.skipped
@@ -99,9 +99,9 @@ def enroll_objects(
             surfaces = (surfaces_of([load_mesh(file, mesh_scale)]).arrays for file in source.values())
             names, kind = list(source), "mesh"
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
-        for number, (each, of_object, surface) in enumerate(zip(names, views, surfaces, strict=False)):
-            progress("enroll", number, len(names), each)
-            added[each] = enrolled_views(objects.embedding, of_object, kind, surface)
+        for number, each in enumerate(names):
+            progress("enroll", number, len(names), each)  # before its views are rendered
+            added[each] = enrolled_views(objects.embedding, next(views), kind, next(surfaces))
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):

@@ -141,6 +141,7 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         """Close the recording."""
         self._reader.close()
+        self._reader = None
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their time stamps.

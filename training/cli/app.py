@@ -128,11 +128,20 @@ console = Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column, but no names; by default, rich cuts them."""
+    """A table that folds words that are longer than a column; by default, rich cuts them.
+
+    Names are folded only if they are longer than a third of a line.
+    """
 
     def __init__(self, *titles: str, title: str | None = None) -> None:
         columns = (table.Column(each, overflow="fold", no_wrap=each == "name") for each in titles)
         super().__init__(*columns, title=title)
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        """Add a row; a long name would leave no room for the other columns, and would be cut."""
+        for column, cell in zip(self.columns, cells, strict=False):
+            column.no_wrap &= len(cell) <= WIDTH // 3
+        super().add_row(*cells, **options)
 
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")

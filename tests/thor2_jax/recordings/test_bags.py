@@ -54,6 +54,9 @@ def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
     path = write_messages(tmp_path / "a.mcap", {COLOR: image(RGB, "rgb8"), files.DEPTH: image(DEPTH, "16UC1")})
     assert_refused("camera_topic", Bag(path).__enter__)
     assert_refused("is not open", list, Bag(path).frames())
+    with Bag(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120)) as closed:
+        pass
+    assert_refused("is not open", list, closed.frames())
     (recorded,) = frames_of(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000)
     assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
 

@@ -100,7 +100,7 @@ def test_uncertainty_that_does_not_decrease_is_noted(
 def test_bad_input_writes_nothing(
     model: Path, video: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is written for few or unlabelled frames, or for a run with a device, which cannot be copied."""
+    """Of few or unlabelled frames, and of runs that cannot be copied: with a device, or with folders without end."""
     few, unlabelled = tmp_path / "few", tmp_path / "unlabelled"
     write_frame(few, OBJECTS)
     for number in range(4):
@@ -109,7 +109,9 @@ def test_bad_input_writes_nothing(
         assert message in refused("adapt", "--model", model, folder, "--out", tmp_path / "out", "--quiet")
     assert "already contains" in refused("adapt", "--model", model, video, "--out", model)
     run = Path(shutil.copytree(model, tmp_path / "run"))
-    (run / "curves.png").symlink_to("/dev/zero")
     monkeypatch.setattr(Recognizer, "adapt", lambda *_: Adaptation(ColorTransform(), 12, 0.5, 0.4))
-    assert "curves.png" in refused("adapt", "--model", run, video, "--out", tmp_path / "out")
+    for name, target in (("curves.png", "/dev/zero"), ("again", ".")):
+        (run / name).symlink_to(target)
+        assert name in refused("adapt", "--model", run, video, "--out", tmp_path / "out")
+        (run / name).unlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "run", "unlabelled"]

@@ -99,8 +99,11 @@ def test_version_and_help(printed: Command) -> None:
 def test_a_narrow_terminal_cuts_no_column(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     code = "import sys; sys.stdout.isatty = lambda: True; from training.cli.app import *; print(console.width)"
-    width, *table = run_python("-c", code + "; console.print(Table('CE+TOPS+TOPS2'), width=12)").stdout.splitlines()
+    code += "; console.print(Table('CE+TOPS+TOPS2'), width=12)"
+    code += "; shown = Table('name', 'views'); shown.add_row('x' * 99, '120'); console.print(shown)"
+    width, *table = run_python("-c", code).stdout.splitlines()
     assert width == "72" and "".join(table).count("TOPS") == 2 and "…" not in "".join(table)
+    assert "".join(table).count("x") == 99 and "120" in "".join(table)
 
 
 def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:

@@ -250,6 +250,17 @@ def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path,
     assert files_of(tmp_path / "other") == files_of(model)
 
 
+def test_progress_begins_before_views_are_rendered(model: Path, tmp_path: Path) -> None:
+    steps: list[object] = []
+
+    def pool(function: Any, tasks: Any) -> Any:
+        yield from (steps.append("render") or function(task) for task in tasks)
+
+    meshes = {"box": write_box(tmp_path / "box.ply", (0.1, 0.2, 0.15))}
+    enroll_objects(model, meshes, pool=pool, progress=lambda stage, done, *_: steps.append(done))
+    assert steps == [0, "render", 1]
+
+
 def test_a_full_disk_leaves_no_run(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: Texts) -> None:
     for step in ("_write_durably", "write_text"):
         for before in ([], [tmp_path / step / "run"]):  # the directory is new, or there and empty

@@ -82,6 +82,14 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     np.testing.assert_allclose(xyz * CONFIG.sigma_s, second.xyz - second.camera, atol=1e-6)
 
 
+def test_the_digest_is_that_of_names_and_clouds() -> None:
+    (one, two), other = views(0, (3, 4)), views(1, (5,))
+    recolored = [(one[0], one[1] ^ 1), two]
+    cases: list[dict[str, Any]] = [{"a": [one, two], "b": other}, {"b": [one, two], "a": other}]
+    cases += [{"a": other, "b": [one, two]}, {"a": recolored, "b": other}]
+    assert len({MemoryViews(clouds, CONFIG).digest for clouds in (*cases, cases[0])}) == 4
+
+
 def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:
     return fold_of_views(np.array(label), np.array(view), ("a", "b"), folds, seed)
 
