@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_written, write_text
+from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
@@ -103,10 +103,14 @@ def finished_record(out: Path) -> Mapping[str, Any]:
 
 
 def log_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
-    """Add the metrics of one epoch; those that an interrupted training logged before its checkpoint are replaced."""
+    """Append the metrics of one epoch; those that an interrupted training logged before its checkpoint are removed."""
     key, row = (fold, classifier), {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    earlier = [r for r in read_metrics(path) if (r["fold"], r["classifier"]) != key or r["epoch"] < metrics.epoch]
-    write_text(path, "".join(json.dumps(each) + "\n" for each in [*earlier, row]))
+    rows = [r for r in read_metrics(path) if (r["fold"], r["classifier"]) != key or r["epoch"] < metrics.epoch]
+    earlier = "".join(json.dumps(each) + "\n" for each in rows)
+    if path.exists() and path.read_text(encoding="utf-8") != earlier:
+        write_text(path, earlier)
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

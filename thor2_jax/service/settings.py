@@ -43,7 +43,7 @@ class Settings:
         warm_why: whether explanations are compiled in the background after the start, or from the first request on.
 
     Raises:
-        InputError: a value is out of range, the cache cannot be written, or the segmenter cannot be loaded.
+        InputError: a value is out of range, the cache cannot be created, or the segmenter cannot be loaded.
     """
 
     model: Path
@@ -65,11 +65,11 @@ class Settings:
         if not 0 < self.deadline <= MAX_DEADLINE:
             raise InputError(f"deadline is {self.deadline}; expected a positive number, at most {MAX_DEADLINE} seconds")
         check_host_names(self.allow_host)
-        if self.cache is not None:
+        if self.cache is not None and not self.cache.is_dir():  # one that exists can be read
             try:
                 check_writable(self.cache)
             except OSError as error:
-                problem = f"which cannot be written ({error.strerror})"
+                problem = f"which cannot be created ({error.strerror})"
                 raise InputError(f"cache is {self.cache}, {problem}; expected a directory, which may be new") from None
         if self.segmenter is not None:
             load_segmenter(self.segmenter)  # Its errors are reported here once, not by every process.

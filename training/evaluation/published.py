@@ -118,7 +118,7 @@ def compare_with_published(
             columns = {method: _measured_column(method, real_views, correct) for method in methods}
             ours = {method: title for method, title in columns.items() if title is not None}
             n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
-            counts = f"{n_frames:,} frames, {n_objects} objects and {len(runs)} models"
+            counts = f"frames {n_frames:,}, objects {n_objects}, models {len(runs)}"
             titles = dict.fromkeys(ours.values())
             differences = _differences(table, counts, len(cells), titles, scratch_networks(runs))
             kept = {name: table[name] for name in ("number", "title", "source", "notes")}
@@ -133,8 +133,8 @@ def _differences(
     published = " and ".join(f"{table[name] or 'an unstated number of'} {name}" for name in ("objects", "models"))
     return [
         f"The published figures concern {_read()['datasets'][table['kind']]}, with {published}.",
-        f"Here: {counts}, trained on other views and folds and fused by the rule {DEFAULT_RULE}; {n_rows} of the "
-        f"table's {len(table['cells'])} rows have instances.",
+        f"Numbers here: {counts}. The models were trained on other views and folds, and their classifiers are fused by "
+        f"the rule {DEFAULT_RULE}; {n_rows} of the table's {len(table['cells'])} rows have instances.",
         *(f"{title} is a smaller network than the published one." for title in titles if title.endswith(_SMALL)),
         *(
             f"{title} was trained from scratch, without pretrained weights: its accuracy does not represent the "
