@@ -49,6 +49,18 @@ def test_a_track_keeps_its_number_and_fuses_the_answers() -> None:
     assert [track.name for track in tracker.tracks()] == ["a", "c"]
 
 
+def test_a_view_of_fewer_points_has_a_smaller_weight() -> None:
+    recognizer = ToyRecognizer()
+    tracker, part = Tracker(recognizer), frame_of_squares({1: (10, 10, UNSURE_B)})
+    labels = np.where(np.arange(part.depth.shape[1]) < 24, part.label_image, 0)
+    tracker.update(frame_of_squares({1: (10, 10, SURE_A)}))
+    (answer,) = tracker.update(dataclasses.replace(part, labels=labels))
+    first, second = (len(each.points) * (0.5 if each.occluded else 1) for each in recognizer.described)
+    first *= 0.5 ** (1 / 30)  # a view loses half of its weight in 30 further ones
+    mean = np.exp(np.average(np.log([SURE_A, UNSURE_B]), axis=0, weights=[first, second]))
+    assert second < first / 2 and answer.confidence == pytest.approx(mean[0] / mean.sum(), abs=1e-4)
+
+
 def test_the_first_answer_is_that_of_the_frame_alone() -> None:
     rng = np.random.default_rng(0)
     recognizer = Recognizer(run())
