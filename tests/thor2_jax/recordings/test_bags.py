@@ -102,6 +102,12 @@ def test_messages_describe_the_content_of_topics(tmp_path: Path) -> None:
         assert_refused(f"holds {content}; expected 8-bit", Bag(tmp_path / "b.mcap", Topics(topic)).__enter__)
 
 
+def test_streams_out_of_step(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.bag", FRAMES, gap=5 * 10**9)
+    assert_refused(r"at least 4\.93 s apart", frames_of, path)
+    assert len(frames_of(path, max_gap=6)) == 3
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kept", [0, 0.001, 0.3, 0.9, 1])
 def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:

@@ -70,6 +70,8 @@ def test_clutter_increases_occlusion() -> None:
         return float(np.mean(np.array(visible) <= 0.95))
 
     assert occluded_share(0.0) < 0.35 < occluded_share(1.0)
+    degrees = [scene.occlusion(label) for scene in scenes(20) for label in scene.truth]
+    assert all(degrees.count(degree) > 0.1 * len(degrees) for degree in ("none", "low", "high"))
 
 
 def test_objects_stand_apart_on_the_table() -> None:
