@@ -9,7 +9,7 @@ import functools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from numpy.typing import NDArray
 
@@ -19,6 +19,7 @@ from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFra
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
 __all__ = ["RecognizerArguments", "recognize_frames", "track_frames"]
@@ -31,7 +32,7 @@ class FrameAnswer:
     Attributes:
         name: name of the frame.
         frame: the frame; None if it could not be read.
-        recognitions: one `Recognition` for each instance; `TrackedRecognition`s of `track_frames`.
+        recognitions: one answer for each instance.
         seconds: time for recognition, without the time to read the files.
         error: why the frame could not be recognized; None if it was.
         recorded: the frame's place in its recording; None if the frame is read from files.
@@ -39,7 +40,7 @@ class FrameAnswer:
 
     name: str
     frame: RGBDFrame | None = None
-    recognitions: Sequence[Any] = ()
+    recognitions: Sequence[Recognition] = ()
     seconds: float = 0.0
     error: str | None = None
     recorded: RecordedFrame | None = None
@@ -139,16 +140,18 @@ def track_frames(
         poses: pose of the camera for each frame, see `thor2_jax.tracking.viewpoints`.
     """
     tracker = recognizer.track()
-    answered: list[FrameAnswer] = []
-    last: dict[int | None, Any] = {}
+    answered: list[tuple[FrameAnswer, Sequence[TrackedRecognition]]] = []
+    last: dict[int | None, TrackedRecognition] = {}
     for number, source in enumerate(sources):
         update = functools.partial(tracker.update, pose=None if poses is None else poses[number])
         (answer,) = recognize_frames(update, [source])
-        answered.append(dataclasses.replace(answer, frame=None))  # a long sequence of images does not fit into memory
-        last |= {each.track: each for each in answer.recognitions}
-    for source, answer in zip(sources, answered, strict=True):
+        tracked = cast(Sequence[TrackedRecognition], answer.recognitions)
+        # A long sequence of images does not fit into memory.
+        answered.append((dataclasses.replace(answer, frame=None), tracked))
+        last |= {each.track: each for each in tracked}
+    for source, (answer, tracked) in zip(sources, answered, strict=True):
         if answer.error is None:
-            final = [each if each.track is None else each.renamed(last[each.track]) for each in answer.recognitions]
+            final = [each if each.track is None else each.renamed(last[each.track]) for each in tracked]
             try:
                 answer = dataclasses.replace(answer, frame=source.read(), recognitions=final)
             except (InputError, OSError) as error:

@@ -5,7 +5,7 @@ RUN/embedding.safetensors             with distractors: the embedding, which als
 RUN/references.safetensors            its reference views, for galleries
 RUN/surfaces.safetensors              surfaces of the classes, if all were trained from meshes
 RUN/gallery/                          with an embedding: labelled views of classes without a mesh, enrolled
-RUN/metrics.jsonl                     added after each epoch: classifier (or "embedding"), fold and metrics
+RUN/metrics.jsonl                     appended after each epoch: classifier (or "embedding"), fold and metrics
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
 RUN/views/                            until the training is finished: views rendered for this run only

@@ -161,9 +161,11 @@ def load_run(path: str | Path) -> TrainedRun:
         sizes = input_size(name, config, network.n_regions), len(classes)
         classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
-    if "embedding" in description:
-        _intact(file, description["embedding"])  # the fingerprint of an embedding is the digest of its file
     embedding = Embedding.load(file, network) if file.is_file() else None
+    stored = None if embedding is None else embedding.fingerprint
+    if description.get("embedding", stored) != stored:
+        state = "is missing" if embedding is None else "is not the embedding that run.json names"
+        raise InputError(f"model: {file} {state}; copy the whole run directory")
     if embedding is not None and embedding.references is None and description.get("references"):
         raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
     surfaces = None

@@ -61,8 +61,8 @@ class OCID(LabelledFrames):
         root = path / "YCB10" if (path / "YCB10").is_dir() else path
         images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
-            found = sorted((root / place / camera).glob("*/*/rgb/*.png"))
-            images += [(image.parents[1].relative_to(root).as_posix(), image) for image in found]
+            paths = sorted((root / place / camera).glob("*/*/rgb/*.png"))
+            images += [(image.parents[1].relative_to(root).as_posix(), image) for image in paths]
         if not images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
         names = as_path(names, "names")

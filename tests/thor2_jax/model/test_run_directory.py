@@ -125,7 +125,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
     "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
-    "other embedding": (other_embedding, "embedding.safetensors is damaged: its"),
+    "other embedding": (other_embedding, "embedding.safetensors is not the embedding"),
     "no embedding": (lambda path: (path / EMBEDDING_FILE).unlink(), "embedding.safetensors is missing"),
     "no references": (lambda path: (path / REFERENCES_FILE).unlink(), "references.safetensors is missing; copy"),
     "other surfaces": (lambda path: (path / SURFACES_FILE).write_bytes(b"0"), "surfaces.safetensors is damaged: its"),

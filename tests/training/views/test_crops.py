@@ -171,12 +171,12 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     assert_refused("has no crops.*--crops", plain.read_crops, 0, SIZE)
     training = TrainJob(tmp_path / "run", DEFAULT, dataset=plain.directory, baselines=["vit-cnn-small"])
     assert_refused("has no crops.*--crops", run_train_job, training, lambda *_: pytest.fail("work began"))
-    mine = plain.directory / "crops" / "0000-0000.npz"
-    mine.parent.mkdir()
-    mine.write_text("a user's")
+    users = plain.directory / "crops" / "0000-0000.npz"
+    users.parent.mkdir()
+    users.write_text("a user's")
     assert_refused("already contains", render_crops, job, plain, 8)
-    assert mine.read_text() == "a user's"
-    mine.unlink()
+    assert users.read_text() == "a user's"
+    users.unlink()
     render_crops(job, plain, 8)
     manifest = plain.directory / "crops" / "manifest.json"
     other = json.loads(manifest.read_text()) | {"dataset": "0"}
