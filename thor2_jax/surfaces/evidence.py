@@ -42,12 +42,12 @@ in free space."""
 REACH = 0.012
 """Largest distance of a match in scores and values, metres."""
 
-N_COMPARED, RIVAL, NAME_WEIGHTS = 3, 0.1, np.array([-7, 2.7, 1.5, 0], np.float32)
+N_COMPARED, RIVAL, NAME_WEIGHTS = 4, 0.003, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
-ODDS_EXPONENT = np.float32(0.5)
+EXPONENT = np.float32(0.5)
 """See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights for all but the last
-weight, of free space, and the exponent. These two are from real frames with classes left out; the odds of the networks
-depend more on the camera than those of surfaces."""
+weight, of free space, and the exponent. These two are from real frames; the probabilities of the networks depend more
+on the camera than surfaces do."""
 
 
 class Sample(NamedTuple):
@@ -93,9 +93,9 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
     Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
-    total probability is shared among them in proportion to p exp(`NAME_WEIGHTS` e). The odds o of all classes against
-    the distractors then become o^`ODDS_EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of the class
-    that is most probable after this step.
+    total probability is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of all
+    classes against the distractors then become o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of
+    the class that is most probable after this step.
     """
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     is_compared = largest >= RIVAL * largest[:, :1]
@@ -185,12 +185,12 @@ def _changed(
         is_compared: [B, K] bool.
         values: [B, K, 4], their evidence.
     """
-    logits = jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
+    logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
     share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
     changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
     best = jnp.take_along_axis(values, changed.argmax(axis=1)[:, None, None], axis=1)[:, 0]
     known = total.clip(1e-4, 1 - 1e-4)
-    logit = ODDS_EXPONENT * jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS
+    logit = EXPONENT * jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS
     return changed, jax.nn.sigmoid(logit) / jnp.maximum(total, 1e-30)
 
 

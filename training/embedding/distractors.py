@@ -203,7 +203,7 @@ class Distractors:
     meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     views: int = 8
     epochs: int = 8
-    networks: int = 5
+    networks: int = 3
     workers: int = 1
 
     def __post_init__(self) -> None:

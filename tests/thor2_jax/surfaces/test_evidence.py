@@ -171,26 +171,26 @@ def test_accelerators_compare_all_rows_at_once(
         _fit_rows.clear_cache()
 
 
-@pytest.mark.parametrize("n_classes", [3, 1])
+@pytest.mark.parametrize("n_classes", [6, 1])
 def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
     """Against the two formulas in float64."""
-    surfaces = jax.tree.map(lambda field: field[:n_classes], surfaces)
+    surfaces = jax.tree.map(lambda field: jnp.concatenate([field, field])[:n_classes], surfaces)
     clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
-    before = rng.dirichlet(np.full(n_classes + 1, 0.4), 9)[:, :n_classes].astype(np.float32)
+    before = rng.dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
     after = np.asarray(with_evidence(jnp.asarray(before), surfaces, sample_points(clouds)), np.float64)
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
     n_compared = 0
     for row, probabilities in enumerate(before.astype(np.float64)):
-        best = np.argsort(-probabilities)[:3]
-        best = best[probabilities[best] > 0.1 * probabilities[best[0]]]
+        best = np.argsort(-probabilities)[:4]
+        best = best[probabilities[best] > 0.003 * probabilities[best[0]]]
         if len(best) > 1:
-            odds = probabilities[best] * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
+            odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
             probabilities[best] = probabilities[best].sum() * odds / odds.sum()
-            n_compared += 1
+            n_compared += len(best)
         known = probabilities.sum()
         odds = (known / (1 - known)) ** 0.5 * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
-    assert n_compared == (0 if n_classes == 1 else pytest.approx(5, abs=3))
+    assert n_compared == (0 if n_classes == 1 else pytest.approx(30, abs=10))
     nothing = np.zeros((9, n_classes), np.float32)
     assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
 
