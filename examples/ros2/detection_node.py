@@ -13,7 +13,7 @@ from vision_msgs.msg import Detection2DArray
 
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
-from thor2_jax.recordings.messages import camera_intrinsics
+from thor2_jax.recordings.messages import camera_of
 
 PARAMETERS = {
     "url": "http://127.0.0.1:8080",
@@ -59,7 +59,7 @@ class DetectionNode(Node):
             self.get_logger().warning("no camera_info yet", throttle_duration_sec=WARNING_SECONDS)
             return
         try:
-            camera = camera_intrinsics(self.camera, self.color_topic)
+            camera = camera_of(self.camera, self.color_topic)
             fields = detection_fields(self.client, color, depth, camera)
         except (InputError, ServiceError, OSError) as error:
             self.get_logger().warning(f"no detections: {error}", throttle_duration_sec=WARNING_SECONDS)

@@ -25,14 +25,7 @@ from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
 from thor2_jax.files import as_path, open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.messages import (
-    camera_intrinsics,
-    color_image,
-    depth_image,
-    image_kind,
-    stamp_name,
-    stamp_of,
-)
+from thor2_jax.recordings.messages import camera_of, color_image, depth_image, image_kind, stamp_name, stamp_of
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 __all__ = ["Bag"]
@@ -221,7 +214,7 @@ class Bag:
             self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
             if self.intrinsics is None:
                 with with_context(str(self.topics.camera)):
-                    self.intrinsics = camera_intrinsics(first[self.topics.camera], str(self.topics.color))
+                    self.intrinsics = camera_of(first[self.topics.camera], str(self.topics.color))
         self.intrinsics = self.intrinsics.with_depth_scale(self._depth_scale)
         color, depth = (first[topic].header.frame_id for topic in (self.topics.color, self.topics.depth))
         self.frame_id = str(color)

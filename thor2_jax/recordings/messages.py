@@ -18,7 +18,7 @@ from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Detection
 
 __all__ = [
-    "camera_intrinsics",
+    "camera_of",
     "color_image",
     "depth_image",
     "detection_array",
@@ -68,15 +68,14 @@ def image_kind(message: Any) -> str:
         return "other"
 
 
-def camera_intrinsics(message: Any, color_topic: str) -> Intrinsics:
+def camera_of(message: Any, color_topic: str) -> Intrinsics:
     """Return the intrinsics of the images of a topic from their CameraInfo.
 
     They are P without distortion for rectified images (`image_rect...`), otherwise K; raise errors as `Intrinsics.of`.
     """
     projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
     if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
-        matrix = projection.reshape(3, 4)[:, :3]
-        return Intrinsics.of_matrix(matrix, width=int(message.width), height=int(message.height))
+        return Intrinsics.of({"K": projection.reshape(3, 4)[:, :3], "width": message.width, "height": message.height})
     return Intrinsics.of(message)
 
 
