@@ -13,6 +13,7 @@ from vision_msgs.msg import Detection2DArray
 
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
+from thor2_jax.recordings.messages import camera_of
 
 PARAMETERS = {
     "url": "http://127.0.0.1:8080",
@@ -37,6 +38,7 @@ class DetectionNode(Node):
         values = {name: self.get_parameter(name).value for name in PARAMETERS}
         self.client = Client(values["url"], os.environ.get("THOR2_TOKEN"), values["timeout"])
         self.camera: CameraInfo | None = None
+        self.color_topic: str = values["color_topic"]
         self.publisher = self.create_publisher(Detection2DArray, "/thor2/detections", 1)
         self.create_subscription(CameraInfo, values["camera_topic"], self.set_camera, qos_profile_sensor_data)
         images = [
@@ -57,7 +59,8 @@ class DetectionNode(Node):
             self.get_logger().warning("no camera_info yet", throttle_duration_sec=WARNING_SECONDS)
             return
         try:
-            fields = detection_fields(self.client, color, depth, self.camera)
+            camera = camera_of(self.camera, self.color_topic)
+            fields = detection_fields(self.client, color, depth, camera)
         except (InputError, ServiceError, OSError) as error:
             self.get_logger().warning(f"no detections: {error}", throttle_duration_sec=WARNING_SECONDS)
             return

@@ -10,7 +10,6 @@ import numpy as np
 from thor2_jax.client import Client
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame, encode_image
-from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Detection, detections_of
 from thor2_jax.recordings.messages import color_image, depth_image, detection_array, stamp_of
 
@@ -19,12 +18,12 @@ MILLIMETRES = 1000.0
 
 
 def frame_of(color: Any, depth: Any, camera: Any) -> RGBDFrame:
-    """Return the frame of a colour image, the depth image that is aligned to it, and their CameraInfo.
+    """Return the frame of a colour image, the depth image that is aligned to it, and their CameraInfo or intrinsics.
 
     Raises:
         InputError: an encoding is not supported, or the images have different sizes.
     """
-    return RGBDFrame(color_image(color), depth_image(depth), None, Intrinsics.of(camera))
+    return RGBDFrame(color_image(color), depth_image(depth), None, camera)
 
 
 def detect(client: Client, frame: RGBDFrame) -> list[Detection]:

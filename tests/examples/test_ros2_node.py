@@ -94,8 +94,14 @@ class Node:
         return types.SimpleNamespace(warning=lambda text, throttle_duration_sec: self.warnings.append(text))
 
 
-def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without camera_info, and if the service fails, there is a warning; the next pair is published."""
+@pytest.mark.parametrize(("color_topic", "fx"), [(COLOR, 290), ("/camera/color/image_rect_color", 280)])
+def test_the_node_warns_and_goes_on(
+    color_topic: str, fx: int, conversion: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without camera_info, and if the service fails, there is a warning; the next pair is published.
+
+    The intrinsics of rectified images are P.
+    """
     rclpy, filters, client, nodes = MagicMock(), MagicMock(), LocalClient(), []
     contents = {
         "rclpy": {name: getattr(rclpy, name) for name in ("init", "spin", "try_shutdown")},
@@ -114,11 +120,13 @@ def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyP
     def spin(node: Any) -> None:
         nodes.append(node)
         topics = [call.args[2] for call in filters.Subscriber.call_args_list]
-        assert topics == [COLOR, DEPTH]
+        assert topics == [color_topic, DEPTH]
         (publish,) = filters.ApproximateTimeSynchronizer.return_value.registerCallback.call_args.args
         pair = image(FRAME.color, "rgb8"), image(FRAME.depth, "16UC1")
         publish(*pair)
-        node.callbacks["/camera/color/camera_info"](CAMERA)
+        camera = camera_info(FRAME.intrinsics, FRAME.depth.shape)
+        camera.P[0] = 280
+        node.callbacks["/camera/color/camera_info"](camera)
         with monkeypatch.context() as patch:
             patch.setattr(client, "recognize_frame", MagicMock(side_effect=ServiceError(503, None, "starting", 1.0)))
             publish(*pair)
@@ -128,13 +136,14 @@ def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyP
     rclpy.spin.side_effect = spin
     node_module = importlib.import_module("detection_node")
     monkeypatch.setattr(node_module, "Client", lambda *arguments: client)
+    monkeypatch.setitem(node_module.PARAMETERS, "color_topic", color_topic)
     node_module.main()
     (node,) = nodes
     assert "camera_info" in node.warnings[0] and "503" in node.warnings[1] and len(node.warnings) == 2
     ((topic, message),) = node.published
     assert topic == "/thor2/detections" and message.header["stamp"]["sec"] == START // 10**9
     assert [one["results"][0]["hypothesis"]["class_id"] for one in message.detections] == ["mug", "mug"]
-    assert client.frames[0].intrinsics.fx == 290 and not node.callbacks
+    assert client.frames[0].intrinsics.fx == fx and not node.callbacks
     rclpy.try_shutdown.assert_called_once_with()
 
 

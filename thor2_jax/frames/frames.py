@@ -117,7 +117,7 @@ class RGBDFrame:
         """Depth in metres [H, W] float32; 0 where there is none."""
         if self.depth.dtype.kind == "u":
             return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
-        return np.where(np.isfinite(self.depth), self.depth, 0).astype(np.float32)
+        return np.where(np.abs(self.depth) <= np.finfo(np.float32).max, self.depth, 0).astype(np.float32)
 
     @property
     def label_image(self) -> NDArray[Any]:

@@ -61,6 +61,8 @@ _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
 """Distortion models with OpenCV's coefficients; other models are refused unless all coefficients are 0."""
 
+_COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs", "dist_coeff", "dist")
+
 Array = NDArray[np.floating[Any]]
 
 
@@ -141,10 +143,10 @@ class Intrinsics:
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
             values = values["intrinsic"]
-        matrix, scale, distortion = _parts(values)
+        matrix, scale = _parts(values)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
         width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
-        return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
+        return cls.of_matrix(matrix, scale, width=width, height=height, distortion=_distortion(values))
 
     @classmethod
     def of_matrix(
@@ -244,13 +246,16 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
         )
 
 
-def _supported(model: Any, distortion: Any) -> Any:
-    """Return the coefficients of a distortion model, or none if all are 0.
+def _distortion(values: Mapping[Any, Any]) -> Any:
+    """Return the coefficients of a lens distortion, which may have each of their names in every format.
 
     Raises:
-        InputError: the model is not supported and a coefficient is not 0.
+        InputError: the distortion model is not supported and a coefficient is not 0.
     """
-    distortion = () if distortion is None else distortion
+    distortion = _entry(values, *_COEFFICIENTS)
+    if distortion is None:
+        distortion = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+    model = "fisheye" if values.get("fisheye_model") else _entry(values, "distortion_model", "model")  # as OpenCV's
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
     if name not in _PINHOLE_MODELS and np.any(np.asarray(distortion, dtype=object)):
         raise InputError(
@@ -260,8 +265,8 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any]:
-    """Return a camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion.
+def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
+    """Return a camera matrix row by row, and depth units per metre or None.
 
     The entries of a mapping determine its format.
 
@@ -269,9 +274,8 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any]:
         InputError: no format has these entries, or one is missing or invalid.
     """
     scale: Any = values.get("depth_scale")
-    model = values.get("distortion_model")
     if "cam_K" in values:
-        return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number"), ()
+        return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number")
     if "intrinsic_matrix" in values:
         matrix = np.asarray(values["intrinsic_matrix"], dtype=object).ravel()
         if matrix.size != 9 or any(matrix[[2, 5]]):  # with cx and cy there, it is given row by row
@@ -279,23 +283,19 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any, Any]:
                 f"intrinsics.intrinsic_matrix is {str(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, 0, "
                 "cx, cy, 1"
             )
-        return matrix.reshape(3, 3).T, scale, ()
+        return matrix.reshape(3, 3).T, scale
     if "ppx" in values or "ppy" in values:
         scale = _units_per_metre(scale, 1, 1, "metres per depth unit, such as 0.001, since ppx and ppy are given")
-        return _pinhole_matrix(values, "ppx", "ppy"), scale, _supported(values.get("model"), values.get("coeffs"))
-    if any(name in values for name in ("camera_matrix", "K", "k")):  # K alone is a camera_info, too
-        coefficients = _supported(model, _entry(values, "distortion_coefficients", "D", "d"))
-        return _entry(values, "camera_matrix", "K", "k"), scale, coefficients
+        return _pinhole_matrix(values, "ppx", "ppy"), scale
+    if (matrix := _entry(values, "camera_matrix", "K", "k")) is not None:  # K alone is a camera_info, too
+        return matrix, scale
     if any(name in values for name in _PINHOLE):
         has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
         if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
             scale = 1000 / scale  # BOP's camera.json
-        return _pinhole_matrix(values, "cx", "cy"), scale, _supported(model, values.get("distortion"))
-    shown = ", ".join(map(str, list(values)[:8])) or "no entry"
-    raise InputError(
-        f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
-        "intrinsic_matrix"
-    )
+        return _pinhole_matrix(values, "cx", "cy"), scale
+    shown, expected = ", ".join(map(str, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
+    raise InputError(f"intrinsics has {shown}; expected {expected}, cam_K, ppx and ppy, or intrinsic_matrix")
 
 
 def _pinhole_matrix(values: Mapping[Any, Any], column: str, row: str) -> list[Any]:
@@ -315,9 +315,9 @@ def _units_per_metre(scale: Any, units: int, most: float, expected: str) -> floa
 
 
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:
-    """Return the first existing entry of these names; for a matrix in OpenCV's YAML, return its data."""
-    value = next((values[name] for name in names if name in values), None)
-    return value.get("data") if isinstance(value, Mapping) else value
+    """Return the first entry of these names that is not None; for a matrix in OpenCV's YAML, return its data."""
+    value = next((values[name] for name in names if values.get(name) is not None), None)
+    return value.get("data", value) if isinstance(value, Mapping) else value
 
 
 _MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
@@ -371,7 +371,8 @@ def _parse(content: bytes) -> Any:
         return np.array([float(word) for word in words])
     except ValueError:
         with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
-            # OpenCV's FileStorage writes a directive and tags that YAML parsers reject.
+            # YAML parsers reject a directive and tags of OpenCV's FileStorage, and read 1e-05 of `rostopic` as text.
+            content = re.sub(rb"(?<=[\s,[])([-+]?\d+)(?=e[-+]\d)", rb"\1.", content)
             values = parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
             if isinstance(values, str):
                 raise ValueError(f"it begins with {content.decode(errors='replace')[:30]!r}") from None

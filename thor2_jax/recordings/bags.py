@@ -21,13 +21,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-
 from thor2_jax.errors import InputError, needs_extra, reason_of, with_context
 from thor2_jax.files import as_path, open_file, parse_yaml, read_file
 from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_name, stamp_of
+from thor2_jax.recordings.messages import camera_of, color_image, depth_image, image_kind, stamp_name, stamp_of
 from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, PairCounts, StampedImage, Topics, choose_topics, nearest_pairs
 
 __all__ = ["Bag"]
@@ -216,7 +214,7 @@ class Bag:
             self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
             if self.intrinsics is None:
                 with with_context(str(self.topics.camera)):
-                    self.intrinsics = _camera(first[self.topics.camera], str(self.topics.color))
+                    self.intrinsics = camera_of(first[self.topics.camera], str(self.topics.color))
         self.intrinsics = self.intrinsics.with_depth_scale(self._depth_scale)
         color, depth = (first[topic].header.frame_id for topic in (self.topics.color, self.topics.depth))
         self.frame_id = str(color)
@@ -242,15 +240,6 @@ class Bag:
                 f"ROS 2 bag (directory, .db3) or MCAP of ROS 2"
                 + (f"; repair it: {repair} {self.path.name}" if repair else "")
             ) from None
-
-
-def _camera(message: Any, color_topic: str) -> Intrinsics:
-    """Return the intrinsics of a CameraInfo: P without distortion for rectified images, otherwise K."""
-    projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
-    if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
-        matrix = projection.reshape(3, 4)[:, :3]
-        return Intrinsics.of_matrix(matrix, width=int(message.width), height=int(message.height))
-    return Intrinsics.of(message)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""ROS messages: sensor_msgs/Image and CompressedImage to arrays, and detections to a vision_msgs/Detection2DArray.
+"""ROS messages: Image and CompressedImage to arrays, CameraInfo to intrinsics, detections to a Detection2DArray.
 
 The functions read attributes only, so they accept messages of ROS 1, ROS 2 (rclpy) and rosbags.
 """
@@ -14,9 +14,19 @@ from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.frames.frames import MAX_IMAGE_PIXELS, decode_image
+from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Detection
 
-__all__ = ["color_image", "depth_image", "detection_array", "image_kind", "ros_time", "stamp_name", "stamp_of"]
+__all__ = [
+    "camera_of",
+    "color_image",
+    "depth_image",
+    "detection_array",
+    "image_kind",
+    "ros_time",
+    "stamp_name",
+    "stamp_of",
+]
 
 _COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "8uc3": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8uc4": "bgra"}
 """Encoding in lower case -> channels; the order of 8UC3 and 8UC4 is that of cv_bridge."""
@@ -56,6 +66,17 @@ def image_kind(message: Any) -> str:
             return "color" if image.mode in ("RGB", "RGBA") else "depth" if image.mode.startswith("I") else "other"
     except Exception:  # Decoders raise many kinds of exception on damaged images.
         return "other"
+
+
+def camera_of(message: Any, color_topic: str) -> Intrinsics:
+    """Return the intrinsics of the images of a topic from their CameraInfo.
+
+    They are P without distortion for rectified images (`image_rect...`), otherwise K; raise errors as `Intrinsics.of`.
+    """
+    projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
+    if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
+        return Intrinsics.of({"K": projection.reshape(3, 4)[:, :3], "width": message.width, "height": message.height})
+    return Intrinsics.of(message)
 
 
 def color_image(message: Any) -> NDArray[np.uint8]:

@@ -4,6 +4,8 @@ for finding in diagnose(FrameFiles(color, depth, labels, intrinsics)).findings:
     print(finding.message, finding.advice)
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
+from thor2_jax.frames.frames import RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
+from thor2_jax.frames.intrinsics import check_camera as check_distortion
 from thor2_jax.recognizer import Recognizer
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
@@ -77,8 +80,10 @@ def diagnose(
         check_labels_alignment(diagnosis, color, labels)
     if depth is None or camera is None:
         return diagnosis
-    pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)  # its size was checked
-    frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, pinhole)
+    camera = dataclasses.replace(camera, width=None, height=None)  # its size was checked
+    if not _passes(diagnosis, _read, "intrinsics", functools.partial(check_distortion, camera, *depth.shape)):
+        return diagnosis
+    frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, camera)
     is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)
     trust_camera = camera_is_right and is_registered  # Without registration, the labels belong to other pixels.
     depth_is_right = _passes(diagnosis, check_depth, frame, sides, names, trust_camera=trust_camera)

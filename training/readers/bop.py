@@ -184,9 +184,7 @@ def _values(image: Path, name: str, key: str, kind: type | tuple[type, ...]) -> 
 def _read_images(image: Path) -> tuple[NDArray[np.uint8], NDArray[Any], Intrinsics]:
     """Return the colour, the depth and the camera of an image."""
     with _entry(image, "camera") as entry:
-        try:
-            matrix, scale = entry["cam_K"], entry["depth_scale"]
-        except (TypeError, KeyError):
-            raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
-        camera = Intrinsics.of({"cam_K": matrix, "depth_scale": scale})
+        if not isinstance(entry, dict) or not entry.keys() >= {"cam_K", "depth_scale"}:
+            raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}")
+        camera = Intrinsics.of(entry)
     return read_color(image), read_depth(_scene(image) / "depth" / f"{image.stem}.png"), camera

@@ -87,6 +87,7 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "RealSense with a scale": (as_json(REALSENSE | {"depth_scale": 0.00025}), Intrinsics(**WITH_SIZE, depth_scale=4e3)),
     "Open3D camera": (as_json({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}), SIZED),
 }
+LENS = [0.12, -2e-05, 1e-05, -0.002, 0.05]
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -104,6 +105,26 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
     storage.write("distortion_coefficients", np.zeros((1, 5)))
     storage.release()
     assert read_intrinsics(tmp_path / "k.yml") == SIZED
+
+
+@pytest.mark.parametrize("name", ["distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs", "dist"])
+@pytest.mark.parametrize("camera", [PINHOLE, {"K": MATRIX.tolist()}, {"cam_K": MATRIX.tolist()}, REALSENSE, OPEN3D])
+def test_coefficients_in_every_format(camera: dict[str, object], name: str) -> None:
+    assert parse_intrinsics(as_json({**camera, name: LENS})).distortion == tuple(LENS)
+    for refused in ({name: LENS, "model": "fisheye"}, {name: {"k1": 0.1}}, {name: LENS, "fisheye_model": 1}):
+        assert_refused("^intrinsics.* distortion|^intrinsics.distortion", Intrinsics.of, {**camera, **refused})
+
+
+def test_coefficients_one_by_one() -> None:
+    """This is how the software of Azure Kinect and Orbbec lists them."""
+    named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), DISTORTIONS["rational_polynomial"], strict=True))
+    assert Intrinsics.of(PINHOLE | named).distortion == DISTORTIONS["rational_polynomial"]
+
+
+def test_rostopic_echo_omits_the_point_of_a_power_of_ten() -> None:
+    echo = ROS1_ECHO.replace("D: [0.0, 0.0, 0.0, 0.0, 0.0]", f"D: {LENS}")
+    assert "-2e-05, 1e-05" in echo
+    assert parse_intrinsics(echo.encode()) == Intrinsics(**WITH_SIZE, distortion=tuple(LENS))
 
 
 def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:

@@ -42,9 +42,11 @@ def test_a_share_of_the_contour_is_behind_another_instance(touching: int, front:
 
 @pytest.mark.parametrize(("missing", "occluded"), [(5, True), (6, False)])
 @pytest.mark.parametrize("whose", ["own", "other"])
-def test_depth_may_be_missing_along_the_edge(whose: str, missing: int, occluded: bool) -> None:
+@pytest.mark.parametrize("value", [0, 65535])
+def test_depth_may_be_missing_along_the_edge(value: int, whose: str, missing: int, occluded: bool) -> None:
+    """Some cameras write the largest value where there is no depth."""
     depth, labels = scene()
-    depth[:, slice(80 - missing, 80) if whose == "own" else slice(80, 80 + missing)] = 0
+    depth[:, slice(80 - missing, 80) if whose == "own" else slice(80, 80 + missing)] = value
     is_occluded, boundary = occlusions(depth, labels)[BACK]
     assert is_occluded == occluded
     # Without its own depth, the edge is at least 13 mm from the cloud.

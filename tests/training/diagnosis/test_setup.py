@@ -239,6 +239,10 @@ def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
     assert codes(labels=photo, intrinsics=b"{}") == {"unreadable-labels", "unreadable-intrinsics"}
     assert codes(color=b"", depth=photo) == {"unreadable-color", "unreadable-depth"}
     assert "size" in codes(depth=encode_image(np.ascontiguousarray(original.depth[::2, ::2])))
+    fields = dataclasses.asdict(original.intrinsics)
+    for distortion, expected in ((-9.0, {"unreadable-intrinsics"}), (0.1, set())):
+        camera = json.dumps({**fields, "distortion": [distortion, 0, 0, 0]}).encode()
+        assert codes(intrinsics=camera) == expected
 
 
 def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Command) -> None:

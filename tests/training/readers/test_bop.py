@@ -33,6 +33,13 @@ def test_a_frame(tmp_path: Path) -> None:
     assert (camera.fx, camera.cx, camera.fy, camera.cy) == (K[0], K[2], K[4], K[5])
 
 
+def test_the_lens_distortion_of_a_scene(tmp_path: Path) -> None:
+    path = write_bop(tmp_path / "000048") / "scene_camera.json"
+    entries = json.loads(path.read_text())
+    path.write_text(json.dumps({image: {**entry, "distortion": [0.1, 0, 0, 0]} for image, entry in entries.items()}))
+    assert BOP(tmp_path)[0].frame.intrinsics.distortion == (0.1, 0, 0, 0)
+
+
 def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in (10, 2):
         write_bop(tmp_path / "000050", number, seed=number)
