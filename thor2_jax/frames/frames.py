@@ -114,10 +114,14 @@ class RGBDFrame:
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth in metres [H, W] float32; 0 where there is none."""
+        """Depth in metres [H, W] float32; 0 where there is none: the value is the largest one of its type, or no number.
+
+        Some cameras write the largest value where they measure nothing.
+        """
         if self.depth.dtype.kind == "u":
-            return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
-        return np.where(np.abs(self.depth) <= np.finfo(np.float32).max, self.depth, 0).astype(np.float32)
+            is_depth = self.depth != np.iinfo(self.depth.dtype).max
+            return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32) * is_depth
+        return np.where(np.abs(self.depth) < np.finfo(np.float32).max, self.depth, 0).astype(np.float32)
 
     @property
     def label_image(self) -> NDArray[Any]:

@@ -215,7 +215,6 @@ def _window(
     here = tuple(slice(part.start - first, part.stop - first) for part, first in zip(inside, (top, left), strict=True))
     labels, depth = np.full(shape, OUTSIDE, np.int64), np.zeros(shape, np.float32)
     labels[here], depth[here] = frame.label_image[inside], frame.depth_m[inside]
-    depth[depth > MAX_DEPTH] = 0  # where there is no depth, some cameras write their largest value
     return labels, depth, (row - top) * shape[1] + column - left
 
 

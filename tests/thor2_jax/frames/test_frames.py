@@ -92,14 +92,14 @@ def test_a_frame_refuses_bad_fields(problem: str) -> None:
 @pytest.mark.parametrize(
     ("depth", "metres"),
     [
-        (np.array([[0, 1], [1234, 65535]], np.uint16), [[0, 1e-4], [0.1234, 6.5535]]),
-        (np.array([[0, 1], [1234, 65536]], np.uint32), [[0, 1e-4], [0.1234, 6.5536]]),
+        (np.array([[65535, 1], [1234, 65534]], np.uint16), [[0, 1e-4], [0.1234, 6.5534]]),
+        (np.array([[2**32 - 1, 1], [1234, 65535]], np.uint32), [[0, 1e-4], [0.1234, 6.5535]]),
         *((np.array([[0.5, np.nan], [np.inf, -np.inf]], f"f{n}"), [[0.5, 0], [0, 0]]) for n in (2, 4, 8)),
-        (np.array([[0.5, 1e308]]), [[0.5, 0]]),
+        (np.array([[0.5, 1e308, np.finfo(np.float32).max]]), [[0.5, 0, 0]]),
     ],
 )
 def test_depth_becomes_metres(depth: np.ndarray, metres: list[list[float]]) -> None:
-    """Integers are multiples of a unit, here 0.1 mm; floats are metres, and those that are not finite become 0."""
+    """Integers are multiples of a unit, here 0.1 mm; floats are metres. The largest value, and what is not finite, is no depth."""
     before = depth.copy()
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8), depth, None, Intrinsics(1, 1, 0, 0, depth_scale=10_000))
     np.testing.assert_array_equal(frame.depth_m, np.array(metres, np.float32), strict=True)
