@@ -58,12 +58,12 @@ def with_context(identifier: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def decoding(message: str, expected: str) -> Iterator[None]:
-    """Turn every exception that a decoder raises for a damaged file into an InputError."""
+def decoding(message: str, expected: str = "", *, advice: str = "") -> Iterator[None]:
+    """Turn every exception of a decoder for a damaged file into an InputError that ends with `expected` or `advice`."""
     try:
         yield
     except Exception as error:
-        raise InputError(f"{message} ({reason_of(error)}); expected {expected}") from None
+        raise InputError(f"{message} ({reason_of(error)}); {advice or f'expected {expected}'}") from None
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
@@ -120,13 +120,11 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         InputError: any other line is damaged.
     """
     content = path.read_bytes() if path.exists() else b""
-    try:
+    with decoding(f"out: {path} is damaged", advice="remove it, or choose another directory"):
         rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
         for row in rows:
             if not (isinstance(row["epoch"], int) and {"fold", "classifier"} <= row.keys()):
                 raise ValueError("a line has no fold, classifier and epoch")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"out: {path} is damaged ({error}); remove it, or choose another directory") from None
     return rows
 
 

@@ -20,7 +20,7 @@ import safetensors
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY_4, RGBDViT, ViT
@@ -73,29 +73,19 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     Raises:
         InputError: the file is missing or damaged, or a tensor is missing or has another shape.
     """
-    try:
+    parameters, advice = list(tensors(model)), "give the file of the network's backbone"
+    with decoding(f"weights: {path} cannot be read", "a safetensors file, see docs/baselines.md"):
         with safetensors.safe_open(path, "numpy") as file:
-            names = set(file.keys())
-            for name, wanted, kind, variable in tensors(model):
-                if name not in names:
-                    raise InputError(
-                        f"weights: {path} has no tensor {name}; expected one of shape {wanted}: give the "
-                        "file of the network's backbone"
-                    )
-                array = file.get_tensor(name).astype(np.float32)
-                if kind == "pos_embed":
-                    array = resampled_positions(array, wanted)
-                if array.shape != wanted:
-                    raise InputError(
-                        f"weights: {name} in {path} has the shape {array.shape}; expected {wanted}: give the "
-                        "file of the network's backbone"
-                    )
-                axes = (*range(2, array.ndim), 1, 0) if kind == "kernel" else range(array.ndim)
-                variable.set_value(jnp.asarray(array.transpose(*axes)))
-    except (OSError, safetensors.SafetensorError, TypeError) as error:
-        raise InputError(
-            f"weights: {path} cannot be read ({error}); expected a safetensors file, see docs/baselines.md"
-        ) from None
+            wanted_names = {name for name, *_ in parameters}.intersection(file.keys())
+            arrays = {name: file.get_tensor(name).astype(np.float32) for name in wanted_names}
+    for name, wanted, kind, variable in parameters:
+        if name not in arrays:
+            raise InputError(f"weights: {path} has no tensor {name}; expected one of shape {wanted}: {advice}")
+        array = resampled_positions(arrays[name], wanted) if kind == "pos_embed" else arrays[name]
+        if array.shape != wanted:
+            raise InputError(f"weights: {name} in {path} has the shape {array.shape}; expected {wanted}: {advice}")
+        axes = (*range(2, array.ndim), 1, 0) if kind == "kernel" else range(array.ndim)
+        variable.set_value(jnp.asarray(array.transpose(*axes)))
 
 
 def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

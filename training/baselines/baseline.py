@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.errors import InputError
+from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_directory import TrainedRun
@@ -150,7 +150,7 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
     Raises:
         InputError: the file is damaged or has another format or other classes; the message names the file.
     """
-    try:
+    with decoding(f"model: {path} cannot be read", advice="remove it and train the baseline again"):
         arrays, metadata = unpack_arrays(read_file(path))
         about = json.loads(metadata["about"])
         if about["format"] != BASELINE_FORMAT:
@@ -160,8 +160,6 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         if about["classes"] != list(classes):
             raise ValueError("it has other classes than its run")
         return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None
 
 
 @dataclasses.dataclass(frozen=True)

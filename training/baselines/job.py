@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import file_digest, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.architectures import ARCHITECTURES, TEMPLATES, pretrained_files, weights_file
@@ -140,11 +140,7 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
         if not file.is_file():
             continue
         stored = read_baseline(file, run.classes)
-        try:
+        with decoding(f"model: {file} does not match its run", advice="delete it and train the baseline again"):
             predict = _METHODS[name][1](stored.arrays, run)
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                f"model: {file} does not match its run ({error}); delete it and train the baseline again"
-            ) from None
         loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
     return loaded

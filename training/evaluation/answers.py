@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import decoding
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
 from thor2_jax.networks.networks import FEATURES
@@ -108,12 +108,10 @@ class AnswerFile:
             return
         content = path.read_bytes()
         complete = content.rfind(b"\n") + 1
-        try:
+        with decoding(f"out: {path} is damaged", advice="delete it to start again"):
             first, *lines = content[:complete].splitlines() or [b""]
             stored = dict(json.loads(first))
             self.frames = [_decode(line) for line in lines]
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(f"out: {path} is damaged ({error}); delete it to start again") from None
         check_same_job(path.parent, stored, header)
         if complete < len(content):
             with path.open("r+b") as file:

@@ -11,11 +11,11 @@ Checkpoints of two epochs are kept: the last epoch and the epoch with the best s
 before an older one is removed, so the last complete checkpoint survives any crash.
 """
 
-import contextlib
 import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -24,7 +24,7 @@ import numpy as np
 import safetensors
 from jax.experimental import multihost_utils
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.model.run_record import run_directories
 from training.storage.jobs import Progress, load_arrays, save_arrays
 
@@ -178,15 +178,9 @@ class Checkpoints:
     def _path(self, epoch: int) -> Path:
         return self.directory / f"{epoch}.safetensors"
 
-    @contextlib.contextmanager
-    def _readable(self, path: Path) -> Iterator[None]:
+    def _readable(self, path: Path) -> AbstractContextManager[None]:
         """Raise InputError if reading a checkpoint in the block fails."""
-        try:
-            yield
-        except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
-            raise InputError(
-                f"checkpoint: {path} cannot be read ({error}); remove {self.directory} to restart this fit"
-            ) from None
+        return decoding(f"checkpoint: {path} cannot be read", advice=f"remove {self.directory} to restart this fit")
 
     def _restore(self, epoch: int, like: Any) -> Any:
         leaves, structure = jax.tree.flatten(like)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, decoding, with_context
 from thor2_jax.files import as_path, read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrames, path_ends, sequence_of
@@ -217,7 +217,8 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
     path = Path(path)
     content = read_file(path)
     header, start = _header(content, path)
-    try:
+    expected = "WIDTH x HEIGHT points with one number for each axis"
+    with decoding(f"{path}: its header does not describe points with x, y and z", expected):
         fields = header["FIELDS"]
         counts = [int(count) for count in header.get("COUNT", ["1"] * len(fields))]
         types = [f"<{_KINDS[kind]}{int(size)}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
@@ -226,12 +227,7 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
         width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
         (encoding,) = header["DATA"]
         if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
-            raise ValueError
-    except (KeyError, IndexError, ValueError, TypeError, OverflowError):
-        raise InputError(
-            f"{path}: its header does not describe points with x, y and z; expected WIDTH x HEIGHT points with one "
-            "number for each axis"
-        ) from None
+            raise ValueError("no points, or no axis")
     if encoding not in ("ascii", "binary"):
         raise InputError(f"{path} has DATA {encoding}; expected ascii or binary")
     data, n = content[start:], width * height

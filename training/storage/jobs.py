@@ -19,7 +19,7 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays, write_text
 
 __all__ = [
@@ -146,10 +146,8 @@ def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -
     """Raise InputError if a directory has a damaged record or the record of another job; arguments as `begin_job`."""
     file = directory / name
     if file.is_file():
-        try:
+        with decoding(f"out: {file} cannot be read", advice=f"delete {file.parent} to start anew"):
             begun = dict(json.loads(file.read_bytes()))
-        except (OSError, ValueError, TypeError, RecursionError) as error:
-            raise InputError(f"out: {file} cannot be read ({error}); delete {file.parent} to start anew") from None
         check_same_job(directory, begun, job)
 
 

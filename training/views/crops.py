@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
@@ -212,20 +212,16 @@ def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]
         InputError: the manifest is missing, damaged or of another format.
     """
     path = directory / MANIFEST
-    try:
+    if not path.is_file():
+        raise InputError(
+            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
+            "`thor2 render` command with --crops"
+        )
+    with decoding(f"dataset: {path} is damaged", advice=f"delete {directory} and render the crops again"):
         content = json.loads(path.read_bytes())
         if content["format"] != CROPS_FORMAT:
             raise ValueError(f"its format is {content['format']!r}; expected {CROPS_FORMAT}")
         return {"crops": int(content["size"]), "dataset": str(content["dataset"])}, dict(content["files"])
-    except OSError:
-        raise InputError(
-            f"dataset: {directory.parent} has no crops, which the networks are trained on; render them: repeat its "
-            "`thor2 render` command with --crops"
-        ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"dataset: {path} is damaged ({error}); delete {directory} and render the crops again"
-        ) from None
 
 
 def crop_file(shard: str) -> str:
