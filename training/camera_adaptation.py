@@ -6,12 +6,11 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from thor2_jax import Recognizer, RGBDFrame
 from thor2_jax.adaptation.estimate import Adaptation, Report
 from thor2_jax.errors import with_context
 from thor2_jax.files import atomic_directory, check_output_directory, read_file
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
-from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameSource
 
 __all__ = ["adapt_run"]

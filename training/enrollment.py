@@ -11,13 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
+from thor2_jax import InputError, Recognizer
 from thor2_jax.files import atomic_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.model.run_directory import TrainedRun, save_run
-from thor2_jax.recognizer import Recognizer
 from training.objects.meshes import load_mesh
 from training.objects.surfaces import surfaces_of
 from training.readers.frames import FrameFolder

@@ -13,13 +13,12 @@ from typing import Any, cast
 
 from numpy.typing import NDArray
 
+from thor2_jax import Recognizer, TrackedRecognition
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.prepared_instance import unit_question
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
-from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frames import FrameSource
 
 __all__ = ["RecognizerArguments", "recognize_frames", "track_frames"]

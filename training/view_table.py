@@ -5,9 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax import InputError, Recognizer
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.viewpoints import ViewTable
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RayCaster, camera_pose, render_view

@@ -17,15 +17,12 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.view_normalization import view_normalize
+from thor2_jax import DescriptorConfig, PointClouds, RGBDFrame, view_normalize
 from thor2_jax.errors import decoding
 from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import Compiled
 from thor2_jax.recognizer import DescribedFrame
-from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs

@@ -17,12 +17,9 @@ from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestClassifier
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.view_normalization import mirror, turn
+from thor2_jax import DescriptorConfig, PointClouds, Strips, mirror, strips, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import Linear, model_arrays, model_from_arrays
-from thor2_jax.types import PointClouds, Strips
 from training.baselines.baseline import (
     BaselineInputs,
     FitTask,

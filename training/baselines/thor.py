@@ -23,12 +23,10 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.config import DescriptorConfig
+from thor2_jax import DescriptorConfig, InputError, PointClouds
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
-from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import MLP, model_arrays, model_from_arrays
-from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, as_given, compiled_network
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit

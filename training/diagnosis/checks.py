@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics
+from thor2_jax import InputError, Intrinsics
 from training.objects.meshes import MAX_SIDE, MIN_SIDE, read_mesh
 
 __all__ = ["Diagnosis", "check_camera", "check_labels", "check_meshes"]

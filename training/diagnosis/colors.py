@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import logit
 
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.recognizer import Recognizer
+from thor2_jax import Recognizer, RGBDFrame
 from training.diagnosis.checks import Diagnosis
 
 __all__ = ["check_channel_order", "check_light"]

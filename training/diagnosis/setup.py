@@ -13,10 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
+from thor2_jax import InputError, Recognizer, RGBDFrame
+from thor2_jax.frames.frames import frame_intrinsics, read_color, read_depth, read_labels
 from thor2_jax.frames.intrinsics import check_camera as check_distortion
-from thor2_jax.recognizer import Recognizer
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth

@@ -29,9 +29,7 @@ import numpy as np
 import thor2_jax
 import training
 from colornet import ColorNetwork
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.errors import InputError
+from thor2_jax import DESCRIPTOR_VERSION, DescriptorConfig, InputError, view_normalize
 from thor2_jax.files import content_digest, json_digest, remove_written
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment

@@ -21,9 +21,8 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax import DescriptorConfig, InputError
 from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, is_color
-from thor2_jax.errors import InputError
 from thor2_jax.networks.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks.networks import EmbeddingSizes, class_cosines, projected_features
 from training.fitting.fit import FitState, network_step

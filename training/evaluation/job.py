@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.config import DESCRIPTOR_VERSION
-from thor2_jax.errors import InputError
+from thor2_jax import DESCRIPTOR_VERSION, InputError, RGBDFrame
 from thor2_jax.files import check_output_directory, file_digest, write_text
-from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction

@@ -24,9 +24,8 @@ from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
+from thor2_jax import DescriptorConfig, InputError
 from thor2_jax.descriptor.describe import BATCH_AXIS, batch_mesh
-from thor2_jax.errors import InputError
 from thor2_jax.networks.networks import MLP, Feature, feature_of, input_size
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs, wait_for_all
 from training.fitting.samples import Batch, Samples, describe_batch

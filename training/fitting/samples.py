@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from colornet import ColorNetwork
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax import DescriptorConfig, InputError, describe_strips, mirror, strips, turn
 from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
-from thor2_jax.descriptor.view_normalization import mirror, turn
-from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud, Descriptors, Parameters, PointClouds, Strips
 from training.views.normalized_views import ViewSource, padded_batches, reorient
 

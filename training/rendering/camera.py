@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax import InputError, Intrinsics, RGBDFrame
 from training.objects.mesh import TexturedMesh
 
 __all__ = [

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax import InputError, Intrinsics, RGBDFrame
 from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
 from training.rendering.camera import (
     Camera,

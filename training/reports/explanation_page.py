@@ -6,13 +6,10 @@ import json
 import re
 from pathlib import Path
 
-from thor2_jax.errors import InputError
-from thor2_jax.explanation.explain import Explanation
+from thor2_jax import Explanation, InputError, Recognition, RGBDFrame
 from thor2_jax.explanation.pictures import change_text, loss_text, pictures
 from thor2_jax.figures import save_figure
 from thor2_jax.files import atomic_directory, has_json, remove_written, write_text
-from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.recognition import Recognition
 from training.reports.html import Picture, Section, Table, write_page
 
 __all__ = ["PAGE", "check_no_foreign_files", "write_explanation"]

@@ -9,13 +9,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax import plot
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips, strips
-from thor2_jax.descriptor.view_normalization import align
+from thor2_jax import DescriptorConfig, PointClouds, align, describe_strips, plot, strips
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.plot import PALETTE
-from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RayCaster, camera_pose, render_view
 

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax import DESCRIPTOR_VERSION, DescriptorConfig, InputError
 from thor2_jax.frames.frames import pixel_points
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance

@@ -21,10 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from thor2_jax import DescriptorConfig, InputError, view_normalize
 from thor2_jax.capacity import batch_points
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, read_table
 from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds, matmul
