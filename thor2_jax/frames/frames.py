@@ -114,9 +114,9 @@ class RGBDFrame:
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth in metres [H, W] float32; 0 where there is none: the value is the largest one of its type, or no number.
+        """Depth in metres [H, W] float32; 0 where there is none.
 
-        Some cameras write the largest value where they measure nothing.
+        Values that are not finite, or the largest one of their type, are missing depth, too.
         """
         if self.depth.dtype.kind == "u":
             is_depth = self.depth != np.iinfo(self.depth.dtype).max

@@ -99,7 +99,7 @@ def test_a_frame_refuses_bad_fields(problem: str) -> None:
     ],
 )
 def test_depth_becomes_metres(depth: np.ndarray, metres: list[list[float]]) -> None:
-    """Integers are multiples of a unit, here 0.1 mm; floats are metres. The largest value, and what is not finite, is no depth."""
+    """Integers are multiples of a unit, here 0.1 mm; floats are metres. The largest value is no depth, like NaN."""
     before = depth.copy()
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8), depth, None, Intrinsics(1, 1, 0, 0, depth_scale=10_000))
     np.testing.assert_array_equal(frame.depth_m, np.array(metres, np.float32), strict=True)
