@@ -94,8 +94,8 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
 
     Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
     total probability is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of all
-    classes against the distractors then become o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), with the evidence of
-    the class that is most probable after this step.
+    classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), where s is the
+    share of the class that is most probable after this step, and e its evidence.
     """
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     is_compared = largest >= RIVAL * largest[:, :1]
@@ -186,11 +186,12 @@ def _changed(
         values: [B, K, 4], their evidence.
     """
     logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30)) + matmul(values, NAME_WEIGHTS)
-    share = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
-    changed = jnp.where(is_compared, share * (largest * is_compared).sum(axis=1, keepdims=True), largest)
+    shares = jax.nn.softmax(jnp.where(is_compared, logits, -jnp.inf), axis=1)
+    changed = jnp.where(is_compared, shares * (largest * is_compared).sum(axis=1, keepdims=True), largest)
     best = jnp.take_along_axis(values, changed.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-    known = total.clip(1e-4, 1 - 1e-4)
+    known, share = total.clip(1e-4, 1 - 1e-4), changed.max(axis=1) / jnp.maximum(total, 1e-30)
     logit = EXPONENT * jnp.log(known / (1 - known)) + matmul(best, KNOWN_WEIGHTS) + KNOWN_BIAS
+    logit += jnp.log(jnp.maximum(share, 1e-30))
     return changed, jax.nn.sigmoid(logit) / jnp.maximum(total, 1e-30)
 
 

@@ -188,7 +188,8 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
             probabilities[best] = probabilities[best].sum() * odds / odds.sum()
             n_compared += len(best)
         known = probabilities.sum()
-        odds = (known / (1 - known)) ** 0.5 * np.exp(values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15] + 2.1)
+        fits = values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15]
+        odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     assert n_compared == (0 if n_classes == 1 else pytest.approx(30, abs=10))
     nothing = np.zeros((9, n_classes), np.float32)
