@@ -149,6 +149,7 @@ def test_labels(frame: RGBDFrame) -> None:
         (lambda labels: labels * 0, "labels-empty"),
         (lambda labels: labels + 1, "labels-background"),
         (_interpolated, "labels-(thin|many)"),
+        (lambda labels: np.tile(np.arange(120) % 4 // 2 * (np.arange(120) // 4 + 1), (90, 1)), "labels-thin"),
         (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), "labels-many"),
         (lambda labels: blobs(2), ""),
         (lambda labels: blobs(3) * 255, "labels-foreground"),
@@ -238,6 +239,7 @@ def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
 
     assert codes(labels=photo, intrinsics=b"{}") == {"unreadable-labels", "unreadable-intrinsics"}
     assert codes(color=b"", depth=photo) == {"unreadable-color", "unreadable-depth"}
+    assert codes(labels=encode_image(original.labels * 0)) == {"labels-empty"}
     assert "size" in codes(depth=encode_image(np.ascontiguousarray(original.depth[::2, ::2])))
 
 
