@@ -204,6 +204,9 @@ def test_exchanged_channels_are_found_by_a_model(frame: RGBDFrame) -> None:
     assert_found("$|color-light", check_channel_order, change(frame, color=color // 2), recognizer)
     for few in (recognizer_that_prefers(color, n=1), recognizer_that_prefers(color, ())):
         assert "not checked" in assert_found("", check_channel_order, wrong, few).notes[0]
+    files = frame_files(SAMPLES / "breakfast")
+    for given, scale, reason in ((change(files, labels=None), None, "no labels"), (files, 100, "other findings")):
+        assert reason in diagnose(given, depth_scale=scale, recognizer=recognizer).notes[-1]
 
 
 def test_units_of_meshes(tmp_path: Path) -> None:
