@@ -50,6 +50,7 @@ __all__ = [
     "remove_written",
     "temporary_directory",
     "unpack_arrays",
+    "write_bytes",
     "write_text",
 ]
 
@@ -266,10 +267,15 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
     return np.lib.format.read_array(stream, allow_pickle=False)
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write `content` to `path`, atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` to `path` in UTF-8, atomically; bytes of a file name that are not UTF-8 are escaped."""
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 MAX_YAML_BYTES = 2**24

@@ -1,12 +1,9 @@
 """Commands that are killed while they write: files under their final names are complete, and commands resume."""
 
-import json
-import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -114,31 +111,6 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
     first, second = (read_baseline(baseline_file(folder, "forest"), ("brick", "stick")) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
-
-
-def without_times(contents: dict[str, bytes]) -> dict[str, Any]:
-    """Return the contents of a report without its timings and its HTML page."""
-    kept: dict[str, Any] = {name: content for name, content in contents.items() if name.endswith((".jpg", ".png"))}
-    if "report.json" in contents:
-        kept["report.json"] = {k: v for k, v in json.loads(contents["report.json"]).items() if k != "speed"}
-    for line in contents.get("answers.jsonl", b"").splitlines()[1:]:
-        answers = json.loads(line)
-        kept[f"answers.jsonl {answers['frame']}"] = answers["instances"]
-    return kept
-
-
-def test_evaluate(frames: Path, model: Path, tmp_path: Path) -> None:
-    command = "evaluate", "frames", frames, "--model", model, "--out"
-    out, whole = tmp_path / "out", finish(*command, tmp_path / "whole")
-    expected = without_times(whole)
-    kill("before frames/1.jpg", *command, out)
-    written = without_times(files(out))
-    assert written.keys() >= {"frames/0.jpg", "answers.jsonl one", "answers.jsonl two"}
-    assert all(expected[name] == content for name, content in written.items())
-    answers = out / "answers.jsonl"
-    os.truncate(answers, answers.stat().st_size - 9)  # a kill during the write of the last answers
-    resumed = finish(*command, out)
-    assert without_times(resumed) == expected and resumed.keys() == whole.keys()
 
 
 def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:

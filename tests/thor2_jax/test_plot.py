@@ -142,6 +142,8 @@ def test_reliability_draws_accuracy_and_counts() -> None:
 
 
 def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
+    assert_refused(r"points is \[300, 2\]", plot.cloud, ax, POINTS[:, :2], COLORS)
+    assert_refused(r"colors is \[2, 3\]; expected \[300, 3\]", plot.cloud, ax, POINTS, COLORS[:2])
     assert_refused("points is .*numbers", plot.cloud, ax, [[1.0, 2.0, 3.0], [1.0]], COLORS[:2])
     assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
     assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)

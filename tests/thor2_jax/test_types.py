@@ -75,6 +75,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
         ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
         ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
+        ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb is int64"]),
         ({"clouds": [(changed(POINTS, np.nan), COLORS)]}, ["clouds[0]", "xyz[1]", "nan"]),
         ({"clouds": [(changed(POINTS, 1e39), COLORS)]}, ["clouds[0]", "xyz[1]", "1e+39"]),
         ({"clouds": [(POINTS, changed(COLORS, 1.5))]}, ["clouds[0]", "rgb[1]", "1.5"]),

@@ -29,7 +29,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.looks import N_SCALARS, LookDescriptors, describe_looks, is_color
 from thor2_jax.errors import decoding
-from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays
+from thor2_jax.files import content_digest, pack_arrays, read_file, unpack_arrays, write_bytes
 from thor2_jax.networks.networks import (
     Compiled,
     EmbeddingNetwork,
@@ -82,8 +82,7 @@ class References:
         """Write the references of the embedding with this fingerprint, atomically; raise OSError if that fails."""
         about = {"embedding": fingerprint, "classes": list(self.classes)}
         arrays: dict[str, NDArray[Any]] = {"embeddings": self.embeddings, "label": self.label}
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(pack_arrays(arrays, {"references": json.dumps(about, sort_keys=True)}))
+        write_bytes(path, pack_arrays(arrays, {"references": json.dumps(about, sort_keys=True)}))
 
     @classmethod
     def load(cls, path: Path, fingerprint: str, size: int) -> "References":
@@ -321,8 +320,7 @@ class Embedding:
         """
         if self.references is not None:
             self.references.save(Path(path).with_name(REFERENCES_FILE), self.fingerprint)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(self._content)
+        write_bytes(path, self._content)
 
     @classmethod
     def load(cls, path: str | Path, network: colornet.ColorNetwork | None = None) -> "Embedding":

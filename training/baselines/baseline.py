@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thor2_jax import DescriptorConfig, PointClouds, RGBDFrame, view_normalize
 from thor2_jax.errors import decoding
-from thor2_jax.files import atomic_write, content_digest, json_digest, pack_arrays, read_file, unpack_arrays
+from thor2_jax.files import content_digest, json_digest, pack_arrays, read_file, unpack_arrays, write_bytes
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import Compiled
 from thor2_jax.recognizer import DescribedFrame
@@ -133,8 +133,7 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], s
         about["weights"] = dict(stored.weights)
     about["digest"] = _digest(stored.arrays, about)
     path.parent.mkdir(exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(pack_arrays(stored.arrays, {"about": json.dumps(about)}))
+    write_bytes(path, pack_arrays(stored.arrays, {"about": json.dumps(about)}))
 
 
 def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thor2_jax.files import atomic_write
+from thor2_jax.files import write_bytes
+from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.results import named_answers
@@ -86,8 +87,7 @@ _CROP_SIDE = 240
 
 def _save(picture: Image.Image, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        picture.save(temporary, format="JPEG", quality=85, subsampling=0)
+    write_bytes(path, encode_image(picture, "JPEG", quality=85, subsampling=0))
 
 
 def draw_judged(color: NDArray[np.uint8], labels: NDArray[Any], judged: Sequence[Annotation], path: Path) -> None:

@@ -20,7 +20,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import atomic_write, content_digest, pack_arrays, read_file, unpack_arrays, write_text
+from thor2_jax.files import content_digest, pack_arrays, read_file, unpack_arrays, write_bytes, write_text
 
 __all__ = [
     "MANIFEST",
@@ -220,8 +220,7 @@ def write_checked(path: Path, content: bytes) -> str:
     Raises:
         OSError: the file cannot be written; an older file is kept.
     """
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, content)
     return content_digest([content])
 
 
@@ -245,8 +244,7 @@ def save_arrays(path: Path, arrays: Arrays, metadata: Mapping[str, str]) -> None
     Raises:
         OSError: the file cannot be written; an older file is kept.
     """
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(pack_arrays(arrays, {**metadata, "sha256": _arrays_digest(arrays)}))
+    write_bytes(path, pack_arrays(arrays, {**metadata, "sha256": _arrays_digest(arrays)}))
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:

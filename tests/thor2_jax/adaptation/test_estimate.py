@@ -24,7 +24,6 @@ from thor2_jax.adaptation.estimate import (
     entropy,
     estimate_transform,
     evenly_spread,
-    gallery_classifier,
     objective,
     posterior_mean,
     transform_colors,
@@ -144,7 +143,8 @@ def test_an_adapted_recognizer_sees_corrected_colors() -> None:
 
 
 def test_gallery_answers_are_its_scores() -> None:
-    recognizer = Recognizer(run())
+    recognizer = Recognizer(untrained_run((), ()))
+    assert_refused("neither classes nor enrolled objects", adaptation_criterion, recognizer.model)
     for name, seed in (("mug", 0), ("bowl", 1)):
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
@@ -152,7 +152,7 @@ def test_gallery_answers_are_its_scores() -> None:
     gallery = dataclasses.replace(recognizer.gallery, references=None)
     scores = gallery.scores(embedding.embed_oriented(oriented))
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
-    np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
+    np.testing.assert_allclose(adaptation_criterion(recognizer.model)(CLOUDS), expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("rule", ["max", *slow("mean", "log-mean")])

@@ -155,6 +155,7 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "height": "480"}', "intrinsics.height is '480'"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2]}', "has 2 coefficients"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2, 3, NaN]}', "coefficient nan"),
+        (json.dumps(PINHOLE | {"distortion": [1] * 15}), "has 15 coefficients"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": "none"}', "distortion is 'none'"),
         ('{"K": 0, "D": [0.1, 0], "distortion_model": "equidistant"}', "the distortion model equidistant; expected"),
         ('{"ppx": 3, "ppy": 2, "fx": 5, "fy": 5, "model": "a.inverse_brown", "coeffs": [1]}', "model a.inverse_brown"),

@@ -30,7 +30,7 @@ CLUTTER = frame_of_squares({1: RED, 2: BLUE, 3: (70, 20, (90, 200, 60))})
 
 
 def taught(run: TrainedRun, **options: object) -> thor2.Recognizer:
-    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding()), **options)  # type: ignore[arg-type]
+    recognizer = thor2.Recognizer(run, embedding=embedding(), **options)  # type: ignore[arg-type]
     recognizer.enroll("brick", [BRICK, (CLUTTER, 1)])
     recognizer.enroll("book", [BOOK])
     return recognizer
@@ -58,8 +58,11 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
     assert ": 1 of 2;" in alone.weak_rejection
+    alone.forget("book")
+    assert "without reference views: 1;" in alone.weak_rejection
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
+    assert_refused("on disk", alone.undo, 0)
     assert ObjectGallery(()).gallery.summary == "no object yet"
     assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
 

@@ -99,6 +99,11 @@ def flip_a_bit(path: Path) -> None:
     weights_file(path, "ce").write_bytes(content)
 
 
+def directory_as_weights(path: Path) -> None:
+    weights_file(path, "tops").unlink()
+    weights_file(path, "tops").mkdir()
+
+
 def other_network(path: Path) -> None:
     network = colornet.load_default()
     dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
@@ -129,6 +134,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no embedding": (lambda path: (path / EMBEDDING_FILE).unlink(), "embedding.safetensors is missing"),
     "no references": (lambda path: (path / REFERENCES_FILE).unlink(), "references.safetensors is missing; copy"),
     "other surfaces": (lambda path: (path / SURFACES_FILE).write_bytes(b"0"), "surfaces.safetensors is damaged: its"),
+    "a directory as weights": (directory_as_weights, "weights/tops.safetensors cannot be read (Is a directory)"),
     "no weights": (lambda path: weights_file(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 

@@ -92,4 +92,5 @@ def test_compressed_float_depth() -> None:
     ],
 )
 def test_other_images_are_refused(read: Any, message: Any) -> None:
+    assert image_kind(compressed(b"damaged", "png")) == "other"
     assert_refused("expected", read, message)

@@ -80,4 +80,5 @@ def test_segmenters_that_fail() -> None:
     def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
         raise NotImplementedError  # without a message
 
+    assert_refused("^frame is a str", segment, FRAME, lambda frame: segment_table(segment("frame")))
     assert_refused(r"^segmenter failing failed .*\(NotImplementedError\);", segment, FRAME, failing)

@@ -135,7 +135,7 @@ def test_depth_with_nan_and_holes() -> None:
     assert (best_overlaps(labels, frame.label_image)[:2] > 0.8).all()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400), (1, 4000)])
 def test_images_of_few_pixels(size: tuple[int, int]) -> None:
     color, depth = np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16)
     assert segment_table(RGBDFrame(color, depth, None, Intrinsics(500.0, 500.0, 0.0, 0.0))).shape == size

@@ -7,6 +7,7 @@ from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from slow_tier import slow
 from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run, with_surfaces
@@ -105,7 +106,7 @@ def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -
 
 @pytest.mark.parametrize("is_estimated", [False, *slow(True)])
 def test_the_service_adapts_after_enough_instances_if_told(
-    teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
+    teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
         monkeypatch.setattr(estimate, "objective", create_autospec(estimate.objective))
@@ -126,6 +127,8 @@ def test_the_service_adapts_after_enough_instances_if_told(
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()
     assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
+    without_classifiers = Settings(write_run(tmp_path / "run", ()), adapt=True)
+    assert_refused("adapt: .*run has no classifiers", InferenceEngine, without_classifiers)
     by_default = InferenceEngine(Settings(teaching_run))
     by_default.compile_adaptation()
     by_default.correct(views(2 * EVERY), observe=True)

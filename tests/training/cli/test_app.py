@@ -85,7 +85,8 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
 def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    assert str(tmp_path / "a") in refused("forget", "mug", "--model", tmp_path / "a")
+    for command in (("forget", "mug", "--model"), ("train", "--meshes", tmp_path, "--out")):
+        assert str(tmp_path / "a") in refused(*command, tmp_path / "a")
 
 
 def test_version_and_help(printed: Command) -> None:

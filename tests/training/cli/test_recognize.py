@@ -108,7 +108,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     save_run(untrained_run((), ()), Path("gallery-only"))
     Path("poses").write_text("[")
     unit, double = np.eye(4).tolist(), (2 * np.eye(4)).tolist()
-    for name, poses in {"few": [unit], "other": {"one": unit}, "scaled": [unit, double]}.items():
+    for name, poses in {"number": 7, "few": [unit], "other": {"one": unit}, "scaled": [unit, double]}.items():
         Path(f"{name}.json").write_text(json.dumps(poses))
     before = sorted(tmp_path.iterdir())
     no_files = ("empty", "frames/one/color.png/results", "pipe")
@@ -126,6 +126,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --segment sam --out out", "error: --segment is 'sam'; expected one of table, model"),
         ("frames --track --workers 2", "workers is 2"),
         ("frames --out out --track --poses poses", "error: --poses: poses is invalid"),
+        ("frames --out out --track --poses number.json", "it contains a int"),
         ("frames --out out --track --poses few.json", "few.json is 1; expected 2"),
         ("frames --out out --track --poses other.json", "no pose of frame two"),
         ("frames --out out --track --poses scaled.json", "frame two is not a rigid motion"),
@@ -161,10 +162,11 @@ def test_no_file_of_the_user_is_replaced(model: Path, tmp_path: Path, refused: C
     for name, content, option in (
         ("f/recognition.json", '{"a": "user\'s"}', "--out"),
         ("f/overlay.png", "a user's", "--out"),
+        ("accents.csv", "\u00e9", "--bop"),
         ("instances.json", '[{"image_id": 1, "category_id": 2}]', "--coco"),
         ("poses.csv", "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n", "--bop"),
     ):
-        (tmp_path / name).write_text(content)
+        (tmp_path / name).write_text(content, "latin-1")
         before, given = files_of(tmp_path), tmp_path if option == "--out" else tmp_path / name
         assert Path(name).name in refused("recognize", "--model", model, tmp_path, option, given)
         assert files_of(tmp_path) == before

@@ -149,6 +149,7 @@ def test_labels(frame: RGBDFrame) -> None:
         (lambda labels: labels * 0, "labels-empty"),
         (lambda labels: labels + 1, "labels-background"),
         (_interpolated, "labels-(thin|many)"),
+        (lambda labels: np.tile(np.arange(120) % 4 // 2 * (np.arange(120) // 4 + 1), (90, 1)), "labels-thin"),
         (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), "labels-many"),
         (lambda labels: blobs(2), ""),
         (lambda labels: blobs(3) * 255, "labels-foreground"),
@@ -203,6 +204,9 @@ def test_exchanged_channels_are_found_by_a_model(frame: RGBDFrame) -> None:
     assert_found("$|color-light", check_channel_order, change(frame, color=color // 2), recognizer)
     for few in (recognizer_that_prefers(color, n=1), recognizer_that_prefers(color, ())):
         assert "not checked" in assert_found("", check_channel_order, wrong, few).notes[0]
+    files = frame_files(SAMPLES / "breakfast")
+    for given, scale, reason in ((change(files, labels=None), None, "no labels"), (files, 100, "other findings")):
+        assert reason in diagnose(given, depth_scale=scale, recognizer=recognizer).notes[-1]
 
 
 def test_units_of_meshes(tmp_path: Path) -> None:
@@ -238,6 +242,7 @@ def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
 
     assert codes(labels=photo, intrinsics=b"{}") == {"unreadable-labels", "unreadable-intrinsics"}
     assert codes(color=b"", depth=photo) == {"unreadable-color", "unreadable-depth"}
+    assert codes(labels=encode_image(original.labels * 0)) == {"labels-empty"}
     assert "size" in codes(depth=encode_image(np.ascontiguousarray(original.depth[::2, ::2])))
     fields = dataclasses.asdict(original.intrinsics)
     for distortion, expected in ((-9.0, {"unreadable-intrinsics"}), (0.1, set())):

@@ -80,13 +80,17 @@ def test_each_sequence_is_answered_by_its_run(tmp_path: Path) -> None:
 
 
 def test_confidences_are_those_of_recognition(tmp_path: Path) -> None:
-    """Instances are compared with surfaces, too."""
+    """Instances are compared with surfaces, too, and with an object that is enrolled."""
     record: dict[str, object] = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))}
     save_run(with_surfaces(untrained_embedding_run(("a", "b"), record=record)), tmp_path / "run")
-    (run,), recognizer, frame = load_runs([tmp_path / "run"]), Recognizer.load(tmp_path / "run"), tilted(patches())
-    values = run.probabilities("", recognizer.describe(frame), None)["embedding"]
-    expected = [answer.confidence for answer in recognizer.recognize(frame) if answer.confidence is not None]
-    assert len(expected) > 1 and values.max(axis=1)[: len(expected)] == pytest.approx(expected, rel=1e-5)
+    recognizer, frame = Recognizer.load(tmp_path / "run"), tilted(patches())
+    for column in ("embedding", "both"):
+        if column == "both":
+            recognizer.enroll("tall", [(frame, 200)])
+        (run,) = load_runs([tmp_path / "run"])
+        values = run.probabilities("", recognizer.describe(frame), None)[column]
+        expected = [answer.confidence for answer in recognizer.recognize(frame) if answer.confidence is not None]
+        assert len(expected) > 1 and values.max(axis=1)[: len(expected)] == pytest.approx(expected, rel=1e-5)
 
 
 def test_incompatible_sequence_runs_are_refused(tmp_path: Path) -> None:
