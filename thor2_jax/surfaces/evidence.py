@@ -57,6 +57,7 @@ class Sample(NamedTuple):
         points: [B, SAMPLED, 3], metres, relative to the camera.
         lab: [B, 3, SAMPLED], smoothed L*a*b* colours.
         rough: [B], roughness, metres.
+        rim: [B, SAMPLED] bool, see `PointClouds.rim`.
         around: [B, G, G, 3], see `PointClouds.around`.
         is_empty: [B] bool.
     """
@@ -64,6 +65,7 @@ class Sample(NamedTuple):
     points: jax.Array
     lab: jax.Array
     rough: jax.Array
+    rim: jax.Array
     around: jax.Array
     is_empty: jax.Array
 
@@ -111,17 +113,20 @@ def sample_points(clouds: PointClouds) -> Sample:
     """Return what `evidence` compares of clouds [B, N] in metres."""
 
     def sample(row: tuple[jax.Array, ...]) -> Sample:
-        points, colors, mask, camera, around = row
+        points, colors, mask, rim, camera, around = row
         number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
         # The order of the points is spatial. Equal steps through it, and multiples of the golden ratio, spread evenly.
         every = (number * jnp.maximum(count / len(number), 1)).astype(int)
         points, lab = points[every] - camera, to_lab(colors[every])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
-        chosen = points[(golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)]
-        return Sample(chosen, *_describe_neighbourhoods(chosen, points, lab, number < count), around, count == 0)
+        chosen = (golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)
+        described = _describe_neighbourhoods(points[chosen], points, lab, number < count)
+        return Sample(points[chosen], *described, rim[every][chosen], around, count == 0)
 
     around = jnp.zeros((len(clouds.points), 1, 1, 3), jnp.float32) if clouds.around is None else clouds.around
-    return jax.lax.map(sample, (clouds.points, clouds.colors, clouds.mask, clouds.camera, around), batch_size=16)
+    rim = jnp.zeros(clouds.mask.shape, bool) if clouds.rim is None else clouds.rim
+    fields = clouds.points, clouds.colors, clouds.mask, rim, clouds.camera, around
+    return jax.lax.map(sample, fields, batch_size=16)
 
 
 @jax.jit
@@ -276,7 +281,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     best = (energy(pose, SAMPLED) + FREE_COST * free).argmin()
     offset, distance, entries = (each[0] for each in look_up(matmul(pose[best, None], points), range(3, 9)))
     matched = distance < REACH
-    plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH).mean()
+    plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH)
+    plane = plane.mean(where=matched | ~sample.rim)
     chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
     fit = jnp.log((plane + 3e-4) / (sample.rough + 3e-4))
     return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]
