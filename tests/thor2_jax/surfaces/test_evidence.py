@@ -86,6 +86,20 @@ def test_the_surface_of_a_class_is_not_in_free_space(surfaces: Surfaces, views: 
         np.testing.assert_array_equal(evidence(surfaces, PointClouds.pack(each), classes)[:, 3], 0)
 
 
+def test_points_off_the_surface_near_the_contour_do_not_count(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """A mask that is too large adds points of the table beside the box."""
+    loose, rims = [], []
+    for xyz, rgb in views[3:6]:
+        table = np.unique(xyz[::4] * [0, 1, 1] + [xyz[:, 0].max() + 0.03, 0, 0], axis=0).astype(np.float32)
+        rims.append(np.arange(len(xyz) + len(table)) >= len(xyz))
+        loose.append((np.concatenate([xyz, table]), np.concatenate([rgb, rgb[: len(table)]])))
+    tight, marked, unmarked = (
+        np.asarray(evidence(surfaces, PointClouds.pack(clouds, rim=rim), np.full(3, 1)))[:, 0]
+        for clouds, rim in ((views[3:6], None), (loose, rims), (loose, None))
+    )
+    assert (marked < tight + 0.4).all() and (unmarked > marked + 0.4).all(), (tight, marked, unmarked)
+
+
 def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) -> None:
     poses = np.asarray(fit_poses(surfaces, PointClouds.pack(views), OWN))
     for (xyz, _), pose, index in zip(views, poses, OWN, strict=True):
