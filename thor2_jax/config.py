@@ -148,11 +148,6 @@ class DescriptorConfig:
         return cls(**stored, relaxation=None if relaxation is None else Relaxation(**relaxation))
 
     @property
-    def uses_rim(self) -> bool:
-        """Whether one of the looks leaves out the points near the contour of the mask."""
-        return self.looks == 4
-
-    @property
     def window(self) -> float:
         """Upper end of the axes of an image, the largest persistence that it covers, in scaled units (0.775)."""
         return (self.image_size - 1) * self.sigma_2

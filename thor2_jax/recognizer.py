@@ -300,7 +300,7 @@ class Recognizer:
         check_frame(frame)
         model, config = self.model, self.run.config
         chosen = frame.instances if labels is None else labels
-        prepared = (prepare_instance(frame, label, config.sigma_s, config.uses_rim) for label in chosen)
+        prepared = (prepare_instance(frame, label, config.sigma_s) for label in chosen)
         return map(model.corrected, prepared)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:

@@ -89,13 +89,12 @@ def instance_clouds(frame: RGBDFrame) -> list[PreparedInstance]:
     return [instance_cloud(frame, label) for label in frame.instances]
 
 
-def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> PreparedInstance:
+def instance_cloud(frame: RGBDFrame, label: int) -> PreparedInstance:
     """Return the cloud of one instance, on a voxel grid of 3 mm and before `find_occlusion`.
 
     Args:
         frame: the frame.
         label: one of `frame.instances`.
-        with_rim: whether to find the rim.
 
     Raises:
         InputError: the frame has no such instance, or the points are too far apart for the grid, for example because of
@@ -114,9 +113,8 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
         trusted &= ~flying
     valid = pixels[trusted]
     points = frame.points(valid).astype(np.float32)
-    channels = frame.color.reshape(-1, 3).take(valid, axis=0)
-    if with_rim:  # the rim becomes a further colour channel
-        channels = np.column_stack([channels, _near_contour(frame, label, pixels)[trusted] * np.uint8(255)])
+    rim = _near_contour(frame, label, pixels)[trusted]  # becomes a further colour channel
+    channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), rim * np.uint8(255)])
     try:
         points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)
     except InputError:
@@ -133,8 +131,7 @@ def instance_cloud(frame: RGBDFrame, label: int, with_rim: bool = True) -> Prepa
         return dataclasses.replace(EMPTY_INSTANCE, label=label, reason=reason)
     kept, relaxed = remove_outliers(points)
     points, channels, none = points.take(kept, axis=0), channels.take(kept, axis=0), np.zeros(len(kept), bool)
-    rim = channels[:, 3] > 127 if with_rim else None
-    return PreparedInstance(label, points, channels[:, :3], none, False, steep or relaxed, rim=rim)
+    return PreparedInstance(label, points, channels[:, :3], none, False, steep or relaxed, rim=channels[:, 3] > 127)
 
 
 def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -256,30 +253,28 @@ DESCRIPTOR_VOXEL = 0.01
 """Voxel side, in scaled units, of all described clouds, also in training, since colour vectors count points."""
 
 
-def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float, with_rim: bool = True) -> PreparedInstance:
+def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float) -> PreparedInstance:
     """Compute the cloud of one instance and its occlusion boundary, on the descriptors' voxel grid.
 
     Args:
         frame: the frame.
         label: one of `frame.instances`.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
-        with_rim: whether to find the rim, see `DescriptorConfig.uses_rim`.
 
     Raises:
         InputError: as `instance_cloud`.
     """
-    cloud = instance_cloud(frame, label, with_rim)
+    cloud = instance_cloud(frame, label)
     if cloud.reason is not None:
         return cloud
     occluded, boundary = find_occlusion(frame, cloud)
     # Flags are further colour channels: a voxel is on the boundary if any of its points is, on the rim if most are.
-    flags = [boundary] if cloud.rim is None else [boundary, cloud.rim]
-    channels = np.column_stack([cloud.colors, np.stack(flags, axis=1) * np.uint8(255)])
+    flags = np.array([boundary, cloud.rim]).T
+    channels = np.column_stack([cloud.colors, flags * np.uint8(255)])
     points, channels = downsample_to_fit(cloud.points, channels, DESCRIPTOR_VOXEL / sigma_s)
-    rim = None if cloud.rim is None else channels[:, 4] > 127
-    if rim is not None and 2 * rim.sum() > len(rim):  # a narrow object would lose most of its points
+    colors, boundary, rim = channels[:, :3], channels[:, 3] > 0, channels[:, 4] > 127
+    if 2 * rim.sum() > len(rim):  # a narrow object would lose most of its points
         rim[:] = False
-    colors, boundary = channels[:, :3], channels[:, 3] > 0
     around = _around(frame, label)
     return PreparedInstance(label, points, colors, boundary, occluded, cloud.kept_by_fallback, rim=rim, around=around)
 

@@ -84,7 +84,7 @@ def prepare_frame(
             frame = _segmented(frame, segmenter)
         with_label_map = True
     with timed(seconds, "clouds"), field_errors():
-        instances = [prepare_instance(frame, k, config.sigma_s, config.uses_rim) for k in frame.instances]
+        instances = [prepare_instance(frame, k, config.sigma_s) for k in frame.instances]
         label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, seconds, label_map)
 
