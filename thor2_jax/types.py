@@ -60,7 +60,8 @@ class PointClouds:
         mask: [B, N] bool, False on padding.
         camera: [B, 3] float32, the camera's position in the frame of `points`.
         boundary: [B, N] bool, points on the occlusion boundary of the object; all False for unoccluded views.
-        rim: [B, N] bool, points near the contour of the instance's mask (see `descriptor.looks`); None if unknown.
+        rim: [B, N] bool, points near the contour of the instance's mask (see `descriptor.looks`,
+            `surfaces.evidence`); None if unknown.
         around: [B, G, G, 3] float32, what the camera sees around the instance, on a regular grid of rays: x / z, y / z
             and z in the camera frame, metres; z is 0 on the instance and without depth; None if unknown.
     """

@@ -69,7 +69,8 @@ class RGBDFrame:
     Attributes:
         color: [H, W, 3] uint8, sRGB.
         depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
-            (millimetres by default) or floats in metres; 0, or for floats also NaN or infinity, means no depth.
+            (millimetres by default) or floats in metres. 0, the largest value of an integer type, NaN and infinity mean
+            no depth.
         labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
             segmented: `thor2_jax.segmented` returns it with labels.
         intrinsics: the camera of all three images; a mapping, matrix or ROS message is converted by `Intrinsics.of`.
@@ -116,7 +117,7 @@ class RGBDFrame:
     def depth_m(self) -> NDArray[np.float32]:
         """Depth in metres [H, W] float32; 0 where there is none.
 
-        Values that are not finite, or the largest one of their type, are missing depth, too.
+        Values that are not finite, and the largest value of an integer type or of float32, are missing depth, too.
         """
         if self.depth.dtype.kind == "u":
             is_depth = self.depth != np.iinfo(self.depth.dtype).max

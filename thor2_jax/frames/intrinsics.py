@@ -247,7 +247,7 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
 
 
 def _distortion(values: Mapping[Any, Any]) -> Any:
-    """Return the coefficients of a lens distortion, which may have each of their names in every format.
+    """Return the coefficients of a lens distortion, under any of their names in any format.
 
     Raises:
         InputError: the distortion model is not supported and a coefficient is not 0.
@@ -372,7 +372,7 @@ def _parse(content: bytes) -> Any:
     except ValueError:
         with decoding("intrinsics is neither JSON, YAML, NPY nor nine numbers", expected):
             # YAML parsers reject a directive and tags of OpenCV's FileStorage, and read 1e-05 of `rostopic` as text.
-            content = re.sub(rb"(?<=[\s,[])([-+]?\d+)(?=e[-+]\d)", rb"\1.", content)
+            content = re.sub(rb"(?<=[\s,[])([-+]?\d+)(?=[eE][-+]\d)", rb"\1.", content)
             values = parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
             if isinstance(values, str):
                 raise ValueError(f"it begins with {content.decode(errors='replace')[:30]!r}") from None

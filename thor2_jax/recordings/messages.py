@@ -71,7 +71,10 @@ def image_kind(message: Any) -> str:
 def camera_of(message: Any, color_topic: str) -> Intrinsics:
     """Return the intrinsics of the images of a topic from their CameraInfo.
 
-    They are P without distortion for rectified images (`image_rect...`), otherwise K; raise errors as `Intrinsics.of`.
+    The matrix is P, without distortion, for rectified images (topics with `image_rect`), and otherwise K.
+
+    Raises:
+        InputError: as `Intrinsics.of`.
     """
     projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
     if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:

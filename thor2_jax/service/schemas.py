@@ -273,7 +273,7 @@ def _form(properties: dict[str, Any], *optional: str) -> dict[str, Any]:
 
 _FRAME: dict[str, Any] = {
     "color": _file("8-bit RGB, PNG or JPEG."),
-    "depth": _file("16-bit PNG in units of 1 / depth_scale metres (by default mm); 0: no depth."),
+    "depth": _file("16-bit PNG in units of 1 / depth_scale metres (by default mm); 0 and 65535: no depth."),
     "labels": _file(
         "One-channel or indexed PNG of instance numbers; 0 is background. Without it, the frame is segmented."
     ),

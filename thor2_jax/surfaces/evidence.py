@@ -45,9 +45,9 @@ REACH = 0.012
 N_COMPARED, RIVAL, NAME_WEIGHTS = 4, 0.003, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 EXPONENT = np.float32(0.5)
-"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights for all but the last
-weight, of free space, and the exponent. These two are from real frames; the probabilities of the networks depend more
-on the camera than surfaces do."""
+"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
+`KNOWN_WEIGHTS`, of free space. That weight and the exponent are from real frames, since the probabilities of the
+networks depend more on the camera than surfaces do."""
 
 
 class Sample(NamedTuple):
@@ -96,8 +96,8 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
 
     Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
     total probability is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of all
-    classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`), where s is the
-    share of the class that is most probable after this step, and e its evidence.
+    classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class that
+    is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
     """
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     is_compared = largest >= RIVAL * largest[:, :1]
@@ -282,7 +282,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     offset, distance, entries = (each[0] for each in look_up(matmul(pose[best, None], points), range(3, 9)))
     matched = distance < REACH
     plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH)
-    plane = plane.mean(where=matched | ~sample.rim)
+    counted = matched | ~sample.rim  # masks may be too large
+    plane = plane.mean(where=counted | ~counted.any())
     chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
     fit = jnp.log((plane + 3e-4) / (sample.rough + 3e-4))
     return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]

@@ -227,7 +227,7 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
         width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
         (encoding,) = header["DATA"]
         if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
-            raise ValueError("no points, or no axis")
+            raise ValueError("no points, or several numbers for an axis")
     if encoding not in ("ascii", "binary"):
         raise InputError(f"{path} has DATA {encoding}; expected ascii or binary")
     data, n = content[start:], width * height

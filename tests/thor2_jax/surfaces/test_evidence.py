@@ -98,6 +98,11 @@ def test_points_off_the_surface_near_the_contour_do_not_count(surfaces: Surfaces
         for clouds, rim in ((views[3:6], None), (loose, rims), (loose, None))
     )
     assert (marked < tight + 0.4).all() and (unmarked > marked + 0.4).all(), (tight, marked, unmarked)
+    t = np.linspace(0, 2 * np.pi, 300)
+    ring = [(np.stack([np.cos(t), np.sin(t), 3 + 0 * t], axis=1).astype(np.float32), np.zeros((300, 3), np.uint8))]
+    all_rim, none = (PointClouds.pack(ring, rim=rim) for rim in ([np.ones(300, bool)], None))
+    off = [evidence(surfaces, clouds, np.zeros(1, int)) for clouds in (all_rim, none)]
+    np.testing.assert_array_equal(*off)  # if no other point is left, these count
 
 
 def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) -> None:
@@ -181,7 +186,7 @@ def test_accelerators_compare_all_rows_at_once(
 
 @pytest.mark.parametrize("n_classes", [6, 1])
 def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
-    """Against the two formulas in float64."""
+    """Compare with the two formulas in float64."""
     surfaces = jax.tree.map(lambda field: jnp.concatenate([field, field])[:n_classes], surfaces)
     clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
     before = rng.dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
