@@ -173,7 +173,7 @@ DEFAULT = Protocol(
 """The default: fewer views than the paper, each with five augmented copies, and an embedding instead of classifiers."""
 
 QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
-"""The default with fewer distractors and networks, which takes half of the time."""
+"""The default with fewer distractors and networks, in three quarters of the time."""
 
 PAPER = Protocol(classifiers=FEATURES, fit=FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS)
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -107,7 +107,7 @@ def train(
     ] = None,
     paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Train in half of the time, with fewer distractors and networks.")
+        bool, typer.Option("--quick", help="Train in three quarters of the time, with fewer distractors and networks.")
     ] = False,
     classifiers: Annotated[
         str | None,
