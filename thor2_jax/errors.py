@@ -59,7 +59,7 @@ def with_context(identifier: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def decoding(message: str, expected: str = "", *, advice: str = "") -> Iterator[None]:
-    """Turn every exception of a decoder for a damaged file into an InputError that ends with `expected` or `advice`."""
+    """Turn every exception of a decoder into an InputError, which says what is expected or gives advice."""
     try:
         yield
     except Exception as error:

@@ -69,8 +69,8 @@ class RGBDFrame:
     Attributes:
         color: [H, W, 3] uint8, sRGB.
         depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
-            (millimetres by default) or floats in metres. 0, the largest value of an integer type, NaN and infinity mean
-            no depth.
+            (millimetres by default) or floats in metres. There is no depth where it is 0, not finite, or the largest
+            value of an integer type or of float32.
         labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
             segmented: `thor2_jax.segmented` returns it with labels.
         intrinsics: the camera of all three images; a mapping, matrix or ROS message is converted by `Intrinsics.of`.
@@ -115,10 +115,7 @@ class RGBDFrame:
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth in metres [H, W] float32; 0 where there is none.
-
-        Values that are not finite, and the largest value of an integer type or of float32, are missing depth, too.
-        """
+        """Depth in metres [H, W] float32; 0 where `depth` has none."""
         if self.depth.dtype.kind == "u":
             is_depth = self.depth != np.iinfo(self.depth.dtype).max
             return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32) * is_depth

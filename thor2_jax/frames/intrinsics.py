@@ -255,7 +255,8 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     distortion = _entry(values, *_COEFFICIENTS)
     if distortion is None:
         distortion = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-    model = "fisheye" if values.get("fisheye_model") else _entry(values, "distortion_model", "model")  # as OpenCV's
+    is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
+    model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
     if name not in _PINHOLE_MODELS and np.any(np.asarray(distortion, dtype=object)):
         raise InputError(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from thor2_jax import InputError, Recognizer, RGBDFrame
 from thor2_jax.frames.frames import frame_intrinsics, read_color, read_depth, read_labels
-from thor2_jax.frames.intrinsics import check_camera as check_distortion
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth
@@ -80,9 +79,10 @@ def diagnose(
     if depth is None or camera is None:
         return diagnosis
     camera = dataclasses.replace(camera, width=None, height=None)  # its size was checked
-    if not _passes(diagnosis, _read, "intrinsics", functools.partial(check_distortion, camera, *depth.shape)):
+    seen = np.zeros((*depth.shape, 3), np.uint8) if color is None else color
+    frame = _read(diagnosis, "intrinsics", functools.partial(RGBDFrame, seen, depth, labels, camera))
+    if frame is None:  # the lens distortion has no inverse
         return diagnosis
-    frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, camera)
     is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)
     trust_camera = camera_is_right and is_registered  # Without registration, the labels belong to other pixels.
     depth_is_right = _passes(diagnosis, check_depth, frame, sides, names, trust_camera=trust_camera)

@@ -146,5 +146,6 @@ def test_repeated_epochs_replace_the_later_ones_of_a_classifier(tmp_path: Path) 
         assert [(r["fold"], r["classifier"], r["epoch"]) for r in train_run.read_metrics(path)] == logged
     train_run.log_metrics(path, 1, "ce", EpochMetrics(3, 1.0, 0.5, 1000.0))  # after the line that was cut off
     assert [r["epoch"] for r in train_run.read_metrics(path)] == [1, 2, 2, 2, 3]
-    path.write_text('{"epoch": "1"}\n')
-    assert_refused(r"out: .*metrics\.jsonl", train_run.read_metrics, path)
+    for damaged in ("no json\n{}\n", '{"epoch": "1"}\n'):
+        path.write_text(damaged)
+        assert_refused(r"out: .*metrics\.jsonl", train_run.read_metrics, path)
