@@ -42,7 +42,7 @@ in free space."""
 REACH = 0.012
 """Largest distance of a match in scores and values, metres."""
 
-N_COMPARED, RIVAL, NAME_WEIGHTS = 4, 0.003, np.array([-7, 2.7, 1.5, 0], np.float32)
+N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 EXPONENT = np.float32(0.5)
 """See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
@@ -94,16 +94,24 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
-    Compared are up to `N_COMPARED` classes that have at least `RIVAL` times the probability of the first one. Their
-    total probability is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of all
+    Classes are compared in the order of their probabilities p, up to `N_COMPARED`. The total probability of those that
+    are compared is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). A class is not compared if
+    its share would be smaller than that of a class before it even with `NAME_WEIGHTS` e = `GOOD_FIT`. The odds o of all
     classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class that
     is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
     """
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
-    is_compared = largest >= RIVAL * largest[:, :1]
-    rows = jax.tree.map(lambda field: jnp.concatenate([field] * index.shape[1]), samples)
-    rows = rows._replace(is_empty=rows.is_empty | ~is_compared.T.ravel())
-    values = _fit_rows(surfaces, rows, index.T.ravel())[0].reshape(*index.T.shape, -1).swapaxes(0, 1)  # [B, K, 4]
+    logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30))
+
+    def compare(best: jax.Array, name: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        logit, index = name
+        is_compared = logit + GOOD_FIT >= best
+        values, _ = _fit_rows(surfaces, samples._replace(is_empty=samples.is_empty | ~is_compared), index)
+        changed = jnp.where(is_compared, logit + matmul(values, NAME_WEIGHTS), -jnp.inf)
+        return jnp.maximum(best, changed), (is_compared, values)
+
+    _, results = jax.lax.scan(compare, jnp.full_like(logits[:, 0], -jnp.inf), (logits.T, index.T))
+    is_compared, values = (each.swapaxes(0, 1) for each in results)  # [B, K], [B, K, 4]
     changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
     return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
 
@@ -154,15 +162,19 @@ def compared(
     """
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)
-    is_compared = (largest >= RIVAL * largest[:, :1]) & (largest > 0)
-    pairs = np.argwhere(is_compared)
-    fits = [  # all are dispatched before the first result is awaited
-        _fit_rows(surfaces[index[row, k]], jax.tree.map(lambda a, row=row: a[row : row + 1], samples), np.zeros(1, int))
-        for row, k in pairs
-    ]
-    values = np.zeros((len(index), N_COMPARED, 4), np.float32)
-    for (row, k), (value, _) in zip(pairs, fits, strict=True):
-        values[row, k] = np.asarray(value)[0]
+    logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
+    is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
+    best = np.full(len(index), -np.inf)
+    for k in range(index.shape[1]):
+        is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
+        rows = np.flatnonzero(is_compared[:, k])
+        of_row = (jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in rows)
+        fits = [  # all are dispatched before the first result is awaited
+            _fit_rows(surfaces[number], sample, np.zeros(1, int))[0]
+            for number, sample in zip(index[rows, k], of_row, strict=True)
+        ]
+        values[rows, k] = np.concatenate([values[:0, k], *fits])
+        best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
     arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
     changed = np.array(probabilities)

@@ -194,17 +194,19 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
     n_compared = 0
     for row, probabilities in enumerate(before.astype(np.float64)):
-        best = np.argsort(-probabilities)[:4]
-        best = best[probabilities[best] > 0.003 * probabilities[best[0]]]
-        if len(best) > 1:
-            odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
-            probabilities[best] = probabilities[best].sum() * odds / odds.sum()
-            n_compared += len(best)
+        best, largest = list[int](), 0.0
+        for k in np.argsort(-probabilities)[:5]:
+            if probabilities[k] ** 0.5 * np.exp(1.5) >= largest:
+                best.append(k)
+                largest = max(largest, probabilities[k] ** 0.5 * np.exp(values[k][row] @ [-7, 2.7, 1.5, 0]))
+        n_compared += len(best)
+        odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
+        probabilities[best] = probabilities[best].sum() * odds / odds.sum()
         known = probabilities.sum()
         fits = values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15]
         odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
-    assert n_compared == (0 if n_classes == 1 else pytest.approx(30, abs=10))
+    assert n_compared == 9 if n_classes == 1 else 18 < n_compared < 40, n_compared
     nothing = np.zeros((9, n_classes), np.float32)
     assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
 
