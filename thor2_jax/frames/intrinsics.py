@@ -142,7 +142,7 @@ class Intrinsics:
         if not isinstance(values, Mapping):
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
-            values = values["intrinsic"]
+            values = {**values, **values["intrinsic"]}
         matrix, scale = _parts(values)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
         width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
@@ -252,9 +252,8 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     Raises:
         InputError: the distortion model is not supported and a coefficient is not 0.
     """
-    distortion = _entry(values, *_COEFFICIENTS)
-    if distortion is None:
-        distortion = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+    given = [entry for name in _COEFFICIENTS if (entry := _entry(values, name)) is not None and np.size(entry)]
+    distortion = given[0] if given else [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
     model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady

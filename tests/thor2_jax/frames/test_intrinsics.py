@@ -111,6 +111,7 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
 @pytest.mark.parametrize("camera", [PINHOLE, {"K": MATRIX.tolist()}, {"cam_K": MATRIX.tolist()}, REALSENSE, OPEN3D])
 def test_coefficients_in_every_format(camera: dict[str, object], name: str) -> None:
     assert parse_intrinsics(as_json({**camera, name: LENS})).distortion == tuple(LENS)
+    assert parse_intrinsics(as_json({"intrinsic": OPEN3D, "D": [], name: LENS})).distortion == tuple(LENS)
     for refused in ({name: LENS, "model": "fisheye"}, {name: {"k1": 0.1}}, {name: LENS, "fisheye_model": 1}):
         assert_refused("^intrinsics.* distortion|^intrinsics.distortion", Intrinsics.of, {**camera, **refused})
 
