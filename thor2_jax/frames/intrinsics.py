@@ -252,10 +252,9 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     Raises:
         InputError: the distortion model is not supported and a coefficient is not 0.
     """
-    given = [entry for name in _COEFFICIENTS if (entry := _entry(values, name)) is not None and np.size(entry)]
-    distortion = (
-        given[0] if given else [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-    )
+    one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+    entries = (_entry(values, name) for name in _COEFFICIENTS)
+    distortion = next((each for each in entries if each is not None and np.size(each)), one_by_one)
     is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
     model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
