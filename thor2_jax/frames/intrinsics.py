@@ -141,12 +141,12 @@ class Intrinsics:
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
         if not isinstance(values, Mapping):
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
-        if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
-            values = {**values, **values["intrinsic"]}
-        matrix, scale = _parts(values)
+        camera = values["intrinsic"] if isinstance(values.get("intrinsic"), Mapping) else values  # of Open3D
+        matrix, scale = _parts(camera)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
-        width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
-        return cls.of_matrix(matrix, scale, width=width, height=height, distortion=_distortion(values))
+        width, height = _entry(camera, "width", "image_width"), _entry(camera, "height", "image_height")
+        distortion = next(filter(_is_filled, map(_distortion, (camera, values))), ())
+        return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
 
     @classmethod
     def of_matrix(
@@ -246,6 +246,10 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
         )
 
 
+def _is_filled(coefficients: Any) -> bool:
+    return coefficients is not None and np.asarray(coefficients, dtype=object).size > 0
+
+
 def _distortion(values: Mapping[Any, Any]) -> Any:
     """Return the coefficients of a lens distortion, under any of their names in any format.
 
@@ -254,7 +258,7 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     """
     one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     entries = (_entry(values, name) for name in _COEFFICIENTS)
-    distortion = next((each for each in entries if each is not None and np.size(each)), one_by_one)
+    distortion = next(filter(_is_filled, entries), one_by_one if any(one_by_one) else ())
     is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
     model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady

@@ -46,8 +46,8 @@ N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.floa
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 EXPONENT = np.float32(0.5)
 """See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
-`KNOWN_WEIGHTS`, of free space. That weight and the exponent are from real frames, since the probabilities of the
-networks depend more on the camera than surfaces do."""
+`KNOWN_WEIGHTS`, of free space. The other values are from real frames, since the probabilities of the networks depend
+more on the camera than surfaces do."""
 
 
 class Sample(NamedTuple):
@@ -94,23 +94,22 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
-    Classes are compared in the order of their probabilities p, up to `N_COMPARED`. The total probability of those that
-    are compared is shared among them in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). A class is not compared if
-    its share would be smaller than that of a class before it even with `NAME_WEIGHTS` e = `GOOD_FIT`. The odds o of all
-    classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class that
-    is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
+    Up to `N_COMPARED` classes are compared, in the order of their probabilities p, until the next one could not come
+    first: until p^`EXPONENT` exp(`GOOD_FIT`) is less than the largest p^`EXPONENT` exp(`NAME_WEIGHTS` e) so far. The
+    compared classes share their total probability in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of
+    all classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class
+    that is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
     """
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30))
 
-    def compare(best: jax.Array, name: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        logit, index = name
-        is_compared = logit + GOOD_FIT >= best
+    def compare(best: jax.Array, name: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        probability, logit, index = name
+        is_compared = (probability > 0) & (logit + GOOD_FIT >= best)
         values, _ = _fit_rows(surfaces, samples._replace(is_empty=samples.is_empty | ~is_compared), index)
-        changed = jnp.where(is_compared, logit + matmul(values, NAME_WEIGHTS), -jnp.inf)
-        return jnp.maximum(best, changed), (is_compared, values)
+        return jnp.maximum(best, logit + matmul(values, NAME_WEIGHTS)), (is_compared, values)
 
-    _, results = jax.lax.scan(compare, jnp.full_like(logits[:, 0], -jnp.inf), (logits.T, index.T))
+    _, results = jax.lax.scan(compare, jnp.full_like(logits[:, 0], -jnp.inf), (largest.T, logits.T, index.T))
     is_compared, values = (each.swapaxes(0, 1) for each in results)  # [B, K], [B, K, 4]
     changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
     return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
@@ -157,8 +156,7 @@ def compared(
 ) -> NDArray[np.floating]:
     """Return probabilities [B, n] on the host, changed as by `with_evidence`, for n surfaces of one class each.
 
-    Every instance and name is compared on its own, so that other numbers of instances and names compile nothing. Rows
-    of zeros are not compared.
+    Every instance and name is compared on its own, so that other numbers of instances and names compile nothing.
     """
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)

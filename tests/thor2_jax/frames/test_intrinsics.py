@@ -111,9 +111,18 @@ def test_a_file_of_opencv(tmp_path: Path) -> None:
 @pytest.mark.parametrize("camera", [PINHOLE, {"K": MATRIX.tolist()}, {"cam_K": MATRIX.tolist()}, REALSENSE, OPEN3D])
 def test_coefficients_in_every_format(camera: dict[str, object], name: str) -> None:
     assert parse_intrinsics(as_json({**camera, name: LENS})).distortion == tuple(LENS)
-    assert parse_intrinsics(as_json({"intrinsic": OPEN3D, "D": [], name: LENS})).distortion == tuple(LENS)
     for refused in ({name: LENS, "model": "fisheye"}, {name: {"k1": 0.1}}, {name: LENS, "fisheye_model": 1}):
         assert_refused("^intrinsics.* distortion|^intrinsics.distortion", Intrinsics.of, {**camera, **refused})
+
+
+def test_coefficients_beside_a_nested_camera() -> None:
+    """Empty lists are passed over, and the lens of the camera itself comes first; matrix and scale are its own."""
+    beside = {"D": [], "dist": LENS, "K": np.eye(3).tolist(), "depth_scale": 1}
+    expected = Intrinsics.of({**OPEN3D, "dist": LENS})
+    assert Intrinsics.of({"intrinsic": OPEN3D, **beside}) == expected
+    own = {"intrinsic": {**OPEN3D, "dist": LENS}, "D": [0.5] * 5, "model": "Azure Kinect"}
+    assert Intrinsics.of(own) == expected
+    assert_refused("model Azure Kinect", Intrinsics.of, {**own, "intrinsic": OPEN3D})
 
 
 def test_coefficients_one_by_one() -> None:
@@ -155,6 +164,7 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "width": 0}', "intrinsics.width is 0"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "height": "480"}', "intrinsics.height is '480'"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2]}', "has 2 coefficients"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [[1], [1, 2]]}', "has the coefficient"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2, 3, NaN]}', "coefficient nan"),
         (json.dumps(PINHOLE | {"distortion": [1] * 15}), "has 15 coefficients"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": "none"}', "distortion is 'none'"),

@@ -11,6 +11,7 @@ from small_clouds import random_clouds
 from thor2_jax.surfaces.evidence import (
     REACH,
     SAMPLED,
+    Sample,
     _fit_rows,
     compared,
     evidence,
@@ -192,23 +193,49 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
     before = rng.dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
     after = np.asarray(with_evidence(jnp.asarray(before), surfaces, sample_points(clouds)), np.float64)
     values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
-    n_compared = 0
     for row, probabilities in enumerate(before.astype(np.float64)):
         best, largest = list[int](), 0.0
         for k in np.argsort(-probabilities)[:5]:
             if probabilities[k] ** 0.5 * np.exp(1.5) >= largest:
                 best.append(k)
                 largest = max(largest, probabilities[k] ** 0.5 * np.exp(values[k][row] @ [-7, 2.7, 1.5, 0]))
-        n_compared += len(best)
         odds = probabilities[best] ** 0.5 * np.exp([values[k][row] @ [-7, 2.7, 1.5, 0] for k in best])
         probabilities[best] = probabilities[best].sum() * odds / odds.sum()
         known = probabilities.sum()
         fits = values[probabilities.argmax()][row] @ [-2.8, 1.5, 1.8, -15]
         odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
-    assert n_compared == 9 if n_classes == 1 else 18 < n_compared < 40, n_compared
     nothing = np.zeros((9, n_classes), np.float32)
     assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
+
+
+@pytest.mark.parametrize(
+    ("logits", "fits", "first"),
+    [
+        *(((0, -1.4), (0, 5), 1), ((0, -1.6), (0, 5), 0)),
+        *(((0, -0.1, -1), (0, 1, 5), 1), ((0, -0.1, -1), (1, 0, 5), 0)),
+        *(((0, 0, 0, 0, -0.1), (0, 0, 0, 0, 5), 4), ((0, 0, 0, 0, 0, -0.1), (0, 0, 0, 0, 0, 5), 0)),
+        ((-1, -np.inf), (-40, 5), 0),
+    ],
+)
+def test_names_are_compared_while_they_may_come_first(
+    logits: tuple[float, ...], fits: tuple[float, ...], first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last name fits best, but comes first only if it is compared."""
+
+    def fit_rows(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
+        return jnp.where(samples.is_empty[:, None], 0, values[index]), None
+
+    monkeypatch.setattr("thor2_jax.surfaces.evidence._fit_rows", fit_rows)
+    probabilities = np.exp(2 * np.array([logits], np.float32))
+    probabilities /= 2 * probabilities.sum()
+    values = np.zeros((len(fits), 4), np.float32)
+    values[:, 2] = np.array(fits) / 1.5  # the weight of the lightness
+    samples = Sample(*[jnp.zeros(1)] * 5, is_empty=jnp.zeros(1, bool))
+    on_device = with_evidence(jnp.asarray(probabilities), jnp.asarray(values), samples)
+    on_host = compared(probabilities, list(jnp.asarray(values)[:, None]), samples)
+    assert on_device.argmax() == on_host.argmax() == first
+    np.testing.assert_allclose(on_host, on_device, atol=1e-6)
 
 
 def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
