@@ -145,7 +145,7 @@ class Intrinsics:
         matrix, scale = _parts(camera)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
         width, height = _entry(camera, "width", "image_width"), _entry(camera, "height", "image_height")
-        distortion = next(filter(_is_filled, map(_distortion, (camera, values))), ())
+        distortion = next(filter(_is_given, map(_distortion, (camera, values))), ())
         return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
 
     @classmethod
@@ -246,8 +246,9 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
         )
 
 
-def _is_filled(coefficients: Any) -> bool:
-    return coefficients is not None and np.asarray(coefficients, dtype=object).size > 0
+def _is_given(coefficients: Any) -> bool:
+    """Return whether there are coefficients of which one is not 0."""
+    return bool(np.any(np.asarray(coefficients, dtype=object)))
 
 
 def _distortion(values: Mapping[Any, Any]) -> Any:
@@ -258,11 +259,11 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     """
     one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     entries = (_entry(values, name) for name in _COEFFICIENTS)
-    distortion = next(filter(_is_filled, entries), one_by_one if any(one_by_one) else ())
+    distortion = next(filter(_is_given, entries), one_by_one)
     is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
     model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
-    if name not in _PINHOLE_MODELS and np.any(np.asarray(distortion, dtype=object)):
+    if name not in _PINHOLE_MODELS and _is_given(distortion):
         raise InputError(
             f"intrinsics has the distortion model {model}; expected plumb_bob or rational_polynomial; rectify the "
             "images and give the intrinsics of the rectified images"
