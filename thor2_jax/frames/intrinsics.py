@@ -62,6 +62,7 @@ _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrad
 """Distortion models with OpenCV's coefficients; other models are refused unless all coefficients are 0."""
 
 _COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs", "dist_coeff", "dist")
+_MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
 
 Array = NDArray[np.floating[Any]]
 
@@ -258,10 +259,8 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
         InputError: the distortion model is not supported and a coefficient is not 0.
     """
     one_by_one = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-    entries = (_entry(values, name) for name in _COEFFICIENTS)
-    distortion = next(filter(_is_given, entries), one_by_one)
-    is_fisheye = values.get("fisheye_model")  # in calibrations of OpenCV
-    model = "fisheye" if is_fisheye else _entry(values, "distortion_model", "model")
+    distortion = next(filter(_is_given, (_entry(values, name) for name in _COEFFICIENTS)), one_by_one)
+    model = "fisheye" if values.get("fisheye_model") else _entry(values, "distortion_model", "model")  # of OpenCV
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
     if name not in _PINHOLE_MODELS and _is_given(distortion):
         raise InputError(
@@ -324,9 +323,6 @@ def _entry(values: Mapping[Any, Any], *names: str) -> Any:
     """Return the first entry of these names that is not None; for a matrix in OpenCV's YAML, return its data."""
     value = next((values[name] for name in names if values.get(name) is not None), None)
     return value.get("data", value) if isinstance(value, Mapping) else value
-
-
-_MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
 
 
 def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:

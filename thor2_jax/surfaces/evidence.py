@@ -162,15 +162,13 @@ def compared(
     largest = np.take_along_axis(probabilities, index, axis=1)
     logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
     is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
+    alone = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in range(len(index))]
     best = np.full(len(index), -np.inf)
     for k in range(index.shape[1]):
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
-        of_row = (jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in rows)
-        fits = [  # all are dispatched before the first result is awaited
-            _fit_rows(surfaces[number], sample, np.zeros(1, int))[0]
-            for number, sample in zip(index[rows, k], of_row, strict=True)
-        ]
+        # All are dispatched before the first result is awaited.
+        fits = [_fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
         values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
