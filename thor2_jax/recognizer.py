@@ -43,7 +43,6 @@ from thor2_jax.networks.embedding import Embedding
 from thor2_jax.networks.networks import THOR2
 from thor2_jax.segmentation.segmenters import segment
 from thor2_jax.surfaces.evidence import compile_comparison, fit_poses
-from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import Descriptors, PointClouds, is_positive_integer
 
@@ -345,18 +344,14 @@ class Recognizer:
 
     def _locate(self, frame: RGBDFrame) -> dict[int, "Distances"]:
         """Return label -> distances from the surface of the object, for recognized instances whose surface is known."""
-        gallery, trained = self.gallery, self.run.surfaces
-        known: dict[str, tuple[Surfaces, int]] = {}
-        if trained is not None:
-            known = {name: (trained, k) for k, name in enumerate(self.run.classes) if name not in gallery.hidden}
-        known |= {gallery.names[number]: (surface, 0) for number, surface in gallery.surfaces.items()}
+        model = self.model
         located: dict[int, Distances] = {}
-        if not known:
+        if not any(map(model.surface_of, model.names)):
             return located
         instances, inference = self.infer(self.prepare(frame))
-        for instance, answer in zip(instances, answers(self.model, instances, inference), strict=True):
-            if answer.name in known:
-                surfaces, index = known[answer.name]
+        for instance, answer in zip(instances, answers(model, instances, inference), strict=True):
+            if answer.name is not None and (known := model.surface_of(answer.name)) is not None:
+                surfaces, index = known
                 pose = np.asarray(fit_poses(surfaces, pack_instances([instance], 1), [index]))[0]
                 located[instance.label] = functools.partial(surfaces.distances, index, pose)
         return located

@@ -9,10 +9,13 @@ those of the first look, which is the paper's.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -31,6 +34,7 @@ from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.surfaces.evidence import evidence, fit_poses
 from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
@@ -38,12 +42,14 @@ __all__ = [
     "compile_explanations",
     "explain",
     "explain_instance",
+    "SurfaceFit",
     "explained_by_classifiers",
     "pixel_attributions",
+    "surface_fits",
 ]
 
 OBJECTS = 3
-"""Number of objects whose nearest view is shown."""
+"""Number of objects whose nearest view, and of objects whose surface, is shown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,6 +87,27 @@ class NearestView:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class SurfaceFit:
+    """How well an instance of n points fits the surface of an object, see `surfaces.evidence`.
+
+    Attributes:
+        name: name of the object.
+        distance: mean point-to-plane distance, divided by the roughness of the instance (both plus 0.3 mm).
+        chroma: correlation of chroma, from -1 to 1.
+        lightness: correlation of lightness, from -1 to 1.
+        free_space: fraction of the surface in free space.
+        of_points: [n] distances of the points from the surface, metres; inf far from it.
+    """
+
+    name: str
+    distance: float
+    chroma: float
+    lightness: float
+    free_space: float
+    of_points: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
     """Explanation of the answer for an instance.
 
@@ -94,6 +121,7 @@ class Explanation:
         attributions: contributions of the points to the answer.
         left_out: contributions of slices and strips, as the exact check of the attributions.
         changes: the smallest changes that lead to another answer, one for each kind with a result.
+        surfaces: comparison with the surfaces of the most probable objects, of those that have one.
         nearest: nearest enrolled views; empty without a gallery.
     """
 
@@ -106,6 +134,7 @@ class Explanation:
     attributions: Attributions
     left_out: LeftOut
     changes: tuple[Change, ...]
+    surfaces: tuple[SurfaceFit, ...]
     nearest: tuple[NearestView, ...]
 
     @property
@@ -141,6 +170,9 @@ class Explanation:
             "strips": [{"slice": int(i), "strip": int(j), "loss": float(left.strips[i, j])} for i, j in cells],
             "agreement": left.agreement,
             "changes": [dataclasses.asdict(change) for change in self.changes],
+            "surfaces": [
+                {key: value for key, value in vars(fit).items() if key != "of_points"} for fit in self.surfaces
+            ],
             "nearest": [{"name": v.name, "view": v.number, "similarity": v.similarity} for v in self.nearest],
             "points": self.instance.points.astype(float).round(5).tolist(),
             "colors": self.instance.colors.tolist(),
@@ -168,16 +200,25 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
 
 def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
     """Explain the answer for a usable instance; see `explain`."""
-    recognition, number = _answer(model, instance)
-    name = model.names[number]
-    scores = _scores(model, explained_by_classifiers(model)[number])
-    parts = dict(_parts(model, scores, instance, scores.names.index(name)))
-    return Explanation(recognition=recognition, name=name, scores=scores, instance=instance, **parts)
+    recognition, probabilities = _answer(model, instance)
+    ranked = np.argsort(-probabilities, kind="stable")
+    scores, names = _scores(model, explained_by_classifiers(model)[ranked[0]]), [model.names[k] for k in ranked]
+    parts = dict(_parts(model, scores, instance, names))
+    return Explanation(recognition=recognition, name=names[0], scores=scores, instance=instance, **parts)
 
 
-def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index: int) -> Iterator[tuple[str, Any]]:
-    """Yield the further fields of an explanation with their values; most of them compile for seconds."""
-    scored = scores.of_instances([instance])[0]
+def _parts(
+    model: Model, scores: ClassScores, instance: PreparedInstance, names: Sequence[str]
+) -> Iterator[tuple[str, Any]]:
+    """Yield the further fields of an explanation with their values; most of them compile for seconds.
+
+    Args:
+        model: the model.
+        scores: class scores.
+        instance: the instance.
+        names: names in the order of their probability; the first one is explained.
+    """
+    scored, index = scores.of_instances([instance])[0], scores.names.index(names[0])
     others = [k for k in np.argsort(-scored, kind="stable") if k != index]
     yield "runner_up", scores.names[others[0]] if others else None
     looks = scores.orient(instance)
@@ -189,6 +230,7 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)
     yield "described", _described(scores, looks, len(instance.points))
+    yield "surfaces", tuple(surface_fits(model, instance, names))
     yield "nearest", tuple(_nearest_views(model, instance))
 
 
@@ -208,7 +250,8 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
     _answer(model, instance)
     scores = _scores(model, by_classifiers)
-    parts = _parts(model, scores, instance, int(scores.of_instances([instance])[0].argmax()))
+    best_first = np.argsort(-scores.of_instances([instance])[0], kind="stable")
+    parts = _parts(model, scores, instance, [scores.names[k] for k in best_first])
     while not is_stopped() and next(parts, None) is not None:
         pass
 
@@ -222,14 +265,13 @@ def _scores(model: Model, by_classifiers: bool) -> ClassScores:
     return classifier_scores(model) if by_classifiers else gallery_scores(model)
 
 
-def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, int]:
-    """Return the answer of the model and the number of the most probable name."""
+def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, NDArray[np.floating[Any]]]:
+    """Return the answer of the model and the probabilities of all names."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
     inference = jax.tree.map(np.asarray, infer_clouds(model, packed(instance)))
     (recognition,) = answers(model, [instance], inference)
-    values = model.combined(inference.probabilities, object_scores(model, inference))
-    return recognition, int(values[0].argmax())
+    return recognition, model.combined(inference.probabilities, object_scores(model, inference))[0]
 
 
 def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlices:
@@ -238,6 +280,17 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
     images = describe_strips(cut, scores.network, scores.config).images
     first = jax.tree.map(lambda a: np.asarray(a[0]), (diagrams, images, cut.color))
     return DescribedSlices(np.asarray(looks.points[0, :n]), *first)
+
+
+def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
+    """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
+    clouds = packed(instance)
+    known = ((name, surface) for name in names if (surface := model.surface_of(name)) is not None)
+    for name, (surfaces, index) in itertools.islice(known, OBJECTS):
+        fit, chroma, lightness, free = map(float, evidence(surfaces, clouds, jnp.array([index]))[0])
+        pose = np.asarray(fit_poses(surfaces, clouds, [index]))[0]
+        of_points = surfaces.distances(index, pose, instance.points)
+        yield SurfaceFit(name, math.exp(fit), chroma, lightness, free, of_points)
 
 
 def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -16,6 +18,7 @@ from thor2_jax.explanation.explain import Explanation, pixel_attributions
 from thor2_jax.figures import name_style, plain_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.surfaces.surfaces import FAR
 
 __all__ = ["ExplanationPicture", "change_text", "loss_text", "main_pictures", "pictures"]
 
@@ -26,7 +29,7 @@ class ExplanationPicture:
 
     Attributes:
         name: name of the picture's file, without ending.
-        section: "decided", "changes", "nearest", "shape", "slices" or "network".
+        section: "decided", "surfaces", "changes", "nearest", "shape", "slices" or "network".
         title: short title.
         caption: description in full sentences.
         figure: the picture.
@@ -49,9 +52,11 @@ def _figure(width: float = 5.2, height: float = 4.4, rows: int = 1, columns: int
 
 
 def main_pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[ExplanationPicture]:
-    """Yield the most important pictures: the attributions of points, the smallest changes and the nearest views."""
+    """Yield the most important pictures: attributions of points, surfaces, smallest changes and nearest views."""
     yield _photo(explanation, frame)
     yield _decided_cloud(explanation)
+    if explanation.surfaces:
+        yield _surfaces(explanation)
     if explanation.changes:
         yield _changes(explanation)
     if explanation.nearest:
@@ -185,6 +190,21 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
         "Each was confirmed by recognizing the changed cloud."
     )
     return ExplanationPicture("changes", "changes", "Smallest changes that change the answer", caption, figure)
+
+
+def _surfaces(explanation: Explanation) -> ExplanationPicture:
+    instance, scale = explanation.instance, ScalarMappable(Normalize(0, 1000 * FAR), "viridis_r")
+    shown = []
+    for fit in explanation.surfaces:
+        colors = scale.to_rgba(1000 * fit.of_points.clip(max=FAR), bytes=True)[:, :3]
+        shown.append((fit.name, dataclasses.replace(instance, colors=colors)))
+    figure = _clouds(shown, len(shown), 2.6)
+    figure.colorbar(scale, ax=figure.axes, location="bottom", shrink=0.6, label="distance from the surface (mm)")
+    caption = (
+        "The distance of each point from the surfaces of the most probable objects, in the pose that fits best. Points "
+        "of another object lie off the surface, or have other colours there."
+    )
+    return ExplanationPicture("surfaces", "surfaces", "Fit to the surfaces of objects", caption, figure)
 
 
 def _nearest(explanation: Explanation) -> ExplanationPicture:

@@ -27,6 +27,7 @@ from thor2_jax.model.recognition import AnswerBy
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.embedding import Embedding, load_default
 from thor2_jax.networks.networks import EMBEDDING, MLP, THOR2, Classifier, Compiled, Feature, feature_of
+from thor2_jax.surfaces.surfaces import Surfaces
 
 __all__ = ["ColorTransform", "Model"]
 
@@ -208,6 +209,15 @@ class Model:
         if not self.gallery.objects:
             return "classifiers"
         return wanted or "both"
+
+    def surface_of(self, name: str) -> tuple[Surfaces, int] | None:
+        """Return surfaces, and which of them is that of the object with this name; None if it has none."""
+        gallery, trained = self.gallery, self.run.surfaces
+        if name in gallery.objects and (enrolled := gallery.surfaces.get(gallery.names.index(name))) is not None:
+            return enrolled, 0
+        if trained is None or name not in self.run.classes or name in gallery.hidden:
+            return None
+        return trained, self.run.classes.index(name)
 
     def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
         """Return the lowest confidence [n] of an answer with each of the `names`: `unknown_below`, if it is set.

@@ -17,7 +17,7 @@ __all__ = ["PAGE", "check_no_foreign_files", "write_explanation"]
 PAGE = "explanation.html"
 VALUES = "explanation.json"
 
-_PICTURES = "photo|cloud|slices-attributions|check|changes|nearest|slices|diagrams|slice-[0-9]+|network"
+_PICTURES = "photo|cloud|slices-attributions|check|surfaces|changes|nearest|slices|diagrams|slice-[0-9]+|network"
 _WRITTEN = rf"{re.escape(PAGE)}|{re.escape(VALUES)}|({_PICTURES})\.png"
 
 _SOURCES = {
@@ -32,6 +32,14 @@ _DECIDED = (
     "The attribution of a point is approximately how much the answer would lose without it. {check} Points that are "
     "left out together can matter more, or less, than the sum of their attributions; the exact check shows how large "
     "this difference is for the strips of this object."
+)
+
+_SURFACES = (
+    "Recognition also compares the points with the surfaces of the most probable objects, in the pose that fits best. "
+    "This changes their probabilities, and decides whether the object is known. The distance is that of the points "
+    "from the surface, on average, divided by the roughness of the points: about 1 is a perfect fit. Chroma and "
+    "lightness are correlations between the colours of the points and those of the surface: 1 is a perfect fit. The "
+    "part of the surface in free space would lie in front of what the camera sees: 0 % is a perfect fit."
 )
 
 _SHAPE = (
@@ -109,10 +117,14 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         f"{loss_text(explanation, check.most_attributed)}; without a random tenth, it "
         f"{loss_text(explanation, check.random)} on average."
     )
+    surfaces = [
+        Section("Does it fit the surfaces?", _SURFACES, _surfaces_table(explanation), pictures.get("surfaces", ()))
+    ]
     resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
     return [
         Section("The answer", answer, _answer_table(explanation.recognition)),
         Section("What decided", _DECIDED.format(check=comparison), pictures=pictures["decided"]),
+        *(surfaces if explanation.surfaces else []),
         Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
         *resembling,
         Section("If the name is wrong", _advice(explanation)),
@@ -173,6 +185,14 @@ def _answer_table(answer: Recognition) -> Table:
     columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source]] for source in sources]
     ranked = enumerate(itertools.zip_longest(*columns, fillvalue=""), 1)
     return ["", *(_SOURCES[source] for source in sources)], [[str(rank), *cells] for rank, cells in ranked]
+
+
+def _surfaces_table(explanation: Explanation) -> Table:
+    rows = [
+        [fit.name, f"{fit.distance:.1f}", f"{fit.chroma:z.2f}", f"{fit.lightness:z.2f}", _percent(fit.free_space)]
+        for fit in explanation.surfaces
+    ]
+    return ["", "distance / roughness", "chroma", "lightness", "in free space"], rows
 
 
 def _percent(value: float) -> str:

@@ -20,16 +20,21 @@ import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
-from thor2_jax.explanation import attributions
+from thor2_jax.explanation import attributions, pictures
 from thor2_jax.explanation.changes import Change, apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
-from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
+from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions, surface_fits
 from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.figures import png_bytes
-from thor2_jax.frames.prepared_instance import pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.surfaces.evidence import evidence
+from training.objects.builtin_objects import builtin_objects
+from training.objects.surfaces import surfaces_of
+from training.rendering.camera import camera_pose
+from training.views.mesh_views import view_cloud
 
 NETWORK = colornet.load_default()
 CLASSES = ("a", "b", "c")
@@ -296,6 +301,31 @@ def test_gallery_answers_are_explained() -> None:
     assert nearest.similarity == pytest.approx(1, abs=0.01) and nearest.number == 0
     np.testing.assert_allclose(nearest.view.points, explanation.instance.points, atol=1e-4)
     assert explanation.attributions.margin > 0
+
+
+def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Explanation) -> None:
+    meshes = [builtin_objects()[name] for name in ("soup_can_red", "yellow_box", "banana")]
+    surfaces = surfaces_of(meshes)
+    recognizer = Recognizer(dataclasses.replace(untrained_embedding_run(CLASSES), surfaces=surfaces))
+    recognizer.enroll("without a surface", [(FRAME, 7)])
+    for own, mesh in zip(CLASSES, meshes, strict=True):
+        points, colors = view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre))
+        instance = PreparedInstance(1, points, np.rint(255 * colors).astype(np.uint8), np.zeros(len(points), bool))
+        names = ["without a surface", own, *sorted({*CLASSES} - {own})]
+        first, *others = fits = list(surface_fits(recognizer.model, instance, names))
+        assert [fit.name for fit in fits] == names[1:]
+        assert np.quantile(first.of_points, 0.95) < 0.004 and first.distance < min(fit.distance for fit in others)
+        of_own = evidence(surfaces, pack_instances([instance], 1), jnp.array([CLASSES.index(own)]))[0]
+        values = np.log(first.distance), first.chroma, first.lightness, first.free_space
+        np.testing.assert_allclose(values, of_own, atol=1e-5)
+    compared = dataclasses.replace(explanation, instance=instance, surfaces=tuple(fits))
+    assert compared.as_json()["surfaces"][0] == {
+        "name": own, "distance": first.distance, "chroma": first.chroma, "lightness": first.lightness, "free_space": 0.0
+    }  # fmt: skip
+    figure = pictures._surfaces(compared).figure
+    shown = [axes.collections[0].get_facecolor()[:, :3] for axes in figure.axes[:3]]
+    yellow = [(colors[:, 0] > 0.7).mean() for colors in shown]
+    assert yellow[0] > 0.9 > max(yellow[1:])
 
 
 def test_errors_name_the_argument(recognizer: Recognizer) -> None:

@@ -10,10 +10,12 @@ import pytest
 from commands import Command, Texts, run_thor2
 from failures import full_disk
 from image_files import write_frame
+from small_runs import with_surfaces
 from written_files import ParsedPage
 
 from thor2_jax import capacity
 from thor2_jax.errors import InputError
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.cli.app import option_arguments
 from training.frame_recognition import RecognizerArguments
@@ -36,8 +38,9 @@ def test_a_page_for_every_instance(
     model: Path, frame: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is left after an error."""
-    out = tmp_path / "out"
-    *pages, last = printed("explain", "--model", model, frame, "--out", out).splitlines()
+    out, compared = tmp_path / "out", tmp_path / "compared"
+    save_run(with_surfaces(load_run(model)), compared)
+    *pages, last = printed("explain", "--model", compared, frame, "--out", out).splitlines()
     assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(pages) == 2
     assert "thor2 enroll" in last
     for label in (1, 4):
@@ -49,7 +52,8 @@ def test_a_page_for_every_instance(
         record = json.loads((directory / "explanation.json").read_text())
         assert record["label"] == label and record["explained_name"] in ("bowl", "mug", "plate")
         pictures = sorted(path.stem for path in directory.glob("*.png"))
-        assert len(pictures) == len(page.pictures) and {"photo", "cloud", "check", "network"} <= set(pictures)
+        assert len(pictures) == len(page.pictures) and {"photo", "cloud", "check", "surfaces", "network"} <= {*pictures}
+        assert "Does it fit the surfaces?" in page.text and len(record["surfaces"]) == 3
         assert not list(directory.glob(".*"))
     monkeypatch.setattr(explanation_page, "write_page", full_disk)
     error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
