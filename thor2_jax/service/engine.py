@@ -123,7 +123,7 @@ class InferenceEngine:
 
         Raises:
             InputError: the given gallery does not exist and `teach` is not set, or the gallery cannot be written and
-                `teach` is set; also as `Recognizer.load`.
+                `teach` is set; also as `Recognizer.load` and, with `adapt`, as `adaptation_criterion`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
@@ -150,11 +150,7 @@ class InferenceEngine:
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
         self.max_batch = settings.max_batch
-        self._online: OnlineAdaptation | None = None
-        if settings.adapt:
-            if not self.model.classifiers:
-                raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(adaptation_criterion(self.model))
+        self._online = OnlineAdaptation(adaptation_criterion(self.model)) if settings.adapt else None
 
     @property
     def model(self) -> Model:
