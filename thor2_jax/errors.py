@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["InputError", "as_array", "decoding", "needs_extra", "reason_of", "with_context"]
+__all__ = ["InputError", "as_array", "decoding", "needs_extra", "reason_of", "refusing_os_errors", "with_context"]
 
 MAX_MESSAGE = 1000
 """Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
@@ -64,6 +64,15 @@ def decoding(message: str, expected: str = "", *, advice: str = "") -> Iterator[
         yield
     except Exception as error:
         raise InputError(f"{message} ({reason_of(error)}); {advice or f'expected {expected}'}") from None
+
+
+@contextlib.contextmanager
+def refusing_os_errors(message: str, advice: str) -> Iterator[None]:
+    """Turn an OSError into an InputError with the reason of the system between the message and the advice."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{message} ({error.strerror}); {advice}") from None
 
 
 @contextlib.contextmanager

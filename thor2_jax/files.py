@@ -25,7 +25,7 @@ from colornet.files import (
     remove_leftovers,
     temporary_directory,
 )
-from thor2_jax.errors import InputError, reason_of
+from thor2_jax.errors import InputError, reason_of, refusing_os_errors
 
 __all__ = [
     "as_path",
@@ -64,14 +64,6 @@ def as_path(path: object, name: str) -> Path:
     return Path(path)
 
 
-@contextlib.contextmanager
-def _refusal_named(message: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{message} that can be written ({error.strerror}); choose another one") from None
-
-
 def check_output_directory(directory: str | Path, marker: str | None = None, resumable: Collection[str] = ()) -> None:
     """Raise unless a command may write to a directory, so that no other files are overwritten and no work is lost.
 
@@ -88,7 +80,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         InputError: the directory contains anything else, or cannot be written.
     """
     directory = Path(directory)
-    with _refusal_named(f"out: {directory} is not a directory"):
+    with refusing_os_errors(f"out: {directory} is not a directory that can be written", "choose another one"):
         names = sorted(path.name for path in directory.iterdir()) if os.path.lexists(directory) else []
         if marker or resumable:
             names = [name for name in names if name not in resumable and not name.startswith(".")]
@@ -115,7 +107,7 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
     """
     if path is None:
         return
-    with _refusal_named(f"{name}: {path} is not a file"):
+    with refusing_os_errors(f"{name}: {path} is not a file that can be written", "choose another one"):
         check_replaceable(path)
         check_writable(path.absolute().parent)
     if path.exists() and not is_own(path):

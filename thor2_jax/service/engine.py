@@ -18,7 +18,7 @@ from thor2_jax.adaptation.estimate import Adaptation, OnlineAdaptation, adaptati
 from thor2_jax.capacity import BATCH_BUCKETS, MIN_BATCH_POINTS, POINT_BUCKETS, batch_bucket, batch_points
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, refusing_os_errors
 from thor2_jax.explanation.explain import explained_by_classifiers
 from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
@@ -123,7 +123,7 @@ class InferenceEngine:
 
         Raises:
             InputError: the given gallery does not exist and `teach` is not set, or the gallery cannot be written and
-                `teach` is set; also as `Recognizer.load`.
+                `teach` is set; also as `Recognizer.load` and, with `adapt`, as `adaptation_criterion`.
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
@@ -136,12 +136,8 @@ class InferenceEngine:
         self._recognizer = recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
         self.objects = recognizer.objects
         if settings.teach:
-            try:
+            with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
                 check_writable(directory)
-            except OSError as error:
-                raise InputError(
-                    f"gallery: {directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
-                ) from None
         model = dataclasses.replace(recognizer.model, run=recognizer.run.without_callback())
         if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")
@@ -150,11 +146,7 @@ class InferenceEngine:
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
         self.max_batch = settings.max_batch
-        self._online: OnlineAdaptation | None = None
-        if settings.adapt:
-            if not self.model.classifiers:
-                raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(adaptation_criterion(self.model))
+        self._online = OnlineAdaptation(adaptation_criterion(self.model)) if settings.adapt else None
 
     @property
     def model(self) -> Model:

@@ -10,7 +10,7 @@ import re
 import socket
 from collections.abc import Iterable, Iterator
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, refusing_os_errors
 
 __all__ = ["check_host_names", "check_token", "is_allowed_host", "listening", "page_headers"]
 
@@ -35,11 +35,8 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
     both = host == "::" and socket.has_dualstack_ipv6()
     if not 0 <= port <= 65_535:
         raise InputError(f"port is {port}; expected 0 to 65535, where 0 chooses a free one")
-    try:
+    with refusing_os_errors(f"port is {port} and host {host}, which cannot be used", "choose others"):
         listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=both)
-    except OSError as error:
-        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
-        raise InputError(message) from None
     with listener:
         url_host = f"[{host}]" if ":" in host else host
         yield listener, f"http://{url_host}:{listener.getsockname()[1]}"

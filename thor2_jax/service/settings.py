@@ -5,7 +5,7 @@ import importlib.util
 from pathlib import Path
 
 from thor2_jax.capacity import BATCH_BUCKETS
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, refusing_os_errors
 from thor2_jax.files import check_writable
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 from thor2_jax.service.hosts import check_host_names, check_token
@@ -66,11 +66,9 @@ class Settings:
             raise InputError(f"deadline is {self.deadline}; expected a positive number, at most {MAX_DEADLINE} seconds")
         check_host_names(self.allow_host)
         if self.cache is not None and not self.cache.is_dir():  # one that exists can be read
-            try:
+            problem = f"cache is {self.cache}, which cannot be created"
+            with refusing_os_errors(problem, "expected a directory, which may be new"):
                 check_writable(self.cache)
-            except OSError as error:
-                problem = f"which cannot be created ({error.strerror})"
-                raise InputError(f"cache is {self.cache}, {problem}; expected a directory, which may be new") from None
         if self.segmenter is not None:
             load_segmenter(self.segmenter)  # Its errors are reported here once, not by every process.
         if self.max_batch not in BATCH_BUCKETS:

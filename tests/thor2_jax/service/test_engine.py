@@ -104,14 +104,23 @@ def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -
     return Adaptation(ColorTransform(0.1, -0.1, 0.2, 0.05), len(instances), 1.0, 0.5)
 
 
+@pytest.mark.parametrize("trained", [("a", "b"), ()])
 @pytest.mark.parametrize("is_estimated", [False, *slow(True)])
 def test_the_service_adapts_after_enough_instances_if_told(
-    teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    trained: tuple[str, ...],
+    is_estimated: bool,
+    frame: thor2.RGBDFrame,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    run = write_run(tmp_path / "run", trained)
+    if not trained:  # the gallery answers
+        assert_refused("neither classes nor enrolled objects", InferenceEngine, Settings(run, adapt=True))
+        thor2.Recognizer.load(run).enroll("tall", [(frame, 200)])
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
         monkeypatch.setattr(estimate, "objective", create_autospec(estimate.objective))
         monkeypatch.setattr(estimate, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
-    engine = InferenceEngine(Settings(teaching_run, adapt=True))
+    engine = InferenceEngine(Settings(run, adapt=True))
     engine.compile_adaptation()
     first, second = views(EVERY - 1), views(3)
     unusable = dataclasses.replace(first[0], reason="too few points")
@@ -127,9 +136,7 @@ def test_the_service_adapts_after_enough_instances_if_told(
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()
     assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
-    without_classifiers = Settings(write_run(tmp_path / "run", ()), adapt=True)
-    assert_refused("adapt: .*run has no classifiers", InferenceEngine, without_classifiers)
-    by_default = InferenceEngine(Settings(teaching_run))
+    by_default = InferenceEngine(Settings(run))
     by_default.compile_adaptation()
     by_default.correct(views(2 * EVERY), observe=True)
     assert by_default.adaptation is None
