@@ -236,6 +236,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--frames", frames), "'new'"),
         (("new", *frame_options(frames / "000")), "--instance"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
+        (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),
     ):
         for run in (model, tmp_path / "other"):
             assert words in refused("enroll", *given, "--model", run)
