@@ -60,8 +60,7 @@ def enroll(
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
     if name is None and (target.label_name is not None or target.instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
-    if target.extend and target.replace:
-        raise InputError("extend and replace are both given; choose one")
+    options.check_alone("replace", target.replace, extend=target.extend)
     options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
     scale = options.given_scale(target.mesh_scale)
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
