@@ -92,11 +92,6 @@ def given_values(record: Any) -> dict[str, Any]:
     return {field.name: value for field, value in values if value != field.default}
 
 
-def given_scale(mesh_scale: float) -> str | None:
-    """Return the value of --mesh-scale for `check_belongs`; None if it is the default."""
-    return None if mesh_scale == 1 else f"{mesh_scale:g}"
-
-
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
     """Raise InputError if an option that needs `owner` is given without it; None means that it was not given."""
     for name, value in values.items():

@@ -169,7 +169,7 @@ def train(
     options.check_alone("quick", quick, paper=paper)
     if (given.meshes is None) == (given.dataset is None) and (given.meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    scale = options.given_scale(given.mesh_scale)
+    scale = options.given_values(given).get("mesh_scale")
     steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
     options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)
     options.check_belongs("--dataset", given.dataset, sequences=given.sequences)

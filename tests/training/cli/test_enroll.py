@@ -166,6 +166,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
+        (("mug", "--every", 2, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("--mesh", tmp_path / "one.ply"), "one.ply is one file, which needs a NAME"),
         (("--mesh", tmp_path / "absent"), "absent does not exist"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
