@@ -170,6 +170,17 @@ def read_mesh(path: Path) -> TexturedMesh:
         raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
+    try:
+        return _read(path)
+    except InputError as error:
+        raise InputError(f"mesh {path}: {error}") from error
+    # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
+    except Exception as error:
+        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)}); export or copy it again") from error
+
+
+def _read(path: Path) -> TexturedMesh:
+    """Return the mesh of a file; raise any exception for a damaged one."""
     import trimesh
 
     missing: list[str] = []
@@ -184,34 +195,28 @@ def read_mesh(path: Path) -> TexturedMesh:
                 missing.append(name)
                 raise
 
-    try:
-        if path.suffix.lower() == ".glb":
-            _check_glb(path)  # before trimesh fails with another message
-        # Processing would silently drop vertices that are not finite.
-        scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
-        if missing:
-            raise InputError(f"its file {missing[0]!r} is missing or unreadable")
-        parts = []
-        for node in scene.graph.nodes_geometry:
-            transform, name = scene.graph[node]
-            geometry = scene.geometry[name]
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-                parts.append(_part(geometry, transform))
-        if not parts:
-            raise InputError("no faces; expected triangles, not points alone")
-        mesh = merge_meshes(parts)
-        # The bounds of an object are those of its faces.
-        used, faces = np.unique(mesh.faces, return_inverse=True)
-        mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
-        if not np.isfinite(mesh.vertices).all():
-            raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
-        if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
-            raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
-    except InputError as error:
-        raise InputError(f"mesh {path}: {error}") from error
-    # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
-    except Exception as error:
-        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)}); export or copy it again") from error
+    if path.suffix.lower() == ".glb":
+        _check_glb(path)  # before trimesh fails with another message
+    # Processing would silently drop vertices that are not finite.
+    scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
+    if missing:
+        raise InputError(f"its file {missing[0]!r} is missing or unreadable")
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            parts.append(_part(geometry, transform))
+    if not parts:
+        raise InputError("no faces; expected triangles, not points alone")
+    mesh = merge_meshes(parts)
+    # The bounds of an object are those of its faces.
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
+    if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
+        raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
     return mesh
 
 
