@@ -104,7 +104,8 @@ def check_alone(option: str, given: object, **values: object) -> None:
     for name, value in values.items():
         value = ", ".join(map(str, value)) if isinstance(value, list) else value
         if value and given:
-            raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
+            pair = f"{name} and {option} are given" if given is True else f"{name} is {value} and {option} is {given}"
+            raise InputError(f"{pair}; give one of them")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -166,10 +166,10 @@ def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | 
 
 def read_mesh(path: Path) -> TexturedMesh:
     """Return the mesh in the unit of its file, of any size; raise InputError as `load_mesh`."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     try:
         return _read(path)
     except InputError as error:

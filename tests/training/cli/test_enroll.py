@@ -174,7 +174,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "empty"), "no .glb"),
         (("mug", "--mesh", tmp_path / "two"), "none of a, b is 'mug'"),
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "instance by --mesh-scale 1"),
-        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend is True and --replace is True"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
