@@ -122,16 +122,13 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
-    write_box(tmp_path / "box.ply", BOX)
-    assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
-    views = Recognizer.load(model).gallery.objects["box"]
-    assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
-    write_box(tmp_path / "large.ply", [1000 * side for side in BOX])
-    assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
-    for views in Recognizer.load(model).gallery.objects.values():
-        if views.source == "mesh":
-            assert views.surface is not None
-            np.testing.assert_allclose(np.ptp(views.surface["table"][0, :3], axis=1), BOX, rtol=0.05)
+    for name, scale in (("box", 1), ("large", 0.001)):
+        mesh = write_box(tmp_path / f"{name}.ply", [side / scale for side in BOX])
+        assert run_thor2("enroll", name, "--model", model, "--mesh", mesh, "--mesh-scale", scale) == 0
+        views = Recognizer.load(model).gallery.objects[name]
+        assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
+        assert views.surface is not None
+        np.testing.assert_allclose(np.ptp(views.surface["table"][0, :3], axis=1), BOX, rtol=0.05)
 
 
 def test_a_folder_of_meshes(tmp_path: Path) -> None:
