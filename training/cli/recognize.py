@@ -171,10 +171,11 @@ def recognize(
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
     the frames are a sequence of one camera, in the order of their names, and an object has one name in all frames.
     """
+    from thor2_jax.frames.frames import RecordedFrame
     from thor2_jax.segmentation.segmenters import TABLE
     from thor2_jax.tracking.viewpoints import read_poses
     from training.frame_recognition import RecognizerArguments, recognize_frames, track_frames
-    from training.readers.frames import segmented_source
+    from training.readers.frames import FrameSource, segmented_source
 
     given.check()
     frames, recording, table = given.frames, given.bag, {"coco": outputs.coco, "bop": outputs.bop}
@@ -202,21 +203,20 @@ def recognize(
     as_json = as_json or recording is not None
     frame_poses = None if poses is None else read_poses(poses, names)
     results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
+    segmented: Iterable[FrameSource | RecordedFrame] = sources
     with contextlib.ExitStack() as stack:
         if bag is not None:
             for note in stack.enter_context(bag).notes:
                 print_note(f"note: {note}")
-        recognizer = load()
-        if bag is not None:
             recorded = itertools.islice(bag.frames(), 0, None, given.every)
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
-            answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
-        elif track:
+        recognizer = load()
+        if track and bag is None:
             answers = track_frames(recognizer, sources, frame_poses)
         elif pool is not None:
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:
-            answers = recognize_frames(recognizer.recognize, sources)
+            answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
         results.write(answers, recognizer.classes)
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
