@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from PIL import Image
 
 from thor2_jax.capacity import BATCH_BUCKETS
@@ -68,13 +69,9 @@ class SetUp:
             Image.fromarray(self.depth).save(depth)
         Image.fromarray(self.labels).save(folder / "mask.png")
         (folder / "intrinsics.json").write_text(json.dumps(self.intrinsics))
-        side = self.mesh_side
-        (folder / "mesh.ply").write_text(
-            "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-            "property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 2\n"
-            "property list uchar int vertex_indices\nend_header\n"
-            f"0 0 0 9 9 9\n{side} 0 0 9 9 9\n0 {side / 2} 0 9 9 9\n0 0 {side / 2} 9 9 9\n3 0 1 2\n3 0 1 3\n"
-        )
+        mesh = trimesh.creation.box([self.mesh_side, self.mesh_side / 2, self.mesh_side / 2])
+        mesh.visual.vertex_colors = [9, 9, 9, 255]
+        mesh.export(folder / "mesh.ply")
         files = FrameFiles(folder / "color.png", depth, folder / "mask.png", folder / "intrinsics.json")
         return files, folder / "mesh.ply"
 

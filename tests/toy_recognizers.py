@@ -49,6 +49,18 @@ class NamesInOrder(UntaughtRecognizer):
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(usable))]).reshape(-1, 2)}
 
 
+def recognizer_that_prefers(
+    color: np.ndarray, classes: Sequence[str] = ("mug",), n: int | None = None, sharpness: float = 8.0
+) -> Any:
+    """Return a recognizer of n instances whose confidence falls with the distance of the colours."""
+
+    def recognize(frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
+        distance = np.abs(frame.color.astype(float) - color).mean() / 255
+        return [thor2.Recognition(label, "mug", float(np.exp(-sharpness * distance))) for label in frame.instances[:n]]
+
+    return SimpleNamespace(recognize=recognize, classes=classes)
+
+
 class ToyRun(NamedTuple):
     """The attributes of a run that results are computed from."""
 

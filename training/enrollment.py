@@ -87,11 +87,9 @@ def enroll_objects(
         surfaces: Iterator[Any] = itertools.repeat(None)
         if isinstance(source, FrameFolder):
             instances = read_instances(source, recognizer.run.config.sigma_s, label_name or name, instance)
-            labelled, skipped = instances.views, instances.skipped
-            if name is not None:
-                labelled = {name: [view for each in labelled.values() for view in each]}
-            views = ([recognizer.model.corrected(view) for view in each] for each in labelled.values())
-            names, kind = list(labelled), "frames"
+            skipped = instances.skipped
+            views = ([recognizer.model.corrected(view) for view in each] for each in instances.views.values())
+            names, kind = [name or each for each in instances.views], "frames"
         else:
             render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
             views = stack.enter_context(contextlib.closing(pool(render, source.values())))

@@ -2,11 +2,10 @@
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from toy_recognizers import recognizer_that_prefers
 
 import thor2_jax as thor2
 from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
@@ -102,15 +101,8 @@ SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
 
 @pytest.mark.slow
 def test_damaged_set_ups_are_diagnosed() -> None:
-    """A toy recognizer is the less sure the more the colours differ from those of the sample."""
-    color = frame_files(SAMPLES / "clutter").read().color.astype(float)
-
-    def recognize(frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
-        confidence = float(np.exp(-20 * np.abs(frame.color - color).mean() / 255))
-        return [thor2.Recognition(label, "known", confidence) for label in frame.instances]
-
     assert len(DAMAGES) == 20
-    recognizer: Any = SimpleNamespace(recognize=recognize, classes=("known",))
+    recognizer = recognizer_that_prefers(frame_files(SAMPLES / "clutter").read().color, sharpness=20.0)
     report = run(SAMPLES, recognizer, ["clutter"])
     wrong = {name: entry["found"] for name, entry in report["damaged"].items() if not entry["right"]}
     assert report["right_by_frame"]["clutter"] == 20 - len(wrong) and len(wrong) <= 2, wrong

@@ -39,7 +39,7 @@ def doctor(
     from training.frame_recognition import RecognizerArguments
     from training.objects.meshes import find_meshes
 
-    options.check_belongs("--meshes", meshes, mesh_scale=options.given_scale(mesh_scale))
+    options.check_belongs("--meshes", meshes, mesh_scale=None if mesh_scale == 1 else mesh_scale)
     sources = given.sources(masks=False)
     paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
     recognizer = None if model is None else RecognizerArguments(model).load()

@@ -55,15 +55,14 @@ def enroll(
     """
     name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
-    has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
+    has_frames = bool(given.arguments)
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
     if name is None and (target.label_name is not None or target.instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
-    if target.extend and target.replace:
-        raise InputError("extend and replace are both given; choose one")
+    options.check_alone("replace", target.replace, extend=target.extend)
     options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
-    scale = options.given_scale(target.mesh_scale)
+    scale = options.given_values(target).get("mesh_scale")
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes
 

@@ -92,11 +92,6 @@ def given_values(record: Any) -> dict[str, Any]:
     return {field.name: value for field, value in values if value != field.default}
 
 
-def given_scale(mesh_scale: float) -> str | None:
-    """Return the value of --mesh-scale for `check_belongs`; None if it is the default."""
-    return None if mesh_scale == 1 else f"{mesh_scale:g}"
-
-
 def check_belongs(owner: str, is_given: object, **values: object) -> None:
     """Raise InputError if an option that needs `owner` is given without it; None means that it was not given."""
     for name, value in values.items():
@@ -109,7 +104,8 @@ def check_alone(option: str, given: object, **values: object) -> None:
     for name, value in values.items():
         value = ", ".join(map(str, value)) if isinstance(value, list) else value
         if value and given:
-            raise InputError(f"{name} is {value} and {option} is {given}; give one of them")
+            pair = f"{name} and {option} are given" if given is True else f"{name} is {value} and {option} is {given}"
+            raise InputError(f"{pair}; give one of them")
 
 
 @dataclasses.dataclass(frozen=True)

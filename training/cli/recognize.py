@@ -49,10 +49,7 @@ class _Answers:
     """The answers as they are printed and written; unusable files are refused before any frame is recognized.
 
     Attributes:
-        tables: the COCO and BOP results, from `write` on.
-        failed: names of the frames that could not be recognized.
         failures: the `segmentation_failure` of each recognized frame.
-        has_unknown: whether an instance got no name.
     """
 
     def __init__(self, given: OutputOptions, frames: Sequence[str], *, several: bool, as_json: bool) -> None:
@@ -71,9 +68,9 @@ class _Answers:
         from training.readers.bop import read_object_names
 
         self._given, self._frames, self._several, self._as_json = given, frames, several, as_json
-        self.failed: list[str] = []
+        self._failed: list[str] = []
         self.failures: list[str] = []
-        self.has_unknown = False
+        self._has_unknown = False
         if given.out is not None:
             resumable = {name.split("/")[0] for name in frames} if several else {*result_files.RESULT_FILES}
             resumable |= {path.name for path in (given.coco, given.bop, given.rerun, given.out_bag) if path}
@@ -92,7 +89,7 @@ class _Answers:
         """Print and write all answers; the error of a damaged recording says where those before it are."""
         from thor2_jax.model.result_files import ResultTables
 
-        self.tables = ResultTables(self._frames, classes, self._numbers)
+        self._tables = ResultTables(self._frames, classes, self._numbers)
         try:
             with self._bag or contextlib.nullcontext(), self._rerun or contextlib.nullcontext():
                 for answer in answers:
@@ -100,9 +97,9 @@ class _Answers:
         except InputError as error:
             if self._frames or not self.failures:
                 raise
-            place = f", written to {self.written}" if self.written else ""
+            place = f", written to {self._written}" if self._written else ""
             raise InputError(f"{error}; frames recognized before: {len(self.failures)}{place}") from None
-        self.tables.write(self._given.coco, self._given.bop)
+        self._tables.write(self._given.coco, self._given.bop)
 
     def _add(self, answer: "FrameAnswer") -> None:
         from thor2_jax.model.result_files import write_recognitions
@@ -113,15 +110,15 @@ class _Answers:
         if self._as_json:
             print(json.dumps(answer.as_json()), flush=True)
         if frame is None:
-            self.failed.append(answer.name)
+            self._failed.append(answer.name)
             print_note(f"failed: {answer.name}: {answer.error}")
             return
         self.failures.append(answer.segmentation_failure)
-        self.has_unknown |= any(each.name is None for each in answer.recognitions)
+        self._has_unknown |= any(each.name is None for each in answer.recognitions)
         if not self._as_json:
             _print_table(answer.name if self._several else None, answer.recognitions)
         if self._given.coco or self._given.bop:
-            self.tables.add(answer.name, frame, answer.detections, answer.seconds)
+            self._tables.add(answer.name, frame, answer.detections, answer.seconds)
         if out is not None:
             write_recognitions(out / answer.name if self._several else out, frame, answer.recognitions)
         if self._bag is not None and place is not None:
@@ -130,11 +127,24 @@ class _Answers:
             self._rerun.write(frame, answer.detections, name=answer.name, stamp=None if place is None else place.stamp)
 
     @property
-    def written(self) -> str:
+    def _written(self) -> str:
         """The paths that exist now, separated by commas."""
         given = self._given
         paths = given.out, given.out_bag, given.coco, given.bop, given.rerun
         return ", ".join(str(path) for path in paths if path and path.exists())
+
+    def summarize(self, known: str, *command: str, **options: object) -> None:
+        """Print where the answers are, `known` if an object is unknown, and the next command; refuse failed frames."""
+        notes = sys.stderr if self._as_json else None
+        if self._has_unknown:
+            print(escape_characters(known), file=notes)
+        result = f"written to {self._written}" if self._written else f"frames recognized: {len(self.failures)}"
+        finish(result, "see why", *command, file=notes, **options)
+        if self._tables.n_without_number:
+            print_note(f"instances whose name has no number in {self._given.names}: {self._tables.n_without_number}")
+        if self._failed:
+            total, listed = len(self._failed) + len(self.failures), first_names(self._failed, MAX_LISTED)
+            raise InputError(f"{len(self._failed)} of {total} frames could not be recognized: {listed}; see above")
 
 
 @app.command()
@@ -161,10 +171,11 @@ def recognize(
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
     the frames are a sequence of one camera, in the order of their names, and an object has one name in all frames.
     """
+    from thor2_jax.frames.frames import RecordedFrame
     from thor2_jax.segmentation.segmenters import TABLE
     from thor2_jax.tracking.viewpoints import read_poses
     from training.frame_recognition import RecognizerArguments, recognize_frames, track_frames
-    from training.readers.frames import segmented_source
+    from training.readers.frames import FrameSource, segmented_source
 
     given.check()
     frames, recording, table = given.frames, given.bag, {"coco": outputs.coco, "bop": outputs.bop}
@@ -192,38 +203,28 @@ def recognize(
     as_json = as_json or recording is not None
     frame_poses = None if poses is None else read_poses(poses, names)
     results = _Answers(outputs, names, several=bool(frames or recording), as_json=as_json)
+    segmented: Iterable[FrameSource | RecordedFrame] = sources
     with contextlib.ExitStack() as stack:
         if bag is not None:
             for note in stack.enter_context(bag).notes:
                 print_note(f"note: {note}")
-        recognizer = load()
-        if bag is not None:
             recorded = itertools.islice(bag.frames(), 0, None, given.every)
             segmented = (dataclasses.replace(each, read=segmented_source(each, segmenter).read) for each in recorded)
-            answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
-        elif track:
+        recognizer = load()
+        if track and bag is None:
             answers = track_frames(recognizer, sources, frame_poses)
         elif pool is not None:
             answers = stack.enter_context(contextlib.closing(pool(arguments.answer, sources)))
         else:
-            answers = recognize_frames(recognizer.recognize, sources)
+            answers = recognize_frames(recognizer.track().update if track else recognizer.recognize, segmented)
         results.write(answers, recognizer.classes)
     if bag is not None and bag.counts.color > bag.counts.pairs:
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
-    failed, failures, written = results.failed, results.failures, results.written
-    result = f"written to {written}" if written else f"frames recognized: {len(failures)}"
-    notes = sys.stderr if as_json else None
-    if results.has_unknown:
-        print(escape_characters(f"{model} recognizes {recognizer.gallery.summary}"), file=notes)
-    finish(result, "see why", "explain", *given.arguments, file=notes, segment=segment, **vars(arguments), out="why")
-    if results.tables.n_without_number:
-        print_note(f"instances whose name has no number in {outputs.names}: {results.tables.n_without_number}")
-    if failed:
-        total, listed = len(failed) + len(failures), first_names(failed, MAX_LISTED)
-        raise InputError(f"{len(failed)} of {total} frames could not be recognized: {listed}; see above")
-    if (segment or recording) and failures and all(failures):
-        raise InputError(failures[0])
+    known, same = f"{model} recognizes {recognizer.gallery.summary}", {"segment": segment, **vars(arguments)}
+    results.summarize(known, "explain", *given.arguments, **same, out="why")
+    if (segment or recording) and results.failures and all(results.failures):
+        raise InputError(results.failures[0])
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

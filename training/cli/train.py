@@ -1,6 +1,7 @@
 """`thor2 train`: train a recognizer."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -165,27 +166,24 @@ def train(
     """
     import jax
 
-    if paper and quick:
-        raise InputError("paper and quick are given; expected one of them")
+    options.check_alone("quick", quick, paper=paper)
     if (given.meshes is None) == (given.dataset is None) and (given.meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
-    scale = options.given_scale(given.mesh_scale)
+    scale = options.given_values(given).get("mesh_scale")
     steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
     options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)
+    options.check_belongs("--dataset", given.dataset, sequences=given.sequences)
+    options.check_alone("sequences", given.sequences, leave_out=leave_out)
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
-    if given.sequences is not None and (given.dataset is None or leave_out):
-        raise InputError(f"sequences is {given.sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
         if given.meshes is not None or frames:
             raise InputError(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-    from thor2_jax.model.run_record import RUN_FILE
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
@@ -206,20 +204,28 @@ def train(
     with show_progress(quiet) as progress:
         trained = run_train_job(job, progress)
     for directory, runs in trained.items():
-        for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []) if runs else []:
-            console.print(f"skipped: {reason}")
-        for run in runs:
-            fold = f"fold {run.record['fold']}: " if len(runs) > 1 else ""
-            for name, accuracy in run.record["held_out_accuracy"].items():
-                console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
-            if run.embedding is not None and run.surfaces is None:
-                console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
-        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
-        if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
-            views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
-            console.print(f"enrolled, too, since they have no mesh: {escape_characters(views)}")
-        finished = "finished, with its baselines" if job.baselines else "finished already: nothing was trained"
-        objects = f" (objects: {len(runs[0].classes)})" if runs else ""
-        written = "run written to" if runs else f"{finished}; the run is in"
-        frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
-        finish(f"{written} {directory}{objects}", "recognize a frame", "recognize", "--model", model, *frame)
+        _report(directory, runs, has_baselines=bool(job.baselines))
+
+
+def _report(directory: Path, runs: Sequence[Any], has_baselines: bool) -> None:
+    """Print the accuracy of the runs in a directory, the skipped instances, and the command that recognizes."""
+    from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
+    from thor2_jax.model.run_record import RUN_FILE
+
+    for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []) if runs else []:
+        console.print(f"skipped: {reason}")
+    for run in runs:
+        fold = f"fold {run.record['fold']}: " if len(runs) > 1 else ""
+        for name, accuracy in run.record["held_out_accuracy"].items():
+            console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
+        if run.embedding is not None and run.surfaces is None:
+            console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
+    model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
+    if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
+        views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
+        console.print(f"enrolled, too, since they have no mesh: {escape_characters(views)}")
+    finished = "finished, with its baselines" if has_baselines else "finished already: nothing was trained"
+    objects = f" (objects: {len(runs[0].classes)})" if runs else ""
+    written = "run written to" if runs else f"{finished}; the run is in"
+    frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
+    finish(f"{written} {directory}{objects}", "recognize a frame", "recognize", "--model", model, *frame)

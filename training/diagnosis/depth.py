@@ -154,7 +154,7 @@ def _check_unit(
         of_meshes = f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
     if MIN_ROOM <= median <= MAX_ROOM if extent is None else low <= extent <= high:
         return False
-    is_metric = frame.depth.dtype.kind == "f"
+    is_metric, is_usable = frame.depth.dtype.kind == "f", MIN_DEPTH <= median <= MAX_DEPTH
     distance = _length(median) + ("" if is_metric else f" with depth_scale {frame.intrinsics.depth_scale:g}")
     measured = f"The median depth would be {distance}"
     if extent is not None:
@@ -171,18 +171,16 @@ def _check_unit(
 
     scale = 1.0 if is_metric else frame.intrinsics.depth_scale
     best = min(DEPTH_SCALES, key=lambda each: misfit(scale / each))
-    is_likely, would_be = misfit(scale / best) < math.inf, _length(median * scale / best)
-    advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
+    would_be = f"would be {_length(median * scale / best)}"
+    rule = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
+    remedy = f"With depth_scale {best:g} (units per metre) the median distance {would_be}: set it in the intrinsics or "
+    remedy += "by --depth-scale."
     if is_metric:
-        advice = "Floating-point depth must be in metres."
-    if is_likely and is_metric:
-        advice += f" Divide it by {best:g}: the median would be {would_be}."
-    elif is_likely:
-        advice = f"With depth_scale {best:g} (units per metre) the median distance would be {would_be}: set it in the "
-        advice += "intrinsics or by --depth-scale."
-    elif MIN_DEPTH <= median <= MAX_DEPTH:
-        advice += " If the distance is right, the focal length or the labels are wrong."
-    if extent is not None and len(frame.instances) == 1 and extent > high and MIN_DEPTH <= median <= MAX_DEPTH:
+        rule = "Floating-point depth must be in metres."
+        remedy = f"{rule} Divide it by {best:g}: the median {would_be}."
+    other = " If the distance is right, the focal length or the labels are wrong." if is_usable else ""
+    advice = remedy if misfit(scale / best) < math.inf else rule + other
+    if extent is not None and len(frame.instances) == 1 and extent > high and is_usable:
         diagnosis.add(
             "labels-foreground",
             f"{measured}: the only number of the label image seems to cover several objects.",

@@ -53,7 +53,6 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         ValueError: the geometry is inconsistent.
     """
     from trimesh.transformations import transform_points
-    from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
     vertices = np.reshape(np.asarray(geometry.vertices, np.float64), (len(geometry.vertices), 3))
     vertices = transform_points(vertices, transform)
@@ -70,6 +69,18 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours; export the mesh with its colours")
+    uv, texture = _texture(visual, faces)
+    return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
+
+
+def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return texture coordinates [F, 3, 2] and the texture [h, w, 3], one pixel for the plain colour of a material.
+
+    Raises:
+        InputError: the texture cannot be used.
+    """
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
+
     material = visual.material
     if isinstance(material, PBRMaterial):
         image, factor = material.baseColorTexture, material.baseColorFactor
@@ -77,24 +88,22 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         image, factor = material.image, None if material.image is not None else material.diffuse
     else:
         raise InputError(f"unsupported material {type(material).__name__}")
-    if image is not None:
-        check_size(image.width, image.height)  # before it is decoded
-        is_simple = isinstance(material, SimpleMaterial)
-        if visual.uv is None:
-            raise InputError("a texture, but no texture coordinates; export the mesh with them")
-        if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
-            raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
-        if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
-            raise InputError("texture coordinates, but no material with a texture or a colour")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None:
-        uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
-    else:
-        uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
-        texture = np.asarray(image.convert("RGB"))
-        if (factor < 255).any():
-            texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
-    return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
+        return np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
+    check_size(image.width, image.height)  # before it is decoded
+    if visual.uv is None:
+        raise InputError("a texture, but no texture coordinates; export the mesh with them")
+    if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
+        raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
+    is_simple = isinstance(material, SimpleMaterial)
+    if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
+        raise InputError("texture coordinates, but no material with a texture or a colour")
+    uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
+    texture = np.asarray(image.convert("RGB"))
+    if (factor < 255).any():
+        texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
+    return uv, texture
 
 
 def _check_glb(path: Path) -> None:
@@ -157,10 +166,21 @@ def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | 
 
 def read_mesh(path: Path) -> TexturedMesh:
     """Return the mesh in the unit of its file, of any size; raise InputError as `load_mesh`."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
+    try:
+        return _read(path)
+    except InputError as error:
+        raise InputError(f"mesh {path}: {error}") from error
+    # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
+    except Exception as error:
+        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)}); export or copy it again") from error
+
+
+def _read(path: Path) -> TexturedMesh:
+    """Return the mesh of a file; raise any exception for a damaged one."""
     import trimesh
 
     missing: list[str] = []
@@ -175,34 +195,28 @@ def read_mesh(path: Path) -> TexturedMesh:
                 missing.append(name)
                 raise
 
-    try:
-        if path.suffix.lower() == ".glb":
-            _check_glb(path)  # before trimesh fails with another message
-        # Processing would silently drop vertices that are not finite.
-        scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
-        if missing:
-            raise InputError(f"its file {missing[0]!r} is missing or unreadable")
-        parts = []
-        for node in scene.graph.nodes_geometry:
-            transform, name = scene.graph[node]
-            geometry = scene.geometry[name]
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-                parts.append(_part(geometry, transform))
-        if not parts:
-            raise InputError("no faces; expected triangles, not points alone")
-        mesh = merge_meshes(parts)
-        # The bounds of an object are those of its faces.
-        used, faces = np.unique(mesh.faces, return_inverse=True)
-        mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
-        if not np.isfinite(mesh.vertices).all():
-            raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
-        if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
-            raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
-    except InputError as error:
-        raise InputError(f"mesh {path}: {error}") from error
-    # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
-    except Exception as error:
-        raise InputError(f"mesh {path}: cannot be read ({reason_of(error)}); export or copy it again") from error
+    if path.suffix.lower() == ".glb":
+        _check_glb(path)  # before trimesh fails with another message
+    # Processing would silently drop vertices that are not finite.
+    scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
+    if missing:
+        raise InputError(f"its file {missing[0]!r} is missing or unreadable")
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            parts.append(_part(geometry, transform))
+    if not parts:
+        raise InputError("no faces; expected triangles, not points alone")
+    mesh = merge_meshes(parts)
+    # The bounds of an object are those of its faces.
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(f"{(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
+    if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
+        raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
     return mesh
 
 

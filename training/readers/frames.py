@@ -253,16 +253,16 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
         InputError: the recording has no complete frame; also as `Bag`. Frames before a later damage are returned.
         OSError: the recording cannot be opened.
     """
-    recording = _Recording(open_bag, every)
+    bag, recording = open_bag(), _Recording(open_bag, every)
     sources: list[FrameSource] = []
     try:
-        for number, frame in enumerate(recording.frames()):
+        for number, frame in enumerate(_frames(bag, every)):
             sources.append(FrameSource(frame.name, functools.partial(recording.read, number)))
     except InputError as error:
         if not sources:
             raise
-        recording.notes.append(str(error))
-    return sources, recording.notes
+        return sources, [*bag.notes, str(error)]
+    return sources, bag.notes
 
 
 def _frames(bag: Bag, every: int) -> Iterator[RecordedFrame]:
@@ -278,16 +278,10 @@ class _Recording:
         self._open, self._every = open_bag, every
         self._numbered: Iterator[tuple[int, RecordedFrame]] = iter(())
         self._last: tuple[int, RecordedFrame] | None = None
-        self.notes: list[str] = []
-
-    def frames(self) -> Iterator[RecordedFrame]:
-        bag = self._open()
-        self.notes = bag.notes
-        return _frames(bag, self._every)
 
     def read(self, number: int) -> RGBDFrame:
         if self._last is None or self._last[0] > number:
-            self._last, self._numbered = None, enumerate(self.frames())
+            self._last, self._numbered = None, enumerate(_frames(self._open(), self._every))
         while self._last is None or self._last[0] < number:
             self._last = next(self._numbered)
         return self._last[1].read()

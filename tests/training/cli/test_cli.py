@@ -97,24 +97,6 @@ def test_labels_without_pixels(model: Path, images: Path, tmp_path: Path, texts:
         assert err == "" and ("without pixels" in out) == ("200 of frame one" in out) == bool(more)
 
 
-@pytest.mark.usefixtures("drawn_pictures")
-def test_any_name_of_an_object(model: Path, images: Path, tmp_path: Path, printed: Command) -> None:
-    """Names may look like markup, mathtext or terminal commands, and have any characters."""
-    names = ("$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
-    shown = dict(zip(NAMES, (*names[:2], r"茶碗\u202e\x1b[2J"), strict=True))
-    renamed, trained = dict(zip(NAMES, names, strict=True)), load_run(model)
-    save_run(dataclasses.replace(trained, classes=tuple(renamed[name] for name in trained.classes)), tmp_path / "run")
-    shutil.copytree(images, tmp_path / "frames" / "one")
-    truth = {label: renamed[name] for label, name in frame_files(images).read_names().items()}
-    (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
-    expected = printed("recognize", "--model", model, *frame_options(images))
-    out = printed("recognize", "--model", tmp_path / "run", *frame_options(images), "--out", tmp_path / "answer")
-    assert all((name in expected) == (shown[name] in out) for name in NAMES)
-    assert "\x1b" not in out and "\u202e" not in out
-    printed("evaluate", "frames", tmp_path / "frames", "--model", tmp_path / "run", "--out", tmp_path / "report")
-    assert (tmp_path / "report" / "confusion.png").is_file()
-
-
 def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path: Path, refused: Command) -> None:
     """The inputs are read later, and are missing."""
     absent = tmp_path / "absent"

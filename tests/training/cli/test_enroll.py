@@ -122,16 +122,13 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
-    write_box(tmp_path / "box.ply", BOX)
-    assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
-    views = Recognizer.load(model).gallery.objects["box"]
-    assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
-    write_box(tmp_path / "large.ply", [1000 * side for side in BOX])
-    assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
-    for views in Recognizer.load(model).gallery.objects.values():
-        if views.source == "mesh":
-            assert views.surface is not None
-            np.testing.assert_allclose(np.ptp(views.surface["table"][0, :3], axis=1), BOX, rtol=0.05)
+    for name, scale in (("box", 1), ("large", 0.001)):
+        mesh = write_box(tmp_path / f"{name}.ply", [side / scale for side in BOX])
+        assert run_thor2("enroll", name, "--model", model, "--mesh", mesh, "--mesh-scale", scale) == 0
+        views = Recognizer.load(model).gallery.objects[name]
+        assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
+        assert views.surface is not None
+        np.testing.assert_allclose(np.ptp(views.surface["table"][0, :3], axis=1), BOX, rtol=0.05)
 
 
 def test_a_folder_of_meshes(tmp_path: Path) -> None:
@@ -166,6 +163,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
+        (("mug", "--every", 2, "--mesh", tmp_path / "one.ply"), "--mesh"),
         (("--mesh", tmp_path / "one.ply"), "one.ply is one file, which needs a NAME"),
         (("--mesh", tmp_path / "absent"), "absent does not exist"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
@@ -173,7 +171,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "empty"), "no .glb"),
         (("mug", "--mesh", tmp_path / "two"), "none of a, b is 'mug'"),
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "instance by --mesh-scale 1"),
-        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "extend and --replace"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
@@ -236,6 +234,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
         (("new", "--frames", frames), "'new'"),
         (("new", *frame_options(frames / "000")), "--instance"),
         (("new", *one_frame(frames / "000", 4)), "instance is 4"),
+        (("new", *frame_options(tiny, labels=tiny / "color.png")), "error: color: --labels: "),
     ):
         for run in (model, tmp_path / "other"):
             assert words in refused("enroll", *given, "--model", run)

@@ -89,11 +89,14 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
 
 
 def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names may look like markup, mathtext or terminal commands, and have any characters."""
     monkeypatch.setattr(recognize_command.console, "_width", 80)
-    unknown = Recognition(2, reason="unknown: a confidence of 0.448, below 0.573", confidence=0.448)
-    recognize_command._print_table("f", [Recognition(1, "021_bleach_cleanser", 0.954, "embedding"), unknown])
+    answers = [Recognition(2, reason="unknown: a confidence of 0.448, below 0.573", confidence=0.448)]
+    names = ("021_bleach_cleanser", "$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
+    recognize_command._print_table("f", answers + [Recognition(1, name, 0.954, "embedding") for name in names])
     out = capfd.readouterr().out
-    assert "021_bleach_cleanser" in out and "unrecognized" in out and "0.954" in out and "…" not in out
+    assert all(text in out for text in (*names[:3], r"茶碗\u202e\x1b[2J", "unrecognized", "0.954")) and "…" not in out
+    assert "\x1b" not in out and "\u202e" not in out
     assert max(map(len, out.splitlines())) == 80
 
 

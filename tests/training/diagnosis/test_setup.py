@@ -6,7 +6,6 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,11 @@ import pytest
 from commands import Command, Texts, json_lines
 from dataset_files import write_bop
 from rendered_objects import write_box
+from toy_recognizers import recognizer_that_prefers
 
 import thor2_jax
 from benchmarks.doctor import _interpolated, _zoomed
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, encode_image
-from thor2_jax.model.recognition import Recognition
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth, instance_extents
@@ -182,16 +181,6 @@ def test_light(frame: RGBDFrame) -> None:
         (lambda color: (color * [1.0, 0.7, 0.25]).astype(np.uint8), "color-cast"),
     ):
         assert_found(expected, check_light, damage(frame.color), frame.labels)
-
-
-def recognizer_that_prefers(color: np.ndarray, classes: tuple[str, ...] = ("mug",), n: int = 3) -> Any:
-    """Return a recognizer whose confidence falls with the distance of the colours."""
-
-    def recognize(frame: RGBDFrame) -> list[Recognition]:
-        distance = np.abs(frame.color.astype(float) - color).mean() / 255
-        return [Recognition(label, "mug", float(np.exp(-8 * distance))) for label in range(1, n + 1)]
-
-    return SimpleNamespace(recognize=recognize, classes=classes)
 
 
 def test_exchanged_channels_are_found_by_a_model(frame: RGBDFrame) -> None:

@@ -102,7 +102,8 @@ def check_refused(path: Path, message: str) -> None:
 
 
 def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
-    check_refused(tmp_path / "missing.glb", "no such file")
+    for name in ("missing.glb", "missing"):
+        check_refused(tmp_path / name, "no such file")
     for name, message in (("mesh.stl", ".glb, .obj, .ply"), ("mesh.glb", "not a GLB file")):
         (tmp_path / name).touch()
         check_refused(tmp_path / name, message)
