@@ -99,6 +99,10 @@ def enrolled_views(
     return _embedded_object(embedding, CompactClouds.of(views), source, surface)
 
 
+def _contents(clouds: CompactClouds) -> list[bytes]:
+    return [view.points.tobytes() + view.colors.tobytes() + view.boundary.tobytes() for view in clouds.views()]
+
+
 MAX_COPIES = 8
 """Largest number of copies of all views from frames together."""
 
@@ -290,7 +294,7 @@ class ObjectGallery:
             views: its views.
             source: "mesh" for views rendered from a mesh, or "frames".
             surface: `Surfaces.arrays` of the mesh, with which instances are compared (`training.objects.surfaces`).
-            extend: add the views to an existing object with this name.
+            extend: add the views to an existing object with this name, see `new_views`.
             replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Raises:
@@ -299,7 +303,16 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        self.add({name: enrolled_views(self.embedding, views, source, surface)}, extend=extend, replace=replace)
+        new = self.new_views(name, views) if extend else views
+        if new or not views:
+            self.add({name: enrolled_views(self.embedding, new, source, surface)}, extend=extend, replace=replace)
+
+    def new_views(self, name: str, views: Sequence[PreparedInstance]) -> list[PreparedInstance]:
+        """Return the views that an object, if it is enrolled, does not have yet; raise InputError as `enroll`."""
+        stored = self.gallery.objects.get(name)
+        known = [] if stored is None else _contents(stored.clouds)
+        contents = _contents(CompactClouds.of(views))
+        return [view for view, content in zip(views, contents, strict=True) if content not in known]
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""

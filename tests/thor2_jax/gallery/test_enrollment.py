@@ -161,6 +161,7 @@ def test_unusable_views_are_refused_and_nothing_changes() -> None:
     assert_refused("instance is 9", recognizer.enroll, "new", [[CLUTTER, 9]])
     assert_refused("cannot be used", recognizer.enroll, "new", [frame_of_squares({1: RED}, 3)])
     assert_refused("views is empty", recognizer.enroll, "new", [])
+    recognizer.enroll("brick", [(CLUTTER, 1), BRICK], extend=True)  # it has both views already
     assert recognizer.gallery is before
 
 
