@@ -2,9 +2,9 @@
 
     python tests/golden/make_golden.py        # rewrites tests/golden/objects/*.npz; a test compares
 
-The reference is NumPy, SciPy, gudhi, persim and colour-science. It uses nothing of `thor2_jax`, and of the other
-packages only data: the meshes of the built-in objects, and the mean colours, edges and members of the packaged colour
-regions. Each file is one view of one object:
+The reference is NumPy, SciPy, gudhi and persim. It uses nothing of `thor2_jax`, and of the other packages only the
+meshes of the built-in objects and the packaged colour network, which the tests of `colornet` compare with references.
+Each file is one view of one object:
 
 | array | shape | meaning |
 |---|---|---|
@@ -22,12 +22,9 @@ regions. Each file is one view of one object:
 import math
 from pathlib import Path
 
-import colour
 import gudhi
 import numpy as np
 from persim import PersistenceImager
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import shortest_path
 from scipy.spatial import ConvexHull
 
 import colornet
@@ -140,26 +137,6 @@ def turned(points: Array) -> Array:
     return rotated - rotated.min(axis=0)
 
 
-def members(colors: Array) -> Array:
-    """Return the region weights [n, 22] of 8-bit colours: 1/m in each of the m regions of the nearest grid colour."""
-    network = colornet.load_default()
-    level = np.floor(colors / 5 + 0.5).astype(int)
-    bits = network.region_bits[(level[:, 0] * 52 + level[:, 1]) * 52 + level[:, 2]]
-    flags = (bits[:, None] >> np.arange(network.n_regions)) & 1
-    return flags / flags.sum(axis=1, keepdims=True)
-
-
-def similarity() -> Array:
-    """Return Delta [22, 22] from the regions' mean colours and edges."""
-    network = colornet.load_default()
-    white = np.array([0.31271, 0.32902])  # D65, 2 degree observer
-    lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(network.mean_rgb / 255), white)
-    difference = np.diff(lab[network.edges], axis=1)[:, 0]
-    weight = np.abs(difference[:, 0]) + np.hypot(difference[:, 1], difference[:, 2])
-    graph = coo_array((weight, tuple(network.edges.T)), shape=(network.n_regions,) * 2)
-    return 1 / (1 + shortest_path(graph, directed=False))
-
-
 def diagram(births: Array, lengths: Array) -> Array:
     """Return the finite H0 pairs [k, 2] of the strips of a slice, from gudhi."""
     tree = gudhi.SimplexTree()
@@ -204,7 +181,9 @@ def golden(mesh: TexturedMesh, azimuth: float, polar: float) -> dict[str, Array]
     normal = normalized(points.astype(np.float64))
     aligned = turned(normal).astype(np.float32)
     x, y, z = aligned.astype(np.float64).T
-    weights = members(colors)
+    network = colornet.load_default()
+    is_member = network.membership(colors) > 0
+    weights = is_member / is_member.sum(axis=1, keepdims=True)
 
     paper = descriptor(np.floor(z / SLICE).astype(int), np.floor(x / STRIP).astype(int), y, weights)
     x, y, z = np.round(x, 2), np.round(y, 2), np.round(z, 1)
@@ -220,7 +199,7 @@ def golden(mesh: TexturedMesh, azimuth: float, polar: float) -> dict[str, Array]
         "released_color": (released[2] / np.maximum(released[3], 1)[..., None]).astype(np.float32),
         "paper_images": paper[1].astype(np.float32),
         "paper_color": paper[2].astype(np.float32),
-        "paper_embedding": (paper[2] @ similarity()).astype(np.float32),
+        "paper_embedding": (paper[2] @ network.similarity).astype(np.float32),
         "view": np.array([azimuth, polar]),
     }
 

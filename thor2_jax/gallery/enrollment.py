@@ -60,12 +60,6 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
     return np.concatenate(batches)[: len(views)]
 
 
-def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
-    """Return an object's views and their `augmented_copies`."""
-    views = list(clouds.views())
-    return views + augmented_copies(views, source)
-
-
 def enrolled_object(
     embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
@@ -113,17 +107,18 @@ CAST, MESH_CAST = 0.06, 0.2
 """Largest deviation from 1 of the factor of each colour channel, for objects from frames and for those with a mesh."""
 
 
-def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
-    """Return augmented copies of the views of one object.
+def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
+    """Return the views of one object and augmented copies of them.
 
     Args:
-        views: the views.
+        clouds: the views.
         source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view, with colour casts up to `MESH_CAST`;
             "frames" for up to `MAX_COPIES` in all, with casts up to `CAST`, or none for more views than that.
     """
     of_mesh = source.startswith("mesh")
-    copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(views), 1), CAST)
-    return [augmented_view(view, copy, cast) for view in views for copy in range(copies)]
+    copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(clouds), 1), CAST)
+    views = list(clouds.views())
+    return views + [augmented_view(view, copy, cast) for view in views for copy in range(copies)]
 
 
 def augmented_view(view: PreparedInstance, copy: int, cast: float = CAST) -> PreparedInstance:
