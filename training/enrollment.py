@@ -101,7 +101,7 @@ def enroll_objects(
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)  # before its views are rendered
             given, surface = next(views), next(surfaces)
-            new = objects.new_views(each, given) if extend else given
+            new = objects.new_views(each, given, extend=extend)
             if len(new) < len(given):
                 skipped = [*skipped, f"views of {each} that are enrolled already: {len(given) - len(new)}"]
             if new or not given:

@@ -69,28 +69,19 @@ def enrolled_object(
     return GalleryObject(flat, clouds, source, date, surface)
 
 
-def _embedded_object(
-    embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None
-) -> GalleryObject:
-    # Views of similar size share a bucket.
-    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    return enrolled_object(embed_looks(embedding, views), clouds, source, surface)
-
-
 def enrolled_views(
-    embedding: Embedding,
-    views: Sequence[PreparedInstance],
-    source: str,
-    surface: Mapping[str, NDArray[Any]] | None = None,
+    embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
     """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
 
     Raises:
-        InputError: there is no view, or a view has no points or is too large.
+        InputError: there is no view.
     """
-    if not views:
+    if not clouds:
         raise InputError("views is empty; expected at least one view of the object")
-    return _embedded_object(embedding, CompactClouds.of(views), source, surface)
+    # Views of similar size share a bucket.
+    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
+    return enrolled_object(embed_looks(embedding, views), clouds, source, surface)
 
 
 def _contents(clouds: CompactClouds) -> list[bytes]:
@@ -246,7 +237,7 @@ class ObjectGallery:
     def _reembedded(self, gallery: Gallery) -> Gallery:
         objects = {}
         for name, views in gallery.objects.items():
-            again = _embedded_object(self.embedding, views.clouds, views.source, views.surface)
+            again = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
             objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
@@ -298,16 +289,21 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        new = self.new_views(name, views) if extend else views
-        if new or not views:
-            self.add({name: enrolled_views(self.embedding, new, source, surface)}, extend=extend, replace=replace)
+        clouds = self.new_views(name, views, extend=extend)
+        if clouds or not views:
+            self.add({name: enrolled_views(self.embedding, clouds, source, surface)}, extend=extend, replace=replace)
 
-    def new_views(self, name: str, views: Sequence[PreparedInstance]) -> list[PreparedInstance]:
-        """Return the views that an object, if it is enrolled, does not have yet; raise InputError as `enroll`."""
-        stored = self.gallery.objects.get(name)
-        known = [] if stored is None else _contents(stored.clouds)
-        contents = _contents(CompactClouds.of(views))
-        return [view for view, content in zip(views, contents, strict=True) if content not in known]
+    def new_views(self, name: str, views: Sequence[PreparedInstance], *, extend: bool) -> CompactClouds:
+        """Return views as a gallery stores them; with `extend`, without those that the object `name` has already.
+
+        Raises:
+            InputError: a view has no points or is too large.
+        """
+        clouds, stored = CompactClouds.of(views), self.gallery.objects.get(name)
+        if not extend or stored is None:
+            return clouds
+        known, pairs = set(_contents(stored.clouds)), zip(views, _contents(clouds), strict=True)
+        return CompactClouds.of([view for view, content in pairs if content not in known])
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
