@@ -9,7 +9,7 @@
 import dataclasses
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from thor2_jax.errors import InputError
@@ -29,11 +29,15 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def _check_positive(config: object, *names: str) -> None:
+def _is_positive(value: Any) -> bool:
+    return _is_finite(value) and value > 0
+
+
+def _check(config: object, expected: str, is_valid: Callable[[Any], bool], *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        if not (_is_finite(value) and value > 0):
-            raise InputError(f"{type(config).__name__}.{name} is {value!r}; expected a positive number")
+        if not is_valid(value):
+            raise InputError(f"{type(config).__name__}.{name} is {value!r}; expected {expected}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Relaxation:
     color: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive(self, "slice", "strip", "extremum", "color")
+        _check(self, "a positive number", _is_positive, "slice", "strip", "extremum", "color")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,22 +106,16 @@ class DescriptorConfig:
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected one of {allowed}")
-        _check_positive(self, "sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight")
-        for name in ("n_slices", "n_strips", "image_size"):
-            if type(getattr(self, name)) is not int or getattr(self, name) < 1:
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected a positive integer")
-        if not _is_finite(self.alpha):
-            raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; expected a finite angle in radians")
-        if not (self.relaxation is None or isinstance(self.relaxation, Relaxation)):
-            raise InputError(f"DescriptorConfig.relaxation is {self.relaxation!r}; expected a Relaxation or None")
+            _check(self, f"one of {allowed}", allowed.__contains__, name)
+        numbers = "sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight"
+        _check(self, "a positive number", _is_positive, *numbers)
+        counts = "n_slices", "n_strips", "image_size"
+        _check(self, "a positive integer", lambda value: type(value) is int and value > 0, *counts)
+        _check(self, "a finite angle in radians", _is_finite, "alpha")
+        _check(self, "a Relaxation or None", lambda value: isinstance(value, Relaxation | None), "relaxation")
         fixed = {"relaxation": None, "sigma_1": 0.1, "sigma_2": 0.025} if self.convention == "released" else {}
         for name, value in fixed.items():
-            if getattr(self, name) != value:
-                raise InputError(
-                    f"DescriptorConfig.{name} is {getattr(self, name)}; expected {value} in the released convention"
-                )
+            _check(self, f"{value} in the released convention", (value,).__contains__, name)
 
     @classmethod
     def released(cls, **changes: Any) -> "DescriptorConfig":

@@ -221,7 +221,7 @@ class Recognizer:
             name: name of the object.
             frames: frames whose label image has the object as its only instance, or pairs of a frame and the label
                 number of the object.
-            extend: add the views to an existing object with this name.
+            extend: add the views to an existing object with this name, except for those that it has already.
             replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Raises:

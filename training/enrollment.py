@@ -50,7 +50,7 @@ def enroll_objects(
         name: the only object to enroll; its name is checked before anything is read. None enrolls all objects.
         label_name: name of this object in the frames; by default `name`.
         instance: number of this object in the frames, see `read_instances`.
-        extend: add the views to existing objects.
+        extend: add the views to existing objects; those that an object has already are left out.
         replace: replace the views of existing objects.
         gallery: directory of the gallery, for an existing run directory; by default `gallery` in the run directory.
         mesh_scale: factor that converts the unit of the meshes to metres.
@@ -58,7 +58,7 @@ def enroll_objects(
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery; the gallery; and for each unused instance the reason.
+        Object -> number of its views in the gallery; the gallery; and for unused instances the reasons.
 
     Raises:
         InputError: the run directory cannot be read, a view cannot be used, the frames have no usable view (as
@@ -98,7 +98,12 @@ def enroll_objects(
         names = [objects.gallery.name_to_enroll(each, extend=extend, replace=replace) for each in names]
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)  # before its views are rendered
-            added[each] = enrolled_views(objects.embedding, next(views), kind, next(surfaces))
+            given, surface = next(views), next(surfaces)
+            new = objects.new_views(each, given, extend=extend)
+            if len(new) < len(given):
+                skipped = [*skipped, f"views of {each} that are enrolled already: {len(given) - len(new)}"]
+            if new or not given:
+                added[each] = enrolled_views(objects.embedding, new, kind, surface)
         progress("enroll", len(names), len(names), "")
         objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):

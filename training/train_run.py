@@ -30,6 +30,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
@@ -338,8 +339,8 @@ def _publish(
     if enrolled and run.embedding is not None:
         objects = ObjectGallery(run.classes, run.embedding)
         objects.open(complete / GALLERY_DIRECTORY)
-        views = {name: enrolled_views(run.embedding, each, "frames") for name, each in enrolled.items()}
-        objects.add(views, extend=True)
+        clouds = {name: CompactClouds.of(views) for name, views in enrolled.items()}
+        objects.add({name: enrolled_views(run.embedding, each, "frames") for name, each in clouds.items()}, extend=True)
     files = [path for path in complete.rglob("*") if path.is_file()]
     for path in sorted(files, key=lambda path: path.name == RUN_FILE):
         place = directory / path.relative_to(complete)

@@ -2,9 +2,9 @@
 
     python tests/golden/make_golden.py        # rewrites tests/golden/objects/*.npz; a test compares
 
-The reference is NumPy, SciPy, gudhi, persim and colour-science. It uses nothing of `thor2_jax`, and of the other
-packages only data: the meshes of the built-in objects, and the mean colours, edges and members of the packaged colour
-regions. Each file is one view of one object:
+The reference is NumPy and SciPy. Of the packages, it uses the meshes of the built-in objects, the packaged colour
+network and `reference_descriptor`, and nothing that runs in JAX. The diagrams and images in the files are those of
+gudhi and persim, which `reference_descriptor` reproduces. Each file is one view of one object:
 
 | array | shape | meaning |
 |---|---|---|
@@ -19,18 +19,16 @@ regions. Each file is one view of one object:
 | view | [2] | azimuth and polar angle of the camera, radians |
 """
 
+import dataclasses
 import math
 from pathlib import Path
 
-import colour
-import gudhi
 import numpy as np
-from persim import PersistenceImager
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import shortest_path
 from scipy.spatial import ConvexHull
 
 import colornet
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.testing.values import reference_descriptor
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 
@@ -47,8 +45,8 @@ VIEWS = {
 }
 """Azimuth and polar angle, in radians, at which each object is seen."""
 
-SCALE, SLICE, STRIP, ALPHA, N_SLICES, N_STRIPS = 2.5, 0.1, 0.025, math.pi / 4, 7, 31
-VARIANCE = 0.00025
+CONFIGS = DescriptorConfig(), DescriptorConfig.released()
+SCALE, STRIP, ALPHA = 2.5, 0.025, math.pi / 4
 VOXEL = 0.01
 DISTANCE = 1.5
 WIDTH, HEIGHT, FIELD_OF_VIEW = 800, 600, math.radians(40)
@@ -140,87 +138,29 @@ def turned(points: Array) -> Array:
     return rotated - rotated.min(axis=0)
 
 
-def members(colors: Array) -> Array:
-    """Return the region weights [n, 22] of 8-bit colours: 1/m in each of the m regions of the nearest grid colour."""
-    network = colornet.load_default()
-    level = np.floor(colors / 5 + 0.5).astype(int)
-    bits = network.region_bits[(level[:, 0] * 52 + level[:, 1]) * 52 + level[:, 2]]
-    flags = (bits[:, None] >> np.arange(network.n_regions)) & 1
-    return flags / flags.sum(axis=1, keepdims=True)
-
-
-def similarity() -> Array:
-    """Return Delta [22, 22] from the regions' mean colours and edges."""
-    network = colornet.load_default()
-    white = np.array([0.31271, 0.32902])  # D65, 2 degree observer
-    lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(network.mean_rgb / 255), white)
-    difference = np.diff(lab[network.edges], axis=1)[:, 0]
-    weight = np.abs(difference[:, 0]) + np.hypot(difference[:, 1], difference[:, 2])
-    graph = coo_array((weight, tuple(network.edges.T)), shape=(network.n_regions,) * 2)
-    return 1 / (1 + shortest_path(graph, directed=False))
-
-
-def diagram(births: Array, lengths: Array) -> Array:
-    """Return the finite H0 pairs [k, 2] of the strips of a slice, from gudhi."""
-    tree = gudhi.SimplexTree()
-    for strip, (birth, length) in enumerate(zip(births, lengths, strict=True)):
-        tree.insert([2 * strip], birth)
-        tree.insert([2 * strip + 1], birth)
-        tree.insert([2 * strip, 2 * strip + 1], birth + length)
-    tree.compute_persistence(min_persistence=-1)
-    pairs = tree.persistence_intervals_in_dimension(0)
-    pairs = pairs[np.isfinite(pairs[:, 1])]
-    return pairs[np.argsort(pairs[:, 0])]
-
-
-def descriptor(slices: Array, strips: Array, y: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
-    """Return diagrams [k, 3], images [7, 32, 32], colour sums [7, 31, 22] and counts [7, 31] of numbered strips."""
-    imager = PersistenceImager(
-        birth_range=(-STRIP, 0.775),
-        pers_range=(-STRIP, 0.775),
-        pixel_size=STRIP,
-        weight="persistence",
-        weight_params={"n": 1.0},
-        kernel_params={"sigma": [[VARIANCE, 0.0], [0.0, VARIANCE]]},
-    )
-    diagrams, images = [], np.zeros((N_SLICES, 32, 32))
-    color, count = np.zeros((N_SLICES, N_STRIPS, weights.shape[1])), np.zeros((N_SLICES, N_STRIPS))
-    np.add.at(color, (slices, strips), weights)
-    np.add.at(count, (slices, strips), 1)
-    for number in np.unique(slices):
-        here = slices == number
-        occupied = np.unique(strips[here])
-        lengths = np.array([np.ptp(y[here & (strips == strip)]) for strip in occupied])
-        pairs = diagram(occupied * STRIP, lengths)
-        images[number] = imager.transform(pairs, skew=True)
-        diagrams.append(np.column_stack([np.full(len(pairs), number), pairs]))
-    return np.concatenate(diagrams), images, color, count
-
-
 def golden(mesh: TexturedMesh, azimuth: float, polar: float) -> dict[str, Array]:
     """Return the arrays of one file."""
     points, colors = cloud(*render(mesh, azimuth, polar))
     points = points.astype(np.float32)
     normal = normalized(points.astype(np.float64))
     aligned = turned(normal).astype(np.float32)
-    x, y, z = aligned.astype(np.float64).T
-    weights = members(colors)
-
-    paper = descriptor(np.floor(z / SLICE).astype(int), np.floor(x / STRIP).astype(int), y, weights)
-    x, y, z = np.round(x, 2), np.round(y, 2), np.round(z, 1)
-    levels = np.searchsorted(np.unique(z), z)
-    released = descriptor(levels, np.digitize(x, np.arange(0, 0.775, STRIP), right=True), y, weights)
+    network = colornet.load_default()
+    counting = dataclasses.replace(network, similarity=np.eye(network.n_regions))
+    paper, released = (reference_descriptor(aligned, colors, counting, config) for config in CONFIGS)
+    slices, strips = np.nonzero(released.counts)
+    births = STRIP * strips
+    color = paper.embeddings.transpose(0, 2, 1)
     return {
         "points": points,
         "colors": (colors / 255).astype(np.float32),
         "box_extent": normal.max(axis=0),
         "aligned": aligned,
-        "released_diagrams": released[0],
-        "released_images": released[1].astype(np.float32),
-        "released_color": (released[2] / np.maximum(released[3], 1)[..., None]).astype(np.float32),
-        "paper_images": paper[1].astype(np.float32),
-        "paper_color": paper[2].astype(np.float32),
-        "paper_embedding": (paper[2] @ similarity()).astype(np.float32),
+        "released_diagrams": np.column_stack([slices, births, births + released.persistence[slices, strips]]),
+        "released_images": released.images.astype(np.float32),
+        "released_color": released.embeddings.transpose(0, 2, 1).astype(np.float32),
+        "paper_images": paper.images.astype(np.float32),
+        "paper_color": color.astype(np.float32),
+        "paper_embedding": (color @ network.similarity).astype(np.float32),
         "view": np.array([azimuth, polar]),
     }
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.special import expit
 from slow_tier import slow
-from small_clouds import aligned_cloud
 
 import thor2_jax as thor2
 from colornet.colors import GRID_WHITE
@@ -94,12 +93,3 @@ def test_a_strip_that_is_left_vanishes_without_a_jump() -> None:
         steps = np.abs(np.diff(images, axis=0)).max(axis=(1, 2, 3))
         assert (steps.max() < largest) and (images.sum(axis=(1, 2, 3)) > 0).all()
         assert (steps.max() > 0.1) == (config.relaxation is None)
-
-
-def test_both_backends_agree() -> None:
-    clouds = thor2.PointClouds.pack([aligned_cloud(k, n, (0.2, 1.0, 0.3)) for k, n in enumerate((200, 0, 1, 37))], 208)
-    first, second = (
-        thor2.describe_aligned(clouds, NETWORK, dataclasses.replace(relaxed(1), homology=name))
-        for name in ("closed_form", "gudhi")
-    )
-    np.testing.assert_allclose(first.tops2, second.tops2, atol=1e-6)

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from flax import nnx
 from scipy.spatial.transform import Rotation
 from small_runs import untrained_embedding_run, with_surfaces
 
@@ -23,7 +22,7 @@ from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.networks.embedding import References
-from thor2_jax.networks.networks import FEATURES, MLP
+from thor2_jax.networks.networks import FEATURES
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64
@@ -89,16 +88,6 @@ def test_gradients_are_those_of_a_cpu(homology: str, accelerator: jax.Device, cl
 
     gradient, expected = on_both(accelerator, jax.jit(jax.grad(mass)), clouds.points, clouds)
     assert_near_except_at_borders(gradient, expected, median=1e-3, limit=1e-2)
-
-
-@pytest.mark.gpu
-def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2.PointClouds) -> None:
-    described = thor2.describe(clouds, NETWORK, thor2.DescriptorConfig(homology="closed_form"))
-    model = MLP(described.tops2.shape[1], 17, rngs=nnx.Rngs(0))
-    graph, state = nnx.split(model)
-    forward = jax.jit(lambda state, descriptors: jax.nn.softmax(nnx.merge(graph, state)(descriptors.tops2)))
-    probabilities, expected = on_both(accelerator, forward, state, described)
-    np.testing.assert_allclose(probabilities, expected, atol=1e-5)
 
 
 def products(traced: Any) -> Iterator[Any]:

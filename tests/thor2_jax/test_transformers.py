@@ -80,22 +80,11 @@ def test_columns_of_data_frames_follow_the_layout(transformer: Any) -> None:
         colors[0, s, r, j] = f"slice{s}_region{r}_strip{j}"
     blocks = [images.reshape(2, -1)] + [colors.reshape(2, -1)] * (transformer is thor2.Tops2Transformer)
     clouds, plain = random_clouds(0, SIZES[:3]), transformer(config=SMALL_CONFIG)
-    frame = clone(plain).set_output(transform="pandas").fit_transform(clouds)
+    copy = pickle.loads(pickle.dumps(clone(plain).set_params(capacity=512)))
+    frame = copy.set_output(transform="pandas").fit_transform(clouds)
     assert isinstance(frame, pd.DataFrame)
     assert list(frame.columns) == list(np.concatenate(blocks, axis=1).reshape(-1))
     np.testing.assert_array_equal(frame.to_numpy(), plain.transform(clouds))
-
-
-@pytest.mark.parametrize("transformer", TRANSFORMERS)
-def test_clones_and_pickles_give_equal_values(transformer: Any) -> None:
-    clouds = random_clouds(0, SIZES[:2])
-    original = transformer(config=SMALL_CONFIG, capacity=1024).fit(clouds)
-    expected = original.transform(clouds)
-    for copy in (clone(original), pickle.loads(pickle.dumps(original))):
-        assert copy.get_params() == original.get_params()
-        np.testing.assert_array_equal(copy.transform(clouds), expected)
-    changed = clone(original).set_params(config=dataclasses.replace(SMALL_CONFIG, n_slices=1))
-    assert changed.transform(clouds).shape[1] == expected.shape[1] // 2
 
 
 XYZ, RGB = np.zeros((3, 3)), np.zeros((3, 3), np.uint8)

@@ -60,12 +60,6 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
     return np.concatenate(batches)[: len(views)]
 
 
-def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
-    """Return an object's views and their `augmented_copies`."""
-    views = list(clouds.views())
-    return views + augmented_copies(views, source)
-
-
 def enrolled_object(
     embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
@@ -75,28 +69,23 @@ def enrolled_object(
     return GalleryObject(flat, clouds, source, date, surface)
 
 
-def _embedded_object(
-    embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None
+def enrolled_views(
+    embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
+    """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
+
+    Raises:
+        InputError: there is no view.
+    """
+    if not clouds:
+        raise InputError("views is empty; expected at least one view of the object")
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
     return enrolled_object(embed_looks(embedding, views), clouds, source, surface)
 
 
-def enrolled_views(
-    embedding: Embedding,
-    views: Sequence[PreparedInstance],
-    source: str,
-    surface: Mapping[str, NDArray[Any]] | None = None,
-) -> GalleryObject:
-    """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
-
-    Raises:
-        InputError: there is no view, or a view has no points or is too large.
-    """
-    if not views:
-        raise InputError("views is empty; expected at least one view of the object")
-    return _embedded_object(embedding, CompactClouds.of(views), source, surface)
+def _contents(clouds: CompactClouds) -> list[bytes]:
+    return [view.points.tobytes() + view.colors.tobytes() + view.boundary.tobytes() for view in clouds.views()]
 
 
 MAX_COPIES = 8
@@ -109,17 +98,18 @@ CAST, MESH_CAST = 0.06, 0.2
 """Largest deviation from 1 of the factor of each colour channel, for objects from frames and for those with a mesh."""
 
 
-def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
-    """Return augmented copies of the views of one object.
+def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
+    """Return the views of one object and augmented copies of them.
 
     Args:
-        views: the views.
+        clouds: the views.
         source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view, with colour casts up to `MESH_CAST`;
             "frames" for up to `MAX_COPIES` in all, with casts up to `CAST`, or none for more views than that.
     """
     of_mesh = source.startswith("mesh")
-    copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(views), 1), CAST)
-    return [augmented_view(view, copy, cast) for view in views for copy in range(copies)]
+    copies, cast = (MESH_COPIES, MESH_CAST) if of_mesh else (MAX_COPIES // max(len(clouds), 1), CAST)
+    views = list(clouds.views())
+    return views + [augmented_view(view, copy, cast) for view in views for copy in range(copies)]
 
 
 def augmented_view(view: PreparedInstance, copy: int, cast: float = CAST) -> PreparedInstance:
@@ -247,7 +237,7 @@ class ObjectGallery:
     def _reembedded(self, gallery: Gallery) -> Gallery:
         objects = {}
         for name, views in gallery.objects.items():
-            again = _embedded_object(self.embedding, views.clouds, views.source, views.surface)
+            again = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
             objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
@@ -290,7 +280,7 @@ class ObjectGallery:
             views: its views.
             source: "mesh" for views rendered from a mesh, or "frames".
             surface: `Surfaces.arrays` of the mesh, with which instances are compared (`training.objects.surfaces`).
-            extend: add the views to an existing object with this name.
+            extend: add the views to an existing object with this name, see `new_views`.
             replace: discard the views of an object with this name, and the classifiers' output for it.
 
         Raises:
@@ -299,7 +289,21 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        self.add({name: enrolled_views(self.embedding, views, source, surface)}, extend=extend, replace=replace)
+        clouds = self.new_views(name, views, extend=extend)
+        if clouds or not views:
+            self.add({name: enrolled_views(self.embedding, clouds, source, surface)}, extend=extend, replace=replace)
+
+    def new_views(self, name: str, views: Sequence[PreparedInstance], *, extend: bool) -> CompactClouds:
+        """Return views as a gallery stores them; with `extend`, without those that the object `name` has already.
+
+        Raises:
+            InputError: a view has no points or is too large.
+        """
+        clouds, stored = CompactClouds.of(views), self.gallery.objects.get(name)
+        if not extend or stored is None:
+            return clouds
+        known, pairs = set(_contents(stored.clouds)), zip(views, _contents(clouds), strict=True)
+        return CompactClouds.of([view for view, content in pairs if content not in known])
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""

@@ -103,17 +103,6 @@ def _fused_probabilities(models: Sequence[MLP], oriented: LookDescriptors, name:
     return oriented.fuse(model(feature_of(oriented.flat[0], name)))
 
 
-def _check_answer_by(value: str | None) -> AnswerBy | None:
-    """Return the source of the answers, or None if no source is given.
-
-    Raises:
-        InputError: the source is unknown.
-    """
-    if value not in (None, *get_args(AnswerBy)):
-        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
-    return cast(AnswerBy | None, value)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Model:
     """A trained run and enrolled objects; an immutable value.
@@ -142,6 +131,7 @@ class Model:
         below = self.unknown_below
         if below is not None and (isinstance(below, str) or np.ndim(below) > 0 or not 0 <= below <= 1):
             raise InputError(f"unknown_below is {below!r}; expected a confidence from 0 to 1")
+        self.answers_by()  # raises for an unknown source
 
     @classmethod
     def of_run(
@@ -156,7 +146,7 @@ class Model:
         Raises:
             InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
         """
-        wanted = _check_answer_by(answer_by) or _check_answer_by(run.record.get("answer_by"))
+        wanted: Any = run.record.get("answer_by") if answer_by is None else answer_by
         classifiers: dict[str, Classifier] = {
             name: Compiled(_fused_probabilities, [nnx.split(each)], name) for name, each in run.classifiers.items()
         }
@@ -202,13 +192,18 @@ class Model:
         Args:
             answer_by: the requested source; by default that of the model, and else "both". A run without classifiers
                 always answers by the gallery, a run with an empty gallery always by the classifiers.
+
+        Raises:
+            InputError: the source is unknown.
         """
-        wanted = _check_answer_by(answer_by) or self.answer_by
+        wanted = self.answer_by if answer_by is None else answer_by
+        if wanted not in (None, *get_args(AnswerBy)):
+            raise InputError(f"answer_by is {wanted!r}; expected one of {', '.join(get_args(AnswerBy))}")
         if not self.classifiers:
             return "gallery"
         if not self.gallery.objects:
             return "classifiers"
-        return wanted or "both"
+        return cast(AnswerBy, wanted or "both")
 
     def surface_of(self, name: str) -> tuple[Surfaces, int] | None:
         """Return surfaces, and which of them is that of the object with this name; None if it has none."""

@@ -164,23 +164,23 @@ def load_run(path: str | Path) -> TrainedRun:
     embedding = Embedding.load(file, network) if file.is_file() else None
     stored = None if embedding is None else embedding.fingerprint
     if description.get("embedding", stored) != stored:
-        state = "is missing" if embedding is None else "is not the embedding that run.json names"
-        raise InputError(f"model: {file} {state}; copy the whole run directory")
+        raise _unfit(file, "is missing" if embedding is None else "is not the embedding that run.json names")
     if embedding is not None and embedding.references is None and description.get("references"):
-        raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
+        raise _unfit(path / REFERENCES_FILE, "is missing")
     surfaces = None
     if description["format"] == FORMAT_WITH_SURFACES:
         surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description.get("surfaces", "")))
-        if len(surfaces.table) != len(classes):
-            raise InputError(
-                f"model: {path / SURFACES_FILE} has surfaces of {len(surfaces.table)} classes; expected "
-                f"{len(classes)}; copy the whole run directory"
-            )
+        if (count := len(surfaces.table)) != len(classes):
+            raise _unfit(path / SURFACES_FILE, f"has surfaces of {count} classes; expected {len(classes)}")
     run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding, surfaces)
     if classes and not classifiers and run.embedding_classifier is None:
-        state = "is missing" if embedding is None else "does not recognize the classes of run.json"
-        raise InputError(f"model: {file} {state}; copy the whole run directory")
+        raise _unfit(file, "is missing" if embedding is None else "does not recognize the classes of run.json")
     return run
+
+
+def _unfit(path: Path, state: str) -> InputError:
+    """Return the error of a file that does not fit the rest of its run directory."""
+    return InputError(f"model: {path} {state}; copy the whole run directory")
 
 
 def weights_file(run: Path, name: str) -> Path:
@@ -193,13 +193,11 @@ def _intact(path: Path, digest: str) -> bytes:
     try:
         content = read_file(path)
     except FileNotFoundError:
-        raise InputError(f"model: {path} is missing; copy the whole run directory") from None
+        raise _unfit(path, "is missing") from None
     except OSError as error:
         raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
     if content_digest([content]) != digest:
-        raise InputError(
-            f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}; copy the whole run directory"
-        )
+        raise _unfit(path, f"is damaged: its SHA-256 is not the one in {RUN_FILE}")
     return content
 
 

@@ -110,24 +110,14 @@ def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) 
     return models[0](*oriented.flat).reshape(*oriented.shape, -1)
 
 
-class _ClassViews(nnx.Module):
-    """The learned blocks of the reference views of the classes.
-
-    Attributes:
-        learned: [C, n, L], of unit length, or zeros beyond the views of a class.
-    """
-
-    def __init__(self, references: References, n_classes: int, length: int) -> None:
-        learned = np.asarray(to_unit_length(jnp.asarray(references.embeddings[:, :length], jnp.float32)))
-        of_class = [learned[references.label == label] for label in range(n_classes)]
-        padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
-        for label, views in enumerate(of_class):
-            padded[label, : len(views)] = views
-        self.learned = nnx.Variable(jnp.asarray(padded))
-
-    def similarity(self, learned: jax.Array, label: jax.Array) -> jax.Array:
-        """Return the cosine [B, K] of each look [B, K, L] at a cloud with the nearest view of the class `label` [B]."""
-        return jnp.einsum("bkl,bnl->bkn", learned, self.learned[...][label], precision=HIGHEST).max(axis=-1, initial=-1)
+def _class_views(references: References, n_classes: int, length: int) -> nnx.Variable[jax.Array]:
+    """Return the learned blocks [C, n, L] of each class's views, of unit length, or zeros beyond the last view."""
+    learned = np.asarray(to_unit_length(jnp.asarray(references.embeddings[:, :length], jnp.float32)))
+    of_class = [learned[references.label == label] for label in range(n_classes)]
+    padded = np.zeros((n_classes, max(map(len, of_class)), length), np.float32)
+    for label, views in enumerate(of_class):
+        padded[label, : len(views)] = views
+    return nnx.Variable(jnp.asarray(padded))
 
 
 def _class_probabilities(
@@ -136,7 +126,7 @@ def _class_probabilities(
     """Return the probabilities [B, n_classes] of the classes, which are the first proxies.
 
     With `nearest`, the distractors are merged into one column, as if each had the logit of the nearest distractor. If
-    `_ClassViews` follow the networks, the odds of all classes together grow with the similarity of the nearest view of
+    `_class_views` follow the networks, the odds of all classes together grow with the similarity of the nearest view of
     the most probable class.
     """
     networks = models[:n_networks]
@@ -149,9 +139,9 @@ def _class_probabilities(
     fused = oriented.fuse(logits.mean(axis=0))
     probabilities = fused[:, :n_classes]
     if len(models) > n_networks:
-        views = models[n_networks]
-        looks = learned[0].reshape(*oriented.shape, -1)
-        similarity = views.similarity(looks, probabilities.argmax(axis=1)).mean(axis=1)
+        looks, views = learned[0].reshape(*oriented.shape, -1), models[n_networks][...][probabilities.argmax(axis=1)]
+        cosines = jnp.einsum("bkl,bnl->bkn", looks, views, precision=HIGHEST)
+        similarity = cosines.max(axis=-1, initial=-1).mean(axis=1)
         probabilities *= jnp.exp(VIEW_WEIGHT * (similarity - NEUTRAL_SIMILARITY))[:, None]
         probabilities /= (probabilities.sum(axis=1) + fused[:, n_classes:].sum(axis=1))[:, None]
     return probabilities
@@ -285,7 +275,7 @@ class Embedding:
         static = len(self.classes), len(models), self.sizes.nearest and self.distractors > 0
         if self.sizes.views and self.references is not None:
             with jax.ensure_compile_time_eval():  # as in `_split`; keeps the views on the device
-                models.append(nnx.split(_ClassViews(self.references, len(self.classes), self.sizes.learned)))
+                models.append(nnx.split(_class_views(self.references, len(self.classes), self.sizes.learned)))
         return Compiled(_class_probabilities, models, *static)
 
     @functools.cached_property

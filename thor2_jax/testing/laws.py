@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colornet import ColorNetwork
+from colornet import ColorNetwork, grid_index
+from colornet.colors import grid_colors
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
 from thor2_jax.frames.frames import RGBDFrame
@@ -212,10 +213,9 @@ def assert_same_regions_alike(describe: Describe, clouds: PointClouds, network: 
     rng = np.random.default_rng(seed)
     _, of_color, counts = np.unique(network.region_bits, return_inverse=True, return_counts=True)
     by_set, first = np.argsort(of_color, kind="stable"), np.cumsum(counts) - counts
-    levels = (np.floor(np.asarray(clouds.colors) * 255 + 0.5).astype(np.int64) + 2) // 5
-    region_set = of_color[(levels[..., 0] * 52 + levels[..., 1]) * 52 + levels[..., 2]]
+    region_set = of_color[grid_index(np.floor(np.asarray(clouds.colors) * 255 + 0.5).astype(np.uint8))]
     other = by_set[first[region_set] + (rng.random(region_set.shape) * counts[region_set]).astype(np.int64)]
-    rgb = np.stack([other // 52**2, other // 52 % 52, other % 52], axis=-1) * 5
+    rgb = grid_colors()[other]
     # Every 8-bit colour within two steps of a grid colour has its regions.
     rgb = np.clip(rgb + rng.integers(-2, 3, rgb.shape), 0, 255)
     recolored = dataclasses.replace(clouds, colors=jnp.asarray(rgb, jnp.float32) / np.float32(255))

@@ -13,7 +13,8 @@ from small_runs import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view
-from thor2_jax.gallery.enrollment import ObjectGallery, augmented_copies
+from thor2_jax.gallery.compact_clouds import CompactClouds
+from thor2_jax.gallery.enrollment import ObjectGallery, views_to_embed
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import answers
@@ -161,16 +162,18 @@ def test_unusable_views_are_refused_and_nothing_changes() -> None:
     assert_refused("instance is 9", recognizer.enroll, "new", [[CLUTTER, 9]])
     assert_refused("cannot be used", recognizer.enroll, "new", [frame_of_squares({1: RED}, 3)])
     assert_refused("views is empty", recognizer.enroll, "new", [])
+    recognizer.enroll("brick", [(CLUTTER, 1), BRICK], extend=True)  # it has both views already
     assert recognizer.gallery is before
 
 
 def test_views_get_augmented_copies() -> None:
     recognizer = taught(untrained_run((), ()))
     views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
-    copies = augmented_copies(views, "frames")
-    assert len(copies) == 8 and len(augmented_copies(views * 5, "frames")) == 0
-    assert len(augmented_copies(views * 5, "mesh")) == len(augmented_copies(views * 5, "mesh and frames")) == 10
-    for copy, again in zip(copies, augmented_copies(views, "frames"), strict=True):
+    two, ten = CompactClouds.of(views), CompactClouds.of(views * 5)
+    embedded = views_to_embed(two, "frames")
+    assert len(embedded) == 2 + 8 and len(views_to_embed(ten, "frames")) == 10
+    assert len(views_to_embed(ten, "mesh")) == len(views_to_embed(ten, "mesh and frames")) == 10 + 10
+    for copy, again in zip(embedded, views_to_embed(two, "frames"), strict=True):
         np.testing.assert_array_equal(copy.points, again.points)
         assert len(copy.points) == len(copy.colors) == len(copy.boundary) >= 30
     recognizer.objects.enroll("mesh", views, "mesh")

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,11 +98,14 @@ def test_runs_and_files_of_a_frame_are_told_apart(model: Path, frames: Path, mon
         assert calls[-1][2] == str(dataset) and calls[-1][4] == [model]
 
 
-def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> None:
+def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, printed: Callable[..., str]) -> None:
+    """With --extend, views that are stored already are left out."""
     more = ("--model", model, "--frames", frames / "000")
     assert run_thor2("enroll", "red thing", *more, "--label-name", "brick") == 0
-    assert run_thor2("enroll", "brick", *more, "--extend") == 0
-    assert view_counts(model) == {"brick": 3, "book": 2, "red thing": 1}
+    for other, count in ((), 2), ((write_frame(frames / "002", {1: "brick"}, 2),), 3):
+        line = "skipped: views of brick that are enrolled already: 1\n"
+        assert line in printed("enroll", "brick", *more, *other, "--extend")
+        assert view_counts(model) == {"brick": count, "book": 2, "red thing": 1}
     assert run_thor2("enroll", "brick", *more, "--replace") == 0
     assert view_counts(model)["brick"] == 1
 
