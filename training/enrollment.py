@@ -16,6 +16,7 @@ from thor2_jax.files import atomic_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
 from thor2_jax.gallery.gallery import GalleryObject
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_open_to_changes
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from training.objects.meshes import load_mesh
 from training.objects.surfaces import surfaces_of
@@ -61,8 +62,9 @@ def enroll_objects(
         Object -> number of its views in the gallery; the gallery; and for unused instances the reasons.
 
     Raises:
-        InputError: the run directory cannot be read, a view cannot be used, the frames have no usable view (as
-            `read_instances`), or a name exists and neither `extend` nor `replace` is given. Nothing is enrolled.
+        InputError: the run directory cannot be read, the gallery cannot be written, a view cannot be used, the frames
+            have no usable view (as `read_instances`), or a name exists and neither `extend` nor `replace` is given.
+            Nothing is enrolled.
         OSError: a file cannot be written; the gallery is unchanged, and no run directory is created.
     """
     if not isinstance(source, FrameFolder):
@@ -81,6 +83,7 @@ def enroll_objects(
             save_run(TrainedRun(embedding.config, embedding.network, (), {}, {}), run)
         recognizer = Recognizer.load(run, gallery=gallery)
         objects = recognizer.objects
+        check_open_to_changes(gallery or run / GALLERY_DIRECTORY)
         if name is not None:
             objects.gallery.name_to_enroll(name, extend=extend, replace=replace)
         views: Iterator[Sequence[PreparedInstance]]

@@ -3,7 +3,7 @@
 | format | recognized by | depth_scale in it, if any |
 |---|---|---|
 | THOR2 | fx, fy, cx, cy | depth units per metre |
-| BOP camera.json | fx, fy, cx, cy, width, height and a depth_scale of at most 10 | millimetres per depth unit |
+| BOP camera.json | fx, fy, cx, cy, width, height and a depth_scale from 0.01 to 10 | millimetres per depth unit |
 | BOP scene_camera.json | cam_K, or image number -> entry with cam_K | millimetres per depth unit |
 | RealSense | ppx, ppy | metres per depth unit |
 | ROS camera_info | camera_matrix with data, or K (ROS 2: k) with D or distortion_model | depth units per metre |
@@ -42,8 +42,8 @@ DEFAULT_DEPTH_SCALE = 1000.0
 LARGEST_INTRINSIC = 10**9
 """Largest absolute value accepted for an intrinsic parameter."""
 
-MAX_BOP_CAMERA_SCALE = 10.0
-"""Largest depth_scale of BOP's camera.json. As depth units per metre, it would mean depth in steps of 10 cm or more."""
+BOP_CAMERA_SCALES = 0.01, 10.0
+"""Range of depth_scale in BOP's camera.json. Depth units per metre are more, and metres per depth unit less."""
 
 MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""
@@ -296,7 +296,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
         return matrix, scale
     if any(name in values for name in _PINHOLE):
         has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
-        if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
+        if has_size and _is_number(scale) and BOP_CAMERA_SCALES[0] <= scale <= BOP_CAMERA_SCALES[1]:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale
     shown, expected = ", ".join(map(str, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"

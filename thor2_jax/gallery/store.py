@@ -23,9 +23,10 @@ from typing import Any
 import filelock
 import numpy as np
 
-from thor2_jax.errors import InputError, reason_of
+from thor2_jax.errors import InputError, reason_of, refusing_os_errors
 from thor2_jax.files import (
     atomic_write,
+    check_writable,
     content_digest,
     pack_arrays,
     read_file,
@@ -43,6 +44,7 @@ __all__ = [
     "GalleryError",
     "check_exists",
     "check_index",
+    "check_open_to_changes",
     "gallery_stamp",
     "load_gallery",
     "previous_gallery",
@@ -89,6 +91,12 @@ def check_exists(directory: Path) -> None:
     """Raise GalleryError unless a directory has an index, or objects from which a lost index can be rebuilt."""
     if gallery_stamp(directory) is None and not any(_own_objects(directory)):
         raise GalleryError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
+
+
+def check_open_to_changes(directory: Path) -> None:
+    """Raise InputError unless the gallery in a directory can be written."""
+    with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
+        check_writable(directory)
 
 
 def check_index(directory: Path) -> None:

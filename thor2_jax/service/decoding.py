@@ -62,13 +62,13 @@ async def read_body(request: Request) -> bytes:
 
 
 async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a multipart form that are in `form`, an OpenAPI request body; other fields are ignored.
+    """Return the fields of a multipart form, which must be those of `form`, an OpenAPI request body.
 
     Files are returned as bytes; names, numbers and flags are parsed.
 
     Raises:
         RequestError: 413 if the body is larger than `MAX_BODY`, 415 for another content type or charset, 400 if the
-            form cannot be parsed, 422 if a field is missing, repeated or invalid.
+            form cannot be parsed, 422 if a field is missing, repeated, unknown or invalid.
     """
     schema = form["content"][FORM]["schema"]
     content_type, options = parse_options_header(request.headers.get("content-type"))
@@ -86,6 +86,9 @@ async def read_form(request: Request, form: dict[str, Any]) -> dict[str, Any]:
     except MultiPartException as error:
         raise RequestError(400, "body", error.message) from None
     try:
+        if unknown := received.keys() - schema["properties"].keys():
+            message = f"The form has the field {min(unknown)[:40]!r}; expected {', '.join(schema['properties'])}."
+            raise RequestError(422, "body", message)
         parsers: dict[str, Callable[[], Any]] = {}
         for name in schema["properties"]:
             given = received.getlist(name)

@@ -18,11 +18,10 @@ from thor2_jax.adaptation.estimate import Adaptation, OnlineAdaptation, adaptati
 from thor2_jax.capacity import BATCH_BUCKETS, MIN_BATCH_POINTS, POINT_BUCKETS, batch_bucket, batch_points
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
-from thor2_jax.errors import InputError, refusing_os_errors
+from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import explained_by_classifiers
-from thor2_jax.files import check_writable
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists, check_open_to_changes
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -136,8 +135,7 @@ class InferenceEngine:
         self._recognizer = recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
         self.objects = recognizer.objects
         if settings.teach:
-            with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
-                check_writable(directory)
+            check_open_to_changes(directory)
         model = dataclasses.replace(recognizer.model, run=recognizer.run.without_callback())
         if settings.teach and model.answer_by == "classifiers":  # They ignore enrolled objects.
             model = dataclasses.replace(model, answer_by="both")

@@ -83,6 +83,7 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "BOP entry": (as_json(BOP_ENTRY), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP scene": (as_json({"7": BOP_ENTRY}), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP camera.json": (as_json(WITH_SIZE | {"depth_scale": 0.1}), Intrinsics(**WITH_SIZE, depth_scale=10_000)),
+    "metres per unit": (as_json(WITH_SIZE | {"depth_scale": 0.001}), Intrinsics(**WITH_SIZE, depth_scale=0.001)),
     "RealSense": (as_json({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}), SIZED),
     "RealSense with a scale": (as_json(REALSENSE | {"depth_scale": 0.00025}), Intrinsics(**WITH_SIZE, depth_scale=4e3)),
     "Open3D camera": (as_json({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}), SIZED),

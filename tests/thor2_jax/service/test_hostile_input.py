@@ -80,6 +80,8 @@ def test_invalid_forms(http: httpx.Client, files: Files) -> None:
     twice = [*files.items(), ("depth", files["depth"])]
     check_refused(http.post("/v1/recognize", files=twice), 422, "depth", "more than once")
     check_refused(http.post("/v1/recognize", files=[(f"part{k}", b"") for k in range(1000)]), 400, "body")
+    mask = {{"labels": "mask"}.get(name, name): content for name, content in files.items()}
+    check_refused(post(http, mask), 422, "body", "'mask'", "labels")
     check_refused(http.post("/v1/recognize", json={"color": "x"}), 415, "body")
     for boundary in ("", "; boundary=", "; boundary=" + "x" * 500):
         headers = {"content-type": f"multipart/form-data{boundary}"}

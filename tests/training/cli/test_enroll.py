@@ -245,6 +245,12 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
     assert files_of(model) == before and not (tmp_path / "other").exists()
 
 
+def test_a_gallery_that_cannot_be_written(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
+    (tmp_path / "file").touch()
+    given = "--frames", frames, "--model", model, "--gallery", tmp_path / "file" / "gallery"
+    assert "(--gallery)" in refused("enroll", *given)  # before views are computed
+
+
 def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path, tmp_path: Path) -> None:
     def create(*_: object) -> None:
         shutil.copytree(model, tmp_path / "other", dirs_exist_ok=True)
