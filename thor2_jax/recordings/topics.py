@@ -118,7 +118,6 @@ class StampedImage(NamedTuple):
     message: Any
 
 
-@dataclasses.dataclass
 class PairCounts:
     """Counts of `nearest_pairs` so far.
 
@@ -129,10 +128,11 @@ class PairCounts:
         smallest_gap: smallest time between a colour and a depth image, nanoseconds; None if there are no such images.
     """
 
-    color: int = 0
-    depth: int = 0
-    pairs: int = 0
-    smallest_gap: int | None = None
+    def __init__(self) -> None:
+        self.color = 0
+        self.depth = 0
+        self.pairs = 0
+        self.smallest_gap: int | None = None
 
 
 def nearest_pairs(
