@@ -103,14 +103,18 @@ def finished_record(out: Path) -> Mapping[str, Any]:
 
 
 def log_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
-    """Append the metrics of one epoch; those that an interrupted training logged before its checkpoint are removed."""
-    key, row = (fold, classifier), {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    rows = [r for r in read_metrics(path) if (r["fold"], r["classifier"]) != key or r["epoch"] < metrics.epoch]
-    earlier = "".join(json.dumps(each) + "\n" for each in rows)
-    if path.exists() and path.read_text(encoding="utf-8") != earlier:
-        write_text(path, earlier)
+    """Append the metrics of one epoch."""
+    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
     with errors_name(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
+
+
+def remove_later_metrics(path: Path, fold: int, classifier: str, last_epoch: int) -> None:
+    """Remove the metrics that an interrupted training logged after its last checkpoint, and a line that is cut off."""
+    key, rows = (fold, classifier), read_metrics(path)
+    rows = [row for row in rows if (row["fold"], row["classifier"]) != key or row["epoch"] <= last_epoch]
+    if path.exists():
+        write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -310,7 +314,11 @@ class _Fold(NamedTuple):
 
     def checkpoints(self, name: str) -> Checkpoints:
         """Open the checkpoints of a fit, which log its metrics."""
-        return Checkpoints(self.scratch / name, functools.partial(log_metrics, self.out / METRICS, self.number, name))
+        logged = self.out / METRICS, self.number, name
+        checkpoints = Checkpoints(self.scratch / name, functools.partial(log_metrics, *logged))
+        if jax.process_index() == 0:
+            remove_later_metrics(*logged, checkpoints.last_epoch)
+        return checkpoints
 
     def report(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Show the progress of a stage of this fold."""

@@ -141,11 +141,6 @@ class WithLabelledViews:
         sizes = {name: len(each) * (1 + self._copies[name]) for name, each in views.items()}
         self.shards = (*shards, *(SourceShard(self.classes.index(name), size) for name, size in sizes.items()))
 
-    @property
-    def without_mesh(self) -> dict[str, Sequence[PreparedInstance]]:
-        """The instances of the classes without rendered views."""
-        return {name: views for name, views in self._views.items() if name not in self._rendered.classes}
-
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of the digest of the rendered views, the instances and the numbers of their copies."""
