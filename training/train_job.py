@@ -194,15 +194,15 @@ def _read_frames(job: TrainJob) -> LabelledInstances | None:
     return read_instances(frames, job.protocol.config.sigma_s, crop_size=job.crop_size)
 
 
-def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
+def _check_names(job: TrainJob, names: Sequence[str], instances: Mapping[str, Sequence[PreparedInstance]]) -> None:
     """Raise InputError before views are rendered if the classes cannot be trained.
 
     Args:
         job: the job.
         names: classes of the meshes or of the dataset.
-        labelled: instances of the frames.
+        instances: class -> its instances in the frames.
     """
-    known = dict.fromkeys([*names, *(labelled.views if labelled else ())])
+    known = dict.fromkeys([*names, *instances])
     if missing := sorted(set(job.leave_out) - set(known)):
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
@@ -210,7 +210,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         raise InputError(f"leave_out has {', '.join(known)}, all objects; expected at least one that is trained")
     if job.protocol.distractors is not None:
         job.protocol.distractors.check(classes)
-    if len(classes) < 2 and (labelled or job.protocol.classifiers):
+    if len(classes) < 2 and (instances or job.protocol.classifiers):
         raise InputError(f"the objects are {classes[0]}; expected at least two; add another one")
     folded: dict[str, str] = {}
     for name in classes:
@@ -219,8 +219,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
             raise InputError(
                 f"the objects {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-    views = labelled.views if labelled else {}
-    if single := [name for name in classes if name not in names and len(views[name]) < 2]:
+    if single := [name for name in classes if name not in names and len(instances[name]) < 2]:
         raise InputError(
             f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "
             "label it in another frame, or leave it out with --leave-out"
@@ -238,19 +237,18 @@ def _open_views(
     meshes, instances = _find_meshes(job), labelled.views if labelled else {}
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     names = source.classes if source else tuple(meshes)
-    _check_names(job, names, labelled)
+    _check_names(job, names, instances)
     if "thor" in job.baselines:
         types_of_views(source.record["job"] if source else vars(job.protocol))  # raises if there are too few
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         # Folds and batches are checked later again, since some views may have too few points.
         folds, n_rendered = job.protocol.folds, len(rendering.angles)
-        labelled_views = {name: len(views) for name, views in instances.items()}
         for name in meshes:
-            n_views = n_rendered + labelled_views.get(name, 0)
+            n_views = n_rendered + len(instances.get(name, ()))
             if n_views < folds and name not in job.leave_out:
                 raise InputError(f"folds is {folds}; expected at most {n_views}, the number of views of class {name!r}")
-        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
+        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(map(len, instances.values())) * (1 + MAX_COPIES)
         _check_batch_size(job.protocol, n_clouds)
         source = render_dataset(rendering, job.out / VIEWS, workers, progress)
         if size is not None:

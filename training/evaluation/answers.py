@@ -140,14 +140,7 @@ def _encode(answers: FrameAnswers) -> str:
         table = instance.probabilities
         rounded = None if table is None else [[float(f"{p:.6g}") for p in row] for row in table]
         instances.append(vars(instance) | {"probabilities": rounded})
-    values = {
-        "frame": answers.frame,
-        "attributes": dict(answers.attributes),
-        "seconds": round(answers.seconds, 4),
-        "files": dict(answers.files),
-        "instances": instances,
-    }
-    return json.dumps(values)
+    return json.dumps(vars(answers) | {"seconds": round(answers.seconds, 4), "instances": instances})
 
 
 def _decode(line: str | bytes) -> FrameAnswers:
