@@ -39,7 +39,7 @@ from thor2_jax.networks.embedding import Embedding
 from thor2_jax.networks.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import Distractors
-from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
+from training.embedding.fit import RUN_SIZES, fit_embedding
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
@@ -306,8 +306,7 @@ class _Fold(NamedTuple):
             networks=distractors.networks,
             seed=seed,
         )
-        references = reference_views(embedding, samples, seed)
-        return dataclasses.replace(embedding, references=references), known + unknown
+        return embedding, known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
         """Open the checkpoints of a fit, which log its metrics."""

@@ -128,8 +128,7 @@ class WithLabelledViews:
             rendered: source of rendered views, or None.
         """
         self._rendered: ViewSource = MemoryViews({}, config) if rendered is None else rendered
-        self._instances, self._config = instances, config
-        self._views = views = dict(instances.views)
+        self._instances, self._config, views = instances, config, instances.views
         self.classes = tuple(dict.fromkeys([*self._rendered.classes, *views]))
         shards = self._rendered.shards
         clouds = [0] * len(self.classes)
@@ -156,7 +155,7 @@ class WithLabelledViews:
             "views": sum(shard.views for shard in self.shards),
             "frames": {
                 "digest": self._instances.digest,
-                "instances": {name: len(each) for name, each in self._views.items()},
+                "instances": {name: len(each) for name, each in self._instances.views.items()},
                 "copies": self._copies,
                 "skipped": list(self._instances.skipped),
             },
@@ -175,8 +174,9 @@ class WithLabelledViews:
         """
         if index < self._first:
             return self._rendered.read(index)
-        name, label = list(self._views)[index - self._first], self.shards[index].label
-        views, copies = self._views[name], self._copies[name]
+        label = self.shards[index].label
+        name = self.classes[label]
+        views, copies = self._instances.views[name], self._copies[name]
         each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
         flat = [view for group in each for view in group]
         clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
@@ -194,7 +194,7 @@ class WithLabelledViews:
         if index < self._first:
             return self._rendered.read_crops(index, size)
         assert self._instances.crops is not None
-        name = list(self._views)[index - self._first]
+        name = self.classes[self.shards[index].label]
         crops, times = self._instances.crops[name], 1 + self._copies[name]
         reduced = stacked(crops, len(crops[0][0])).reduced(size)
         return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

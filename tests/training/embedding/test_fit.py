@@ -181,7 +181,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
     assert {path.name for path in out.parent.iterdir()} == {out.name, REFERENCES_FILE}
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr(build, "reference_views", mock.Mock(side_effect=Interrupted))
+        patch.setattr(fit, "reference_views", mock.Mock(side_effect=Interrupted))
         command(other)
     assert_refused("epochs 1, not 2", command, other, epochs=2)
     for repeated in ((module, "render_clouds"), (fit, "_step")):
