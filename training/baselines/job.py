@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import file_digest, remove_written
+from thor2_jax.files import remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files, weights_file
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
 from training.baselines.image_baselines import (
@@ -134,18 +134,11 @@ def train_baselines(
                 write_baseline(file, fitted, run.classes, time.perf_counter() - start)
                 # Checkpoints, including those of earlier versions.
                 remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
-            elif weights is not None and pretrained_files(name):
-                _check_pretrained(file, run, name, weights)
-
-
-def _check_pretrained(file: Path, run: TrainedRun, name: str, weights: Path) -> None:
-    """Raise InputError if an existing baseline was not trained from these weights files."""
-    paths = [weights_file(weights, each) for each in pretrained_files(name)]
-    if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
-        raise InputError(
-            f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
-            "out weights"
-        )
+            elif weights is not None and read_baseline(file, run.classes).weights != check_weights(weights, name):
+                raise InputError(
+                    f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
+                    "or leave out weights"
+                )
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:

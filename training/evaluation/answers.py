@@ -152,8 +152,7 @@ def _decode(line: str | bytes) -> FrameAnswers:
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
         instances.append(InstancePrediction(**instance))
-    files = dict(values.get("files", {}))
-    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)
+    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, values.get("files", {}))
 
 
 Rule = FusionRule | Literal["calibrated"]

@@ -131,10 +131,8 @@ class WithLabelledViews:
         self._instances, self._config, views = instances, config, instances.views
         self.classes = tuple(dict.fromkeys([*self._rendered.classes, *views]))
         shards = self._rendered.shards
-        clouds = [0] * len(self.classes)
-        for shard in shards:
-            clouds[shard.label] += shard.views
-        wanted = max(clouds) or CLOUDS
+        clouds = np.bincount([shard.label for shard in shards], [shard.views for shard in shards])
+        wanted = int(max(clouds, default=0)) or CLOUDS
         self._first = len(shards)
         self._copies = {name: min(MAX_COPIES, max(wanted // len(each) - 1, 0)) for name, each in views.items()}
         sizes = {name: len(each) * (1 + self._copies[name]) for name, each in views.items()}
