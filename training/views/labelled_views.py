@@ -175,8 +175,7 @@ class WithLabelledViews:
         label = self.shards[index].label
         name = self.classes[label]
         views, copies = self._instances.views[name], self._copies[name]
-        each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
-        flat = [view for group in each for view in group]
+        flat = [each for view in views for each in (view, *(augmented_view(view, copy) for copy in range(copies)))]
         clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
         view = np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist()
         copy = list(range(1 + copies)) * len(views)
