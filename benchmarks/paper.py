@@ -29,7 +29,7 @@ from benchmarks.paper_report import draw_claims, report_text
 from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, write_text
-from training.baselines.architectures import check_weights, crop_size, pretrained_files
+from training.baselines.architectures import crop_size, pretrained_files
 from training.baselines.baseline import baseline_file
 from training.baselines.job import check_baselines
 from training.evaluation.runs import load_runs
@@ -67,13 +67,12 @@ class Comparison:
         self.out: Path = options.out
         self.options = options
         names = [name.strip() for name in options.baselines.split(",") if name.strip()]
-        self.baselines = [name for name in check_baselines(names) if not (options.real and name == "thor")]
+        checked = check_baselines(names, options.weights, self.out)
+        self.baselines = [name for name in checked if not (options.real and name == "thor")]
         self.datasets = _datasets(options)
         tables = {"scenes": options.scene_names, "frames": options.frame_names}
         for name in self.datasets:
             find_meshes(options.meshes, tables[name])
-        for name in self.baselines if options.weights else ():
-            check_weights(options.weights, name)
         weights = sorted(options.weights.glob("*.safetensors")) if options.weights else []
         job = {
             "meshes": str(options.meshes.resolve()),

@@ -9,10 +9,10 @@ import jax
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.architectures import check_weights, crop_size, pretrained_files
-from training.baselines.image_baselines import check_backbone
+from training.baselines.architectures import crop_size
 from training.baselines.job import check_baselines, train_baselines
 from training.baselines.thor import types_of_views
 from training.fitting.samples import check_classes
@@ -93,53 +93,42 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
         InputError: an option is invalid, or a directory holds results of another job.
         OSError: a file cannot be written.
     """
-    baselines = check_baselines(job.baselines)
-    if job.weights is not None:
-        if not any(pretrained_files(name) for name in baselines):
-            reason = "but none of the baselines reads pretrained weights"
-            raise InputError(f"weights is {job.weights}, {reason}; leave it out")
-        for name in baselines:
-            check_weights(job.weights, name)
-    elif baselines:
-        check_backbone(baselines, job.out)
-    labelled = _read_frames(job, baselines)
-    if job.sequences is None:
-        if not is_finished(job.out):
-            check_out(job.out)
-        elif job.meshes is not None:
-            _check_finished_views(job, labelled)
-            if not baselines:
-                return {job.out: []}
+    baselines = check_baselines(job.baselines, job.weights, job.out)
+    labelled = _read_frames(job)
+    if job.sequences is None and not is_finished(job.out):
+        check_out(job.out)
+    elif job.sequences is None and job.meshes is not None:
+        _check_finished_views(job, labelled)
+        if not baselines:
+            return {job.out: []}
     shown = numbered(progress, job.stages)
-    source = _open_views(job, labelled, shown)
-    enrolled = source.without_mesh if isinstance(source, WithLabelledViews) else {}
-    if job.leave_out:
-        source = WithoutClasses(source, job.leave_out)
-        enrolled = {name: views for name, views in enrolled.items() if name in source.classes}
-    sources = {job.out: source}
-    if job.sequences is not None:
-        sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
+    source, enrolled = _open_views(job, labelled, shown)
+    sources = {job.out: source} if job.sequences is None else sequence_sources(source, job.sequences, job.out)
     for directory, views in sources.items():
-        _check_batch_size(job.protocol, sum(shard.views for shard in views.shards))
-        if job.protocol.classifiers:
-            check_classes(views)
-        if not is_finished(directory):
-            check_out(directory)
-            if job.crop_size is not None:
-                views.read_crops(0, job.crop_size)  # raises if there are none
-        elif not baselines or job.sequences is not None:
-            check_trained(views.digest, directory, job.protocol)
+        _check_views(job, directory, views)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         if job.sequences is not None:
             shown = numbered(add_prefix(progress, str(directory.relative_to(job.out))), job.stages)
-        is_done = is_finished(directory)
-        runs[directory] = [] if is_done else train_run(views, directory, job.protocol, shown, enrolled)
+        runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown, enrolled)
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
         remove_views(job.out / VIEWS)
     return runs
+
+
+def _check_views(job: TrainJob, directory: Path, views: ViewSource) -> None:
+    """Raise InputError if a run cannot be trained on views, or its directory holds results of another job."""
+    _check_batch_size(job.protocol, sum(shard.views for shard in views.shards))
+    if job.protocol.classifiers:
+        check_classes(views)
+    if not is_finished(directory):
+        check_out(directory)
+        if job.crop_size is not None:
+            views.read_crops(0, job.crop_size)  # raises if there are none
+    elif not job.baselines or job.sequences is not None:
+        check_trained(views.digest, directory, job.protocol)
 
 
 def _check_batch_size(protocol: Protocol, n_views: int) -> None:
@@ -187,7 +176,7 @@ def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
     return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
 
 
-def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances | None:
+def _read_frames(job: TrainJob) -> LabelledInstances | None:
     """Return the instances of the labelled frames; None if the job has no frames.
 
     Raises:
@@ -199,21 +188,21 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         raise InputError(
             f"sequences is {job.sequences}; expected none with frames, since the runs are trained on different objects"
         )
-    if "thor" in baselines:
+    if "thor" in job.baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
     frames = FrameFolder([source for path in job.frames for source in find_frames([path])])
     return read_instances(frames, job.protocol.config.sigma_s, crop_size=job.crop_size)
 
 
-def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
+def _check_names(job: TrainJob, names: Sequence[str], instances: Mapping[str, Sequence[PreparedInstance]]) -> None:
     """Raise InputError before views are rendered if the classes cannot be trained.
 
     Args:
         job: the job.
         names: classes of the meshes or of the dataset.
-        labelled: instances of the frames.
+        instances: class -> its instances in the frames.
     """
-    known = dict.fromkeys([*names, *(labelled.views if labelled else ())])
+    known = dict.fromkeys([*names, *instances])
     if missing := sorted(set(job.leave_out) - set(known)):
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
@@ -221,7 +210,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         raise InputError(f"leave_out has {', '.join(known)}, all objects; expected at least one that is trained")
     if job.protocol.distractors is not None:
         job.protocol.distractors.check(classes)
-    if len(classes) < 2 and (labelled or job.protocol.classifiers):
+    if len(classes) < 2 and (instances or job.protocol.classifiers):
         raise InputError(f"the objects are {classes[0]}; expected at least two; add another one")
     folded: dict[str, str] = {}
     for name in classes:
@@ -230,31 +219,36 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
             raise InputError(
                 f"the objects {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
-    views = labelled.views if labelled else {}
-    if single := [name for name in classes if name not in names and len(views[name]) < 2]:
+    if single := [name for name in classes if name not in names and len(instances[name]) < 2]:
         raise InputError(
             f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "
             "label it in another frame, or leave it out with --leave-out"
         )
 
 
-def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Progress) -> ViewSource:
-    """Open the dataset, or render the meshes to `out`/views; add the labelled instances."""
-    meshes = _find_meshes(job)
+def _open_views(
+    job: TrainJob, labelled: LabelledInstances | None, progress: Progress
+) -> tuple[ViewSource, Mapping[str, Sequence[PreparedInstance]]]:
+    """Open the dataset, or render the meshes to `out`/views; add the labelled instances, and leave objects out.
+
+    Returns:
+        The views, and the labelled instances of each class without a mesh.
+    """
+    meshes, instances = _find_meshes(job), labelled.views if labelled else {}
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
-    _check_names(job, source.classes if source else list(meshes), labelled)
+    names = source.classes if source else tuple(meshes)
+    _check_names(job, names, instances)
     if "thor" in job.baselines:
         types_of_views(source.record["job"] if source else vars(job.protocol))  # raises if there are too few
     if meshes:
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         # Folds and batches are checked later again, since some views may have too few points.
         folds, n_rendered = job.protocol.folds, len(rendering.angles)
-        labelled_views = {name: len(views) for name, views in labelled.views.items()} if labelled else {}
         for name in meshes:
-            n_views = n_rendered + labelled_views.get(name, 0)
+            n_views = n_rendered + len(instances.get(name, ()))
             if n_views < folds and name not in job.leave_out:
                 raise InputError(f"folds is {folds}; expected at most {n_views}, the number of views of class {name!r}")
-        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(labelled_views.values()) * (1 + MAX_COPIES)
+        n_clouds = len(meshes) * n_rendered * rendering.copies + sum(map(len, instances.values())) * (1 + MAX_COPIES)
         _check_batch_size(job.protocol, n_clouds)
         source = render_dataset(rendering, job.out / VIEWS, workers, progress)
         if size is not None:
@@ -262,4 +256,5 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, progress: Pro
     if labelled is not None:
         source = WithLabelledViews(labelled, job.protocol.config, source)
     assert source is not None
-    return source
+    enrolled = {name: views for name, views in instances.items() if name not in (*names, *job.leave_out)}
+    return WithoutClasses(source, job.leave_out) if job.leave_out else source, enrolled

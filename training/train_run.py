@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, decoding
@@ -39,7 +40,7 @@ from thor2_jax.networks.embedding import Embedding
 from thor2_jax.networks.networks import EMBEDDING, MLP, Feature
 from thor2_jax.types import Cloud
 from training.embedding.distractors import Distractors
-from training.embedding.fit import RUN_SIZES, fit_embedding, reference_views
+from training.embedding.fit import RUN_SIZES, fit_embedding
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import (
@@ -104,14 +105,18 @@ def finished_record(out: Path) -> Mapping[str, Any]:
 
 
 def log_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
-    """Append the metrics of one epoch; those that an interrupted training logged before its checkpoint are removed."""
-    key, row = (fold, classifier), {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    rows = [r for r in read_metrics(path) if (r["fold"], r["classifier"]) != key or r["epoch"] < metrics.epoch]
-    earlier = "".join(json.dumps(each) + "\n" for each in rows)
-    if path.exists() and path.read_text(encoding="utf-8") != earlier:
-        write_text(path, earlier)
+    """Append the metrics of one epoch."""
+    row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
     with errors_name(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
+
+
+def remove_later_metrics(path: Path, fold: int, classifier: str, last_epoch: int) -> None:
+    """Remove the metrics that an interrupted training logged after its last checkpoint, and a line that is cut off."""
+    key, rows = (fold, classifier), read_metrics(path)
+    rows = [row for row in rows if (row["fold"], row["classifier"]) != key or row["epoch"] <= last_epoch]
+    if path.exists():
+        write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -168,24 +173,15 @@ def train_run(
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
-        samples: Samples | None = None
-        if settings.classifiers:
-            check_classes(source)
-            form = Form(settings.mirrors, settings.orientation_copies)
-            show = of_stage(progress, Stage.DESCRIBE, "views")
-            samples, _ = sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)
-            label, view = samples.label, samples.view
-        else:  # only the distribution of the views among the folds is needed here
-            views = [source.read(index).view for index in range(len(source.shards))]
-            label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
-            view = np.concatenate(views)
+        samples = _sample_classes(source, settings, progress)
         if settings.distractors is not None:
             _ = source.surfaces  # a damaged file is reported now rather than after the fit
         parts = settings.folds
         if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
-            fewest = min(len(np.unique(view[label == index])) for index in range(len(source.classes)))
+            each = (samples.view[samples.label == index] for index in range(len(source.classes)))
+            fewest = min(len(np.unique(view)) for view in each)
             parts = max(2, min(HELD_OUT, fewest))
-        fold_of = fold_of_views(label, view, source.classes, parts, settings.fit.seed)
+        fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:
             if not resumed:
@@ -196,28 +192,33 @@ def train_run(
         runs = []
         for fold in range(settings.folds):
             held_out = None if parts == 1 else fold_of == fold
-            of_fold = _Fold(settings, source, out, fold, samples, label, view, held_out, progress, enrolled or {})
-            runs.append(of_fold.train())
+            runs.append(_Fold(settings, source, out, fold, samples, held_out, progress, enrolled or {}).train())
         wait_for_all("trained")
         if first:
             remove_written(out / CHECKPOINTS, r"begun\.json", r"\.lock", r"(fold-[0-9]+|distractors)/.*")
         return runs
 
 
-class _Fold(NamedTuple):
-    """One fold of a training: the arguments of `train_run`, the fold's number, and all samples.
+def _sample_classes(source: ViewSource, settings: Protocol, progress: Progress) -> Samples:
+    """Return the samples of the classifiers; without classifiers, one sample of each view, which is empty."""
+    if settings.classifiers:
+        check_classes(source)
+        form = Form(settings.mirrors, settings.orientation_copies)
+        show = of_stage(progress, Stage.DESCRIBE, "views")
+        return sample_views(source, settings.network, settings.config, form, settings.fit.seed, show)[0]
+    views = [source.read(index).view for index in range(len(source.shards))]
+    label = np.repeat([shard.label for shard in source.shards], [len(each) for each in views])
+    return Samples(csr_array((len(label), 0)), np.zeros((len(label), 0), np.float32), label, np.concatenate(views))
 
-    The last are the samples of the classifiers (None without classifiers), and for each sample or view its class, its
-    view and whether it is held out.
-    """
+
+class _Fold(NamedTuple):
+    """One fold of a training: the arguments of `train_run`, the fold's number, all samples, and which are held out."""
 
     settings: Protocol
     source: ViewSource
     out: Path
     number: int
-    samples: Samples | None
-    label: NDArray[np.integer[Any]]
-    view: NDArray[np.integer[Any]]
+    samples: Samples
     held_out: NDArray[np.bool_] | None
     progress: Progress
     enrolled: Mapping[str, Sequence[PreparedInstance]]
@@ -244,7 +245,6 @@ class _Fold(NamedTuple):
         best_epochs: dict[Feature, int] = {}
         temperatures: dict[Feature, float] = {}
         for name in settings.classifiers:
-            assert samples is not None
             context, checkpoints = FitContext(name, settings.network, settings.config), self.checkpoints(name)
             shown = fit_progress(self.report, f"fit {name}", settings.fit.epochs)
             fitted = fit(samples, context, settings.fit, checkpoints, self.held_out, shown)
@@ -270,7 +270,7 @@ class _Fold(NamedTuple):
         names = dict.fromkeys(row["classifier"] for row in rows)
         draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, self.out / CURVES)
         record = settings.record(self.source.digest)
-        record |= {"dataset": self.source.record, "samples": len(self.label), "fold": self.number}
+        record |= {"dataset": self.source.record, "samples": len(self.samples), "fold": self.number}
         record |= _outcome([row for row in rows if row["fold"] == self.number], run.record["kept_epochs"])
         record["held_out_accuracy"] |= accuracy
         record |= {"temperatures": run.record["temperatures"], **confidence}
@@ -283,12 +283,13 @@ class _Fold(NamedTuple):
             The embedding, which recognizes the classes; and the label and the cloud, in metres, of each view in the
             held-out set. Labels of distractors start at the number of classes.
         """
-        settings, label, held_out, checkpoints = self.settings, self.label, self.held_out, self.checkpoints(EMBEDDING)
+        settings, checkpoints = self.settings, self.checkpoints(EMBEDDING)
         network, seed, classes = settings.network, settings.fit.seed, self.source.classes
         config = dataclasses.replace(settings.config, homology="closed_form")
         scratch, shown = self.out / CHECKPOINTS / "distractors", of_stage(self.report, Stage.RENDER_DISTRACTORS)
         others = distractors.samples(scratch, network, config, shown)
-        kept = {index: np.unique(self.view[held_out & (label == index)]) for index in range(len(classes))}
+        label, view = self.samples.label[self.held_out], self.samples.view[self.held_out]
+        kept = {index: np.unique(view[label == index]) for index in range(len(classes))}
         shown = of_stage(self.report, Stage.DESCRIBE_EMBEDDED)
         samples, known = sample_views(self.source, network, config, OF_EMBEDDING, seed, shown, kept)
         unknown = distractors.held_out_clouds(len(classes))
@@ -306,12 +307,15 @@ class _Fold(NamedTuple):
             networks=distractors.networks,
             seed=seed,
         )
-        references = reference_views(embedding, samples, seed)
-        return dataclasses.replace(embedding, references=references), known + unknown
+        return embedding, known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
         """Open the checkpoints of a fit, which log its metrics."""
-        return Checkpoints(self.scratch / name, functools.partial(log_metrics, self.out / METRICS, self.number, name))
+        logged = self.out / METRICS, self.number, name
+        checkpoints = Checkpoints(self.scratch / name, functools.partial(log_metrics, *logged))
+        if jax.process_index() == 0:
+            remove_later_metrics(*logged, checkpoints.last_epoch)
+        return checkpoints
 
     def report(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Show the progress of a stage of this fold."""

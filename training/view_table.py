@@ -1,5 +1,6 @@
 """Table of rendered views of the classes and their answers, from which `next_view` chooses a viewpoint."""
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,8 +10,7 @@ from thor2_jax import InputError, Recognizer
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.tracking.viewpoints import ViewTable
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import RayCaster, camera_pose, render_view
-from training.views.mesh_views import cloud_of
+from training.views.mesh_views import ViewTask, all_views, cloud_of
 
 __all__ = ["view_table"]
 
@@ -29,20 +29,16 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
         InputError: no mesh is of a trained class.
     """
     classes = recognizer.run.classes
+    angles = np.array(list(itertools.product(POLARS, np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS)))[:, ::-1]
     labels: list[int] = []
     rotations: list[NDArray[np.float64]] = []
     views: list[PreparedInstance] = []
-    for name, mesh in meshes.items():
-        if name not in classes:
-            continue
-        caster = RayCaster([mesh])
-        for polar in POLARS:
-            for azimuth in np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS:
-                pose = camera_pose(float(azimuth), polar, mesh.centre)
-                xyz, rgb = cloud_of(render_view(caster, pose))
-                views.append(PreparedInstance(len(views), xyz, rgb, np.zeros(len(xyz), bool)))
-                labels.append(classes.index(name))
-                rotations.append(pose[:3, :3])
+    for name in [name for name in meshes if name in classes]:
+        for _, _, view in all_views(ViewTask(name, meshes[name], angles)):
+            xyz, rgb = cloud_of(view)
+            views.append(PreparedInstance(len(views), xyz, rgb, np.zeros(len(xyz), bool)))
+            labels.append(classes.index(name))
+            rotations.append(view.pose[:3, :3])
     if not views:
         raise InputError(
             f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected meshes of the classes"

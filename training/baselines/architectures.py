@@ -32,7 +32,6 @@ __all__ = [
     "crop_size",
     "network_inputs",
     "pretrained_files",
-    "weights_file",
 ]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
@@ -51,18 +50,6 @@ def tensors(model: nnx.Module) -> Iterator[tuple[str, tuple[int, ...], str, Any]
         if kind == "kernel":
             shape = (shape[-1], shape[-2], *shape[:-2])
         yield prefix + ".".join([*modules, _TENSORS.get(kind, kind)]), shape, kind, variable
-
-
-def weights_file(directory: Path, name: str) -> Path:
-    """Return the file of a backbone's pretrained weights.
-
-    Raises:
-        InputError: it does not exist.
-    """
-    path = directory / f"{name}.safetensors"
-    if not path.is_file():
-        raise InputError(f"weights: {path} does not exist; expected it in the folder, see docs/baselines.md")
-    return path
 
 
 def load_backbone(model: nnx.Module, path: Path) -> None:
@@ -132,7 +119,9 @@ class Architecture:
         """
         digests = {}
         for backbone, name in self.weights.items():
-            path = weights_file(directory, name)
+            path = directory / f"{name}.safetensors"
+            if not path.is_file():
+                raise InputError(f"weights: {path} does not exist; expected it in the folder, see docs/baselines.md")
             load_backbone(getattr(network, backbone), path)
             digests[path.name] = file_digest(path)
         return digests
@@ -208,12 +197,16 @@ def crop_size(names: Sequence[str], weights: bool) -> int | None:
     return max((ARCHITECTURES[name].size for name in readers if name in ARCHITECTURES), default=None)
 
 
-def check_weights(directory: Path, name: str) -> None:
+def check_weights(directory: Path, name: str) -> dict[str, str]:
     """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Returns:
+        Name of each file -> its SHA-256; empty for baselines that read none.
 
     Raises:
         InputError: a file is missing, damaged or of another architecture.
     """
-    if name in ARCHITECTURES:
-        architecture = ARCHITECTURES[name]
-        architecture.load_weights(nnx.eval_shape(lambda: architecture.build(2, 0)), directory)
+    if not pretrained_files(name):
+        return {}
+    architecture = ARCHITECTURES[name]
+    return architecture.load_weights(nnx.eval_shape(lambda: architecture.build(2, 0)), directory)

@@ -7,12 +7,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import file_digest, remove_written
+from thor2_jax.files import remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
-from training.baselines.architectures import ARCHITECTURES, TEMPLATES, pretrained_files, weights_file
+from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files
 from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
-from training.baselines.image_baselines import fit_image_network, fit_templates, load_image_network, load_templates
+from training.baselines.image_baselines import (
+    check_backbone,
+    fit_image_network,
+    fit_templates,
+    load_image_network,
+    load_templates,
+)
 from training.baselines.thor import fit_thor, load_thor
 from training.fitting.loop import find_run_directories
 from training.storage.jobs import Progress, add_prefix
@@ -53,16 +59,29 @@ _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
 KeyError or ValueError for unsuitable arrays."""
 
 
-def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
-    """Return `names` in the order of BASELINES.
+def check_baselines(names: Sequence[str], weights: Path | None, out: Path) -> tuple[str, ...]:
+    """Return `names` in the order of BASELINES, if they can be trained.
+
+    Args:
+        names: names of baselines.
+        weights: folder of pretrained weights, see `train_baselines`.
+        out: directory that contains the runs.
 
     Raises:
-        InputError: a name is unknown or given twice.
+        InputError: a name is unknown or given twice; `weights` is not needed, lacks a file or has a file of another
+            architecture; or templates have no backbone.
     """
     if not set(names) <= set(BASELINES) or len(set(names)) != len(names):
         raise InputError(
             f"baselines is {', '.join(names)}; expected any of {', '.join(BASELINES)}; give each at most once"
         )
+    if weights is None:
+        check_backbone(names, out)
+    elif not any(map(pretrained_files, names)):
+        raise InputError(f"weights is {weights}, but none of the baselines reads pretrained weights; leave it out")
+    else:
+        for name in names:
+            check_weights(weights, name)
     return tuple(name for name in BASELINES if name in names)
 
 
@@ -115,18 +134,11 @@ def train_baselines(
                 write_baseline(file, fitted, run.classes, time.perf_counter() - start)
                 # Checkpoints, including those of earlier versions.
                 remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
-            elif weights is not None and pretrained_files(name):
-                _check_pretrained(file, run, name, weights)
-
-
-def _check_pretrained(file: Path, run: TrainedRun, name: str, weights: Path) -> None:
-    """Raise InputError if an existing baseline was not trained from these weights files."""
-    paths = [weights_file(weights, each) for each in pretrained_files(name)]
-    if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
-        raise InputError(
-            f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
-            "out weights"
-        )
+            elif weights is not None and read_baseline(file, run.classes).weights != check_weights(weights, name):
+                raise InputError(
+                    f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
+                    "or leave out weights"
+                )
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:

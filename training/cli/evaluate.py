@@ -110,16 +110,16 @@ def _evaluate(
 ) -> None:
     from thor2_jax.files import file_digest
     from thor2_jax.model.run_record import RUN_FILE
-    from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_evaluated
+    from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_runs
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
-    load = models, tuple(frames.identifiers) if per_sequence else None
+    load = (models, tuple(frames.identifiers)) if per_sequence else (models,)
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = file_digest(names)
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
-        loaded = load_evaluated(*load)
+        loaded = load_runs(*load)
         answering = functools.partial(answer_frames_in_pool, load, frames, pool) if pool else None
         report = evaluate_dataset(loaded, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)

@@ -7,7 +7,6 @@ the views and 1,190 s for the fit itself. `--meshes` adds the objects of a folde
 interrupted fit resumes from the directory FILE.checkpoints.
 """
 
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -21,7 +20,7 @@ from thor2_jax.errors import InputError, reason_of
 from thor2_jax.files import check_output_file, remove_written
 from thor2_jax.networks.embedding import Embedding
 from training.embedding.distractors import ObjectSource, sample_objects, samples_record
-from training.embedding.fit import fit_embedding, reference_views
+from training.embedding.fit import fit_embedding
 from training.fitting.loop import Checkpoints, fit_progress
 from training.objects.meshes import find_meshes
 from training.storage.jobs import begin_job, locked, of_stage
@@ -59,7 +58,6 @@ def build_embedding(
         samples = sample_objects(*arguments, local_workers(workers), rendered, directory=directory / "samples")
         checkpoints = Checkpoints(directory / "networks")
         embedding = fit_embedding(samples, network, config, epochs, checkpoints, progress=fitted)
-        embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
         embedding.save(out)
         remove_written(directory, r"job\.json", r"\.lock", r"(samples|networks)/[0-9]+\.safetensors")
     print(f"{out}: {embedding.fingerprint}")

@@ -29,7 +29,7 @@ from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 from training.fitting.samples import Batch, Samples, describe_batch
 
-__all__ = ["RUN_SIZES", "fit_embedding", "reference_views"]
+__all__ = ["RUN_SIZES", "fit_embedding"]
 
 RUN_SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
 """Sizes of each network of a run; several small networks give steadier answers than fewer large networks."""
@@ -123,7 +123,7 @@ def fit_embedding(
     networks: int = 1,
     seed: int = 0,
 ) -> Embedding:
-    """Fit an embedding, or resume from the last checkpoint.
+    """Fit an embedding with its reference views, or resume from the last checkpoint.
 
     On the same machine, equal arguments give equal weights, even if the fit was interrupted.
 
@@ -139,7 +139,7 @@ def fit_embedding(
             proxies of the other objects as distractors. By default, there are no classes and proxies are discarded.
         networks: number of networks, fitted together on the same batches from different weights. The first network
             computes the embedding; all networks classify. Use 1 without classes.
-        seed: seed for weights, proxies, sample order and dropout.
+        seed: seed for weights, proxies, sample order, dropout and the choice of the reference views.
 
     Raises:
         InputError: there are fewer samples than in a batch, the loss is not finite, or a checkpoint is unreadable.
@@ -180,7 +180,8 @@ def fit_embedding(
     )
     models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
-    return fitted if classes else fitted.without_proxies()
+    fitted = fitted if classes else fitted.without_proxies()
+    return dataclasses.replace(fitted, references=reference_views(fitted, samples, seed))
 
 
 BACKGROUND_VIEWS = 1024
@@ -190,7 +191,7 @@ VIEWS_OF_CLASS, CLASS_VIEWS = 192, 8192
 """Largest number of views per class, and of all classes together."""
 
 
-def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> References:
+def reference_views(embedding: Embedding, samples: Samples, seed: int) -> References:
     """Return the embedded reference views of an embedding.
 
     Args:

@@ -140,14 +140,7 @@ def _encode(answers: FrameAnswers) -> str:
         table = instance.probabilities
         rounded = None if table is None else [[float(f"{p:.6g}") for p in row] for row in table]
         instances.append(vars(instance) | {"probabilities": rounded})
-    values = {
-        "frame": answers.frame,
-        "attributes": dict(answers.attributes),
-        "seconds": round(answers.seconds, 4),
-        "files": dict(answers.files),
-        "instances": instances,
-    }
-    return json.dumps(values)
+    return json.dumps(vars(answers) | {"seconds": round(answers.seconds, 4), "instances": instances})
 
 
 def _decode(line: str | bytes) -> FrameAnswers:
@@ -159,8 +152,7 @@ def _decode(line: str | bytes) -> FrameAnswers:
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
         instances.append(InstancePrediction(**instance))
-    files = dict(values.get("files", {}))
-    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)
+    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, values.get("files", {}))
 
 
 Rule = FusionRule | Literal["calibrated"]

@@ -25,12 +25,12 @@ from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePredic
 from training.evaluation.frame_pictures import draw_pictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import check_known, compute_results
-from training.evaluation.runs import Run, all_predictors, load_runs, load_sequence_runs
+from training.evaluation.runs import Run, all_predictors, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import Progress, locked
 from training.storage.workers import WorkerPool
 
-__all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_evaluated"]
+__all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_runs"]
 
 Answering = Callable[[range], Generator[FrameAnswers, None, None]]
 """Function that yields the answers for the frames with these numbers, such as `answer_frames_in_pool`."""
@@ -40,8 +40,8 @@ ANSWERS = "answers.jsonl"
 NO_PIXELS = "no pixels in the label image"
 """Reason of a labelled instance that has no pixels and therefore cannot be described."""
 
-Load = tuple[tuple[Path, ...], tuple[str, ...] | None]
-"""Arguments of `load_evaluated`."""
+Load = tuple[tuple[Path, ...]] | tuple[tuple[Path, ...], tuple[str, ...]]
+"""Arguments of `load_runs`."""
 
 
 def evaluate_dataset(
@@ -57,7 +57,7 @@ def evaluate_dataset(
     A frame is described once for all runs, and its answers are saved before the next frame is read.
 
     Args:
-        runs: runs, as returned by `load_runs` or `load_sequence_runs`.
+        runs: runs, as returned by `load_runs`.
         frames: the dataset.
         dataset: "kind" (uwis, ocid, bop, frames), "path", and all other values on which the frames depend.
         out: directory of the report: new, empty, or of the same evaluation.
@@ -151,25 +151,6 @@ def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Gener
         start = time.perf_counter()
 
 
-def load_evaluated(models: tuple[Path, ...], sequences: tuple[str, ...] | None = None) -> Sequence[Run]:
-    """Load the runs of an evaluation.
-
-    Args:
-        models: see `load_runs`; with `sequences`, the directory of `load_sequence_runs`.
-        sequences: identifiers of the frames if there is a run for each sequence; None otherwise.
-
-    Raises:
-        InputError: several directories of sequences are given; also as `load_runs` and `load_sequence_runs`.
-    """
-    if sequences is None:
-        return load_runs(models)
-    if len(models) != 1:
-        raise InputError(
-            f"per_sequence: {len(models)} models are given; expected one directory with a run per sequence"
-        )
-    return load_sequence_runs(models[0], sequences)
-
-
 def answer_frames_in_pool(
     load: Load, frames: LabelledFrames, pool: WorkerPool, numbers: range
 ) -> Generator[FrameAnswers, None, None]:
@@ -178,7 +159,7 @@ def answer_frames_in_pool(
     If a frame cannot be read, the answers for the frames before it are yielded before its error is raised.
 
     Args:
-        load: arguments of `load_evaluated`, with which each worker process loads the runs.
+        load: arguments of `load_runs`, with which each worker process loads the runs.
         frames: the dataset.
         pool: the workers.
         numbers: numbers of the frames.
@@ -190,8 +171,8 @@ def answer_frames_in_pool(
     return pool(functools.partial(_answer_first, load), map(frames.only, numbers))
 
 
-_loaded = functools.lru_cache(1)(load_evaluated)
-"""Cached `load_evaluated`, which loads the runs only once in each worker process."""
+_loaded = functools.lru_cache(1)(load_runs)
+"""Cached `load_runs`, which loads the runs only once in each worker process."""
 
 
 def _answer_first(load: Load, frames: LabelledFrames) -> FrameAnswers:

@@ -130,15 +130,24 @@ def _digest(path: Path) -> str:
     )
 
 
-def load_runs(paths: Sequence[Path]) -> list[Run]:
+def load_runs(paths: Sequence[Path], frames: Sequence[str] | None = None) -> Sequence[Run]:
     """Load runs that share classes, descriptor and colour network, so that a frame is described once for all runs.
 
     Args:
-        paths: run directories, or directories with the folds of a training.
+        paths: run directories, or directories with the folds of a training; with `frames`, one directory, see
+            `load_sequence_runs`.
+        frames: identifiers of the frames if there is a run for each sequence; None otherwise.
 
     Raises:
-        InputError: a run cannot be read or is given twice, or classes, descriptor or colour network differ.
+        InputError: a run cannot be read or is given twice, classes, descriptor or colour network differ, or several
+            directories of sequences are given; also as `load_sequence_runs`.
     """
+    if frames is not None:
+        if len(paths) != 1:
+            raise InputError(
+                f"per_sequence: {len(paths)} models are given; expected one directory with a run per sequence"
+            )
+        return load_sequence_runs(paths[0], frames)
     directories = find_run_directories(paths)
     runs = [_load(directory) for directory in directories]
     by_digest: dict[str, Path] = {}

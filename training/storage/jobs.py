@@ -74,13 +74,9 @@ Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 
-def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:
+def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], Any]:
     """Return the callback of a stage with a fixed note, called with (done, total)."""
-
-    def show(done: int, total: int) -> None:
-        progress(stage, done, total, note)
-
-    return show
+    return lambda done, total: progress(stage, done, total, note)
 
 
 def add_prefix(progress: Progress, name: str) -> Progress:

@@ -128,23 +128,15 @@ class WithLabelledViews:
             rendered: source of rendered views, or None.
         """
         self._rendered: ViewSource = MemoryViews({}, config) if rendered is None else rendered
-        self._instances, self._config = instances, config
-        self._views = views = dict(instances.views)
+        self._instances, self._config, views = instances, config, instances.views
         self.classes = tuple(dict.fromkeys([*self._rendered.classes, *views]))
         shards = self._rendered.shards
-        clouds = [0] * len(self.classes)
-        for shard in shards:
-            clouds[shard.label] += shard.views
-        wanted = max(clouds) or CLOUDS
+        clouds = np.bincount([shard.label for shard in shards], [shard.views for shard in shards])
+        wanted = int(max(clouds, default=0)) or CLOUDS
         self._first = len(shards)
         self._copies = {name: min(MAX_COPIES, max(wanted // len(each) - 1, 0)) for name, each in views.items()}
         sizes = {name: len(each) * (1 + self._copies[name]) for name, each in views.items()}
         self.shards = (*shards, *(SourceShard(self.classes.index(name), size) for name, size in sizes.items()))
-
-    @property
-    def without_mesh(self) -> dict[str, Sequence[PreparedInstance]]:
-        """The instances of the classes without rendered views."""
-        return {name: views for name, views in self._views.items() if name not in self._rendered.classes}
 
     @functools.cached_property
     def digest(self) -> str:
@@ -161,7 +153,7 @@ class WithLabelledViews:
             "views": sum(shard.views for shard in self.shards),
             "frames": {
                 "digest": self._instances.digest,
-                "instances": {name: len(each) for name, each in self._views.items()},
+                "instances": {name: len(each) for name, each in self._instances.views.items()},
                 "copies": self._copies,
                 "skipped": list(self._instances.skipped),
             },
@@ -180,10 +172,10 @@ class WithLabelledViews:
         """
         if index < self._first:
             return self._rendered.read(index)
-        name, label = list(self._views)[index - self._first], self.shards[index].label
-        views, copies = self._views[name], self._copies[name]
-        each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
-        flat = [view for group in each for view in group]
+        label = self.shards[index].label
+        name = self.classes[label]
+        views, copies = self._instances.views[name], self._copies[name]
+        flat = [each for view in views for each in (view, *(augmented_view(view, copy) for copy in range(copies)))]
         clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
         view = np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist()
         copy = list(range(1 + copies)) * len(views)
@@ -199,7 +191,7 @@ class WithLabelledViews:
         if index < self._first:
             return self._rendered.read_crops(index, size)
         assert self._instances.crops is not None
-        name = list(self._views)[index - self._first]
+        name = self.classes[self.shards[index].label]
         crops, times = self._instances.crops[name], 1 + self._copies[name]
         reduced = stacked(crops, len(crops[0][0])).reduced(size)
         return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

@@ -352,21 +352,22 @@ def fold_of_views(
     return fold
 
 
-def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
+def sequence_sources(source: ViewSource, table: Path, out: Path) -> dict[Path, ViewSource]:
     """Return the views for the training of each sequence.
 
     Args:
         source: views of the objects of all sequences.
         table: JSON or YAML file, sequence -> names of its objects, as for the OCID reader.
+        out: directory that contains the run directories.
 
     Returns:
-        Sequence -> views of its objects.
+        Run directory of each sequence -> views of its objects.
 
     Raises:
         InputError: the table is unreadable or empty, a sequence is not a relative path, or the source has no views of
             an object.
     """
-    sources: dict[str, ViewSource] = {}
+    sources: dict[Path, ViewSource] = {}
     for sequence, names in read_table(table).items():
         if not isinstance(sequence, str) or Path(sequence).is_absolute() or {"", ".", ".."} & set(sequence.split("/")):
             raise InputError(f"sequences: {table} has the sequence {sequence!r}; expected a relative path")
@@ -374,7 +375,7 @@ def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
             raise InputError(f"sequences: {table}: {sequence} is {names!r}; expected a list of names")
         if missing := sorted(set(names) - set(source.classes)):
             raise InputError(f"sequences: {table}: the views have no class {', '.join(missing)}, named by {sequence}")
-        sources[sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
+        sources[out / sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
     if not sources:
         raise InputError(f"sequences: {table} has no sequence; expected a table of sequence -> object names")
     return sources

@@ -120,7 +120,7 @@ def test_each_view_type_has_every_class(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: Command) -> None:
     assert_refused("^dataset: ", train_baselines, trained, Views(clouds(1), CONFIG), ["forest"])
-    assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
+    assert check_baselines(["pointnet", "thor"], None, tmp_path) == ("thor", "pointnet")
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run", "--baselines", "forest, tree")
     assert refused(*command).startswith("error: --baselines is forest, tree; ")
     assert not (tmp_path / "run").exists()

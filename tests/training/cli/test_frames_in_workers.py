@@ -19,7 +19,7 @@ from rendered_objects import write_meshes
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
-from training.evaluation.job import answer_frames, answer_frames_in_pool, load_evaluated
+from training.evaluation.job import answer_frames, answer_frames_in_pool, load_runs
 from training.frame_recognition import RecognizerArguments, recognize_frames
 from training.readers.frames import FrameFolder, find_frames, segmented_source
 
@@ -57,8 +57,8 @@ def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path
 
 
 def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, tmp_path: Path) -> None:
-    arguments, damaged = ((model,), None), Path(shutil.copytree(folder, tmp_path / "frames"))
-    expected = answer_frames(load_evaluated(*arguments), FrameFolder(folder))
+    arguments, damaged = ((model,),), Path(shutil.copytree(folder, tmp_path / "frames"))
+    expected = answer_frames(load_runs(*arguments), FrameFolder(folder))
     (damaged / "006" / "depth.png").write_bytes(b"damaged")
     frames, answers = FrameFolder(damaged), []
 

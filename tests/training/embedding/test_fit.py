@@ -38,7 +38,6 @@ OBJECTS = range(2, 26, 3)  # all of their views have enough points
 CLASSES = ("a", "b")
 EPOCHS = 12
 
-whole_embedding = nnx.jit(lambda model, *inputs: model(*inputs))
 learned_block = nnx.jit(lambda model, *inputs: model.learned(*inputs))
 
 
@@ -72,7 +71,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     normal = thor2.view_normalize(thor2.PointClouds.pack([rendered[k][1] for k in order[rows]]), SMALL_CONFIG)
     descriptors = describe_batch(batch, NETWORK, embedding.config)
-    actual = whole_embedding(nnx.merge(*embedding._embedder), descriptors, batch.statistics)
+    actual = nnx.jit(nnx.merge(*embedding._embedder))(descriptors, batch.statistics)
     similarity = []
     for mirror in ("", "x"):
         aligned = thor2.turn(thor2.mirror(normal, mirror), SMALL_CONFIG)
@@ -181,7 +180,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
     assert {path.name for path in out.parent.iterdir()} == {out.name, REFERENCES_FILE}
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr(build, "reference_views", mock.Mock(side_effect=Interrupted))
+        patch.setattr(fit, "reference_views", mock.Mock(side_effect=Interrupted))
         command(other)
     assert_refused("epochs 1, not 2", command, other, epochs=2)
     for repeated in ((module, "render_clouds"), (fit, "_step")):

@@ -135,17 +135,19 @@ def test_invalid_options_are_refused_by_name() -> None:
         assert_refused(f"^{name} is {value};", FitOptions, **{name: value})
 
 
-def test_repeated_epochs_replace_the_later_ones_of_a_classifier(tmp_path: Path) -> None:
-    """Only in its fold; a last line that was cut off by a crash is ignored."""
-    path = tmp_path / "metrics.jsonl"
-    for fold, classifier, epoch in ((0, "ce", 1), (0, "ce", 2), (0, "tops", 2), (1, "ce", 2), (0, "ce", 2)):
+def test_later_metrics_of_a_classifier_are_removed(tmp_path: Path) -> None:
+    """Only in its fold; a last line that was cut off by a crash is ignored, and removed, too."""
+    path, logged = tmp_path / "metrics.jsonl", [(0, "ce", 1), (0, "ce", 2), (0, "tops", 2), (1, "ce", 2)]
+    train_run.remove_later_metrics(path, 0, "ce", 0)
+    for fold, classifier, epoch in logged:
         train_run.log_metrics(path, fold, classifier, EpochMetrics(epoch, 1.0, 0.5, 1000.0))
-    logged = [(0, "ce", 1), (0, "tops", 2), (1, "ce", 2), (0, "ce", 2)]
     for rest in ("", '{"fold": 0, "cl'):
         path.write_text(path.read_text() + rest)
         assert [(r["fold"], r["classifier"], r["epoch"]) for r in train_run.read_metrics(path)] == logged
-    train_run.log_metrics(path, 1, "ce", EpochMetrics(3, 1.0, 0.5, 1000.0))  # after the line that was cut off
-    assert [r["epoch"] for r in train_run.read_metrics(path)] == [1, 2, 2, 2, 3]
+    train_run.remove_later_metrics(path, 0, "ce", 1)
+    train_run.log_metrics(path, 0, "ce", EpochMetrics(2, 1.0, 0.5, 1000.0))
+    rows = train_run.read_metrics(path)
+    assert [(r["fold"], r["classifier"], r["epoch"]) for r in rows] == [logged[0], *logged[2:], logged[1]]
     for damaged in ("no json\n{}\n", '{"epoch": "1"}\n'):
         path.write_text(damaged)
         assert_refused(r"out: .*metrics\.jsonl", train_run.read_metrics, path)
