@@ -152,7 +152,8 @@ def _decode(line: str | bytes) -> FrameAnswers:
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
         instances.append(InstancePrediction(**instance))
-    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, values.get("files", {}))
+    files = dict(values.get("files", {}))
+    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)
 
 
 Rule = FusionRule | Literal["calibrated"]
