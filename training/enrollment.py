@@ -59,7 +59,7 @@ def enroll_objects(
         progress: called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery; the gallery; and for unused instances the reasons.
+        Object -> number of its views in the gallery; the gallery; and notes on instances and views that were left out.
 
     Raises:
         InputError: the run directory cannot be read, the gallery cannot be written, a view cannot be used, the frames
@@ -102,13 +102,14 @@ def enroll_objects(
         for number, each in enumerate(names):
             progress("enroll", number, len(names), each)  # before its views are rendered
             given, surface = next(views), next(surfaces)
-            new = objects.new_views(each, given, extend=extend)
+            new = objects.new_views(each, given, surface, extend=extend)
             if len(new) < len(given):
                 skipped = [*skipped, f"views of {each} that are enrolled already: {len(given) - len(new)}"]
             if new or not given:
                 added[each] = enrolled_views(objects.embedding, new, kind, surface)
         progress("enroll", len(names), len(names), "")
-        objects.add(added, extend=extend, replace=replace)
+        if added:
+            objects.add(added, extend=extend, replace=replace)
         if is_new and not _is_empty(model):
             raise InputError(f"model: {model} was created by another command meanwhile; repeat this one to add to it")
     return {each: len(objects.gallery.objects[each].clouds) for each in names}, objects, skipped

@@ -80,8 +80,10 @@ def test_columns_of_data_frames_follow_the_layout(transformer: Any) -> None:
         colors[0, s, r, j] = f"slice{s}_region{r}_strip{j}"
     blocks = [images.reshape(2, -1)] + [colors.reshape(2, -1)] * (transformer is thor2.Tops2Transformer)
     clouds, plain = random_clouds(0, SIZES[:3]), transformer(config=SMALL_CONFIG)
-    copy = pickle.loads(pickle.dumps(clone(plain).set_params(capacity=512)))
-    frame = copy.set_output(transform="pandas").fit_transform(clouds)
+    copy = clone(plain).set_params(capacity=512).set_output(transform="pandas").fit(clouds)
+    copy = pickle.loads(pickle.dumps(copy))
+    assert copy.get_params() == plain.get_params() | {"capacity": 512}
+    frame = copy.transform(clouds)
     assert isinstance(frame, pd.DataFrame)
     assert list(frame.columns) == list(np.concatenate(blocks, axis=1).reshape(-1))
     np.testing.assert_array_equal(frame.to_numpy(), plain.transform(clouds))

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 OBJECTS = 3
-"""Number of objects whose nearest view, and of objects whose surface, is shown."""
+"""Number of objects that are shown with their nearest view, and of those shown with their surface."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

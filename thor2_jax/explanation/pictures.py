@@ -202,7 +202,7 @@ def _surfaces(explanation: Explanation) -> ExplanationPicture:
     figure.colorbar(scale, ax=figure.axes, location="bottom", shrink=0.6, label="distance from the surface (mm)")
     caption = (
         "The distance of each point from the surfaces of the most probable objects, in the pose that fits best. Points "
-        "of another object lie off the surface, or have other colours there."
+        "of another object lie off the surface, unless it has the same shape."
     )
     return ExplanationPicture("surfaces", "surfaces", "Fit to the surfaces of objects", caption, figure)
 

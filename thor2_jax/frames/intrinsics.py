@@ -43,7 +43,7 @@ LARGEST_INTRINSIC = 10**9
 """Largest absolute value accepted for an intrinsic parameter."""
 
 BOP_CAMERA_SCALES = 0.01, 10.0
-"""Range of depth_scale in BOP's camera.json. Depth units per metre are more, and metres per depth unit less."""
+"""Range of depth_scale in BOP's camera.json; other values beside fx, fy, cx and cy are depth units per metre."""
 
 MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""

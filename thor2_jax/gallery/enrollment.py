@@ -72,7 +72,7 @@ def enrolled_object(
 def enrolled_views(
     embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
-    """Return the views of an object as a gallery stores them; the arguments are those of `ObjectGallery.enroll`.
+    """Return the views of an object as a gallery stores them; for `source` and `surface` see `ObjectGallery.enroll`.
 
     Raises:
         InputError: there is no view.
@@ -289,18 +289,22 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is unchanged.
         """
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
-        clouds = self.new_views(name, views, extend=extend)
+        clouds = self.new_views(name, views, surface, extend=extend)
         if clouds or not views:
             self.add({name: enrolled_views(self.embedding, clouds, source, surface)}, extend=extend, replace=replace)
 
-    def new_views(self, name: str, views: Sequence[PreparedInstance], *, extend: bool) -> CompactClouds:
+    def new_views(
+        self, name: str, views: Sequence[PreparedInstance], surface: Mapping[str, NDArray[Any]] | None, *, extend: bool
+    ) -> CompactClouds:
         """Return views as a gallery stores them; with `extend`, without those that the object `name` has already.
+
+        If the object gets its first surface with these views, all of them are new.
 
         Raises:
             InputError: a view has no points or is too large.
         """
         clouds, stored = CompactClouds.of(views), self.gallery.objects.get(name)
-        if not extend or stored is None:
+        if not extend or stored is None or (surface is not None and stored.surface is None):
             return clouds
         known, pairs = set(_contents(stored.clouds)), zip(views, _contents(clouds), strict=True)
         return CompactClouds.of([view for view, content in pairs if content not in known])

@@ -267,8 +267,9 @@ def _file(description: str) -> dict[str, Any]:
 
 
 def _form(properties: dict[str, Any], *optional: str) -> dict[str, Any]:
-    schema = {"required": [name for name in properties if name not in optional], "properties": properties}
-    return {"required": True, "content": {FORM: {"schema": {"type": "object", **schema}}}}
+    required = [name for name in properties if name not in optional]
+    schema = {"type": "object", "required": required, "properties": properties, "additionalProperties": False}
+    return {"required": True, "content": {FORM: {"schema": schema}}}
 
 
 _FRAME: dict[str, Any] = {
@@ -295,7 +296,10 @@ _ENROLLMENT: dict[str, Any] = {
     **_FRAME,
     "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
     "instance": _INSTANCE,
-    "extend": {"type": "boolean", "description": "Add the view to an existing object."},
+    "extend": {
+        "type": "boolean",
+        "description": "Add the view to an existing object, even if it has an equal one.",
+    },
     "replace": {"type": "boolean", "description": "Discard the views of an existing object."},
 }
 

@@ -246,13 +246,12 @@ def _with_options(message: str) -> str:
     """Return a message with the given options in place of the arguments that they set: --max-gap, not max_gap.
 
     Only the first word that is an argument is replaced: a second one is part of the value, such as a path. A word
-    before another argument is the name of a frame: "color: --labels: ..." is about the labels of color.png.
+    before a file of a frame is the name of that frame: "color: --labels: ..." is about the labels of color.png.
     """
     options = {argument.split("=")[0] for argument in sys.argv if argument.startswith("--")}
     names = {option[2:].replace("-", "_"): option for option in options}
     names |= {"segmenter": "--segment"} if "--segment" in options else {}
-    arguments = "|".join(map(re.escape, names))
-    pattern = rf"(^| and |: )(\w+)(?=:? )(?!: (?!\2 )({arguments}):? )"
+    pattern = r"(^| and |: )(\w+)(?=:? )(?!: (color|depth|labels|intrinsics): )"
     return re.sub(pattern, lambda match: match[1] + names.pop(match[2], match[2]), message)
 
 

@@ -188,10 +188,10 @@ def _answer_table(answer: Recognition) -> Table:
 
 
 def _surfaces_table(explanation: Explanation) -> Table:
-    rows = [
-        [fit.name, f"{fit.distance:.1f}", f"{fit.chroma:z.2f}", f"{fit.lightness:z.2f}", _percent(fit.free_space)]
-        for fit in explanation.surfaces
-    ]
+    rows = []
+    for fit in explanation.surfaces:
+        free = f"{100 * fit.free_space:.0f} %"
+        rows.append([fit.name, f"{fit.distance:.1f}", f"{fit.chroma:z.2f}", f"{fit.lightness:z.2f}", free])
     return ["", "distance / roughness", "chroma", "lightness", "in free space"], rows
 
 

@@ -20,6 +20,7 @@ from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import answers
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
+from thor2_jax.surfaces.surfaces import Surfaces
 from training.objects.builtin_objects import builtin_objects
 
 embedding = functools.cache(small_embedding)
@@ -164,6 +165,15 @@ def test_unusable_views_are_refused_and_nothing_changes() -> None:
     assert_refused("views is empty", recognizer.enroll, "new", [])
     recognizer.enroll("brick", [(CLUTTER, 1), BRICK], extend=True)  # it has both views already
     assert recognizer.gallery is before
+
+
+def test_a_first_surface_comes_with_views_that_are_stored() -> None:
+    objects, views = taught(untrained_run((), ())).objects, [instance_view(CLUTTER, 1, 2.5)]
+    surface = Surfaces.empty().arrays
+    for number, (given, count) in enumerate(((None, 1), (None, 1), (surface, 2), (surface, 2))):
+        objects.enroll("mesh", views, "mesh", given, extend=number > 0)
+        enrolled = objects.gallery.objects["mesh"]
+        assert enrolled.surface is given and len(enrolled.clouds) == count
 
 
 def test_views_get_augmented_copies() -> None:

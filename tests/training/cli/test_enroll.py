@@ -99,13 +99,15 @@ def test_runs_and_files_of_a_frame_are_told_apart(model: Path, frames: Path, mon
 
 
 def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, printed: Callable[..., str]) -> None:
-    """With --extend, views that are stored already are left out."""
+    """With --extend, views that are stored already are left out; without any other, the gallery does not change."""
     more = ("--model", model, "--frames", frames / "000")
     assert run_thor2("enroll", "red thing", *more, "--label-name", "brick") == 0
     for other, count in ((), 2), ((write_frame(frames / "002", {1: "brick"}, 2),), 3):
+        generation = Recognizer.load(model).gallery.generation
         line = "skipped: views of brick that are enrolled already: 1\n"
         assert line in printed("enroll", "brick", *more, *other, "--extend")
         assert view_counts(model) == {"brick": count, "book": 2, "red thing": 1}
+        assert (Recognizer.load(model).gallery.generation > generation) == bool(other)
     assert run_thor2("enroll", "brick", *more, "--replace") == 0
     assert view_counts(model)["brick"] == 1
 
@@ -245,10 +247,14 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
     assert files_of(model) == before and not (tmp_path / "other").exists()
 
 
-def test_a_gallery_that_cannot_be_written(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
+def test_a_gallery_that_cannot_be_written(
+    model: Path, frames: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is refused before views are computed."""
+    monkeypatch.delattr("training.enrollment.read_instances")
     (tmp_path / "file").touch()
     given = "--frames", frames, "--model", model, "--gallery", tmp_path / "file" / "gallery"
-    assert "(--gallery)" in refused("enroll", *given)  # before views are computed
+    assert "(--gallery)" in refused("enroll", *given)
 
 
 def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path, tmp_path: Path) -> None:
