@@ -346,7 +346,7 @@ class Recognizer:
         """Return label -> distances from the surface of the object, for recognized instances whose surface is known."""
         model = self.model
         located: dict[int, Distances] = {}
-        if not any(map(model.surface_of, model.names)):
+        if model.run.surfaces is None and not model.gallery.surfaces:
             return located
         instances, inference = self.infer(self.prepare(frame))
         for instance, answer in zip(instances, answers(model, instances, inference), strict=True):

@@ -34,15 +34,15 @@ from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.surfaces.evidence import evidence, fit_poses
+from thor2_jax.surfaces.evidence import fit_rows, sample_points
 from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
     "Explanation",
+    "SurfaceFit",
     "compile_explanations",
     "explain",
     "explain_instance",
-    "SurfaceFit",
     "explained_by_classifiers",
     "pixel_attributions",
     "surface_fits",
@@ -284,11 +284,11 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
 
 def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
     """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
-    clouds = packed(instance)
+    samples = sample_points(packed(instance))
     known = ((name, surface) for name in names if (surface := model.surface_of(name)) is not None)
     for name, (surfaces, index) in itertools.islice(known, OBJECTS):
-        fit, chroma, lightness, free = map(float, evidence(surfaces, clouds, jnp.array([index]))[0])
-        pose = np.asarray(fit_poses(surfaces, clouds, [index]))[0]
+        (values,), (pose,) = map(np.asarray, fit_rows(surfaces, samples, jnp.array([index])))
+        fit, chroma, lightness, free = values.tolist()
         of_points = surfaces.distances(index, pose, instance.points)
         yield SurfaceFit(name, math.exp(fit), chroma, lightness, free, of_points)
 

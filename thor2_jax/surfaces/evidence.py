@@ -23,7 +23,16 @@ from thor2_jax.descriptor.slicing import to_lab
 from thor2_jax.surfaces.surfaces import FAR, GRID, N_POINTS, RADIUS, Surfaces, rotations
 from thor2_jax.types import PointClouds, matmul
 
-__all__ = ["Sample", "compared", "compile_comparison", "evidence", "fit_poses", "sample_points", "with_evidence"]
+__all__ = [
+    "Sample",
+    "compared",
+    "compile_comparison",
+    "evidence",
+    "fit_poses",
+    "fit_rows",
+    "sample_points",
+    "with_evidence",
+]
 
 SAMPLED = 256
 """Points of an instance that are compared in the end; the stages use the first ones of them."""
@@ -82,12 +91,12 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
         [B, 4] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
         correlations of chroma and of lightness, fraction of the surface in free space; zeros for an empty cloud.
     """
-    return _fit_rows(surfaces, sample_points(clouds), class_index)[0]
+    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
 
 
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
     """Return the poses [B, 3, 4] of `evidence`: a rotation and a shift from the camera to the class, metres."""
-    return _fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
+    return fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
 
 
 @jax.jit
@@ -106,7 +115,7 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     def compare(best: jax.Array, name: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         probability, logit, index = name
         is_compared = (probability > 0) & (logit + GOOD_FIT >= best)
-        values, _ = _fit_rows(surfaces, samples._replace(is_empty=samples.is_empty | ~is_compared), index)
+        values, _ = fit_rows(surfaces, samples._replace(is_empty=samples.is_empty | ~is_compared), index)
         return jnp.maximum(best, logit + matmul(values, NAME_WEIGHTS)), (is_compared, values)
 
     _, results = jax.lax.scan(compare, jnp.full_like(logits[:, 0], -jnp.inf), (largest.T, logits.T, index.T))
@@ -137,7 +146,9 @@ def sample_points(clouds: PointClouds) -> Sample:
 
 
 @jax.jit
-def _fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
+def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the values of `evidence` and of `fit_poses` for samples of B instances, from one search for poses."""
+
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)
 
@@ -168,7 +179,7 @@ def compared(
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
         # All are dispatched before the first result is awaited.
-        fits = [_fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
+        fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
         values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     missing = ((0, 0), (0, N_COMPARED - index.shape[1]))

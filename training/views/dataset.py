@@ -48,7 +48,7 @@ import numpy as np
 import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, refusing_os_errors, with_context
 from thor2_jax.files import check_output_directory, content_digest, read_file, remove_written, write_text
 from thor2_jax.surfaces.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
@@ -132,12 +132,8 @@ class ViewDataset:
         directory, manifest = Path(path), Path(path) / MANIFEST
         if not directory.is_dir():
             raise InputError(f"dataset: {directory} is not a directory; expected the output of `thor2 render`")
-        try:
+        with refusing_os_errors(f"dataset: {manifest} cannot be read", "expected output of `thor2 render`"):
             dataset = cls.read_manifest(directory)
-        except OSError as error:
-            raise InputError(
-                f"dataset: {manifest} cannot be read ({error.strerror}); expected output of `thor2 render`"
-            ) from None
         version, n_shards = dataset.job["descriptor_version"], dataset.job["shards"]
         if version != DESCRIPTOR_VERSION:
             raise InputError(

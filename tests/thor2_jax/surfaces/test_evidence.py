@@ -12,10 +12,10 @@ from thor2_jax.surfaces.evidence import (
     REACH,
     SAMPLED,
     Sample,
-    _fit_rows,
     compared,
     evidence,
     fit_poses,
+    fit_rows,
     sample_points,
     with_evidence,
 )
@@ -178,11 +178,11 @@ def test_accelerators_compare_all_rows_at_once(
     clouds = PointClouds.pack(views)
     expected = np.asarray(evidence(surfaces, clouds, OWN))
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, default: default(*arguments))
-    _fit_rows.clear_cache()
+    fit_rows.clear_cache()
     try:
         np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
     finally:
-        _fit_rows.clear_cache()
+        fit_rows.clear_cache()
 
 
 @pytest.mark.parametrize("n_classes", [6, 1])
@@ -226,7 +226,7 @@ def test_names_are_compared_while_they_may_come_first(
     def fit_rows(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
         return jnp.where(samples.is_empty[:, None], 0, values[index]), None
 
-    monkeypatch.setattr("thor2_jax.surfaces.evidence._fit_rows", fit_rows)
+    monkeypatch.setattr("thor2_jax.surfaces.evidence.fit_rows", fit_rows)
     probabilities = np.exp(2 * np.array([logits], np.float32))
     probabilities /= 2 * probabilities.sum()
     values = np.zeros((len(fits), 4), np.float32)
