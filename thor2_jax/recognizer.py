@@ -334,13 +334,13 @@ class Recognizer:
             Labels [H, W]; 0 is background.
         """
         labels = segment(frame)
-        from thor2_jax.segmentation.known_objects import fit_masks, segment_known  # imports OpenCV
+        from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV
 
         def recognize(frames: Sequence[RGBDFrame]) -> list[tuple[str | None, float]]:
             instances = (each for frame in frames for each in self.prepare(frame, [1]))
             return [(each.name, each.confidence or 0.0) for each in answers(self.model, *self.infer(instances))]
 
-        return fit_masks(frame, segment_known(frame, labels, recognize), self._locate)
+        return segment_known(frame, labels, recognize, self._locate)
 
     def _locate(self, frame: RGBDFrame) -> dict[int, "Distances"]:
         """Return label -> distances from the surface of the object, for recognized instances whose surface is known."""

@@ -1,16 +1,16 @@
 """Refinement of a segmentation by recognition, since objects in a pile touch without a visible edge.
 
-labels = segment_known(frame, labels, recognize)          # labels of any segmenter, [H, W]
-labels = fit_masks(frame, labels, locate)                 # if the surfaces of the objects are known
+labels = segment_known(frame, labels, recognize, locate)  # labels of any segmenter, [H, W]
 
-Each piece of the segmentation is divided into parts of similar colour and place. The parts, unions of neighbouring
-parts and whole pieces are candidates for objects and are all recognized. A piece is divided if its best division
-contains objects of different names. Neighbours are then merged repeatedly if their union is recognized better than each
-of them. In the end, pixels go to the object on whose surface their points lie.
+Objects are taken from each piece of the segmentation one by one. What is left of the piece is divided into parts of
+similar colour and place. The parts, unions of neighbouring parts and all of it are candidates and are recognized. The
+best one is the next object. If its surface is known, pixels whose points lie on the surface are added to it, and others
+are removed. If only one name was found in a piece, or too little of it is known, the piece remains. Neighbours are then
+merged repeatedly if their union is recognized better than each of them. In the end, pixels go to the object on whose
+surface their points lie.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import cv2
@@ -24,19 +24,25 @@ from thor2_jax.segmentation.pixels import Mask, components, nearest_known, renum
 __all__ = ["Distances", "fit_masks", "segment_known"]
 
 Parts = frozenset[int]
-"""Numbers of the parts of a candidate or of a whole piece."""
+"""Numbers of the parts of a candidate, or of the pieces that are merged."""
 
 Answer = tuple[str | None, float]
 """Name (None for an unknown object) and confidence."""
 
+Recognize = Callable[[Sequence[RGBDFrame]], Sequence[Answer]]
+"""Function from frames to the answer for the instance with label 1 in each frame; other labels are neighbours."""
+
 Distances = Callable[[NDArray[np.floating]], NDArray[np.float64]]
 """Function from points [n, 3] in the camera frame to their distances [n] from the surface of an object, metres."""
 
+Locate = Callable[[RGBDFrame], Mapping[int, Distances]]
+"""Function from a frame with labels to label -> distances from the surface, for all known objects."""
+
 LEAST_PART, MOST_PARTS = 1000, 6
-"""Smallest average number of pixels of a part, and largest number of parts of a piece."""
+"""Smallest average number of pixels of a part, and largest number of parts of a region."""
 
 MOST_JOINED = 4
-"""Largest number of parts in a candidate that is not a whole piece."""
+"""Largest number of parts in a candidate that is not the whole region."""
 
 CELL = (25.0, 0.06)
 """Equivalent distances in colour (CIELAB with 0.6 of the lightness) and in space (metres)."""
@@ -59,42 +65,8 @@ MOST = 0.99
 SHARE = 0.5
 """Smallest fraction of a piece that must be recognized in its division."""
 
-COST, COST_OF_UNKNOWN = 0.3, 0.5
-"""Penalties for each known and each unknown candidate in a division: these log-odds times the area of the piece."""
-
 GAIN = 1.0
 """Smallest increase of the log-odds of a known object when two objects are merged."""
-
-
-def segment_known(
-    frame: RGBDFrame, labels: NDArray[np.integer], recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]]
-) -> NDArray[np.int32]:
-    """Return labels after pieces are divided and merged where the results are known objects.
-
-    Args:
-        frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W], labels of a segmenter.
-        recognize: function from frames to the answer for the instance with label 1 in each frame; other labels are
-            neighbours.
-
-    Returns:
-        Labels [H, W]: 0 is background, and the objects are numbered from 1.
-    """
-    parts, piece_of = _parts(frame, labels)
-    beside = _neighbours(parts)
-    sizes = np.bincount(parts.ravel(), minlength=len(piece_of))
-    known = _Known(lambda candidates: recognize([_shown(frame, parts, each) for each in candidates]), sizes)
-    pieces = [frozenset(np.flatnonzero(piece_of == k).tolist()) for k in range(1, int(piece_of.max()) + 1)]
-    inside = [_candidates(piece, beside) for piece in pieces]
-    known.look_at([each for candidates in inside for each in candidates])
-    things = {thing for piece, each in zip(pieces, inside, strict=True) for thing in _best_division(piece, each, known)}
-    while merged := _merged(things, beside, known):
-        things = merged
-    result = np.zeros(parts.shape, np.int32)
-    for number, thing in enumerate(sorted(things, key=min), start=1):
-        result[_mask(parts, thing)] = number
-    return result
-
 
 ROUNDS = 2
 """Number of times that surfaces are fitted to masks, and masks to surfaces."""
@@ -106,9 +78,36 @@ LEAST_PIXELS = 200
 """Number of pixels of the smallest separate piece; smaller ones go to the nearest piece."""
 
 
-def fit_masks(
-    frame: RGBDFrame, labels: NDArray[np.int32], locate: Callable[[RGBDFrame], Mapping[int, Distances]]
+def segment_known(
+    frame: RGBDFrame, labels: NDArray[np.integer], recognize: Recognize, locate: Locate
 ) -> NDArray[np.int32]:
+    """Return labels after pieces are divided and merged where the results are known objects.
+
+    Args:
+        frame: colour, depth and intrinsics; its labels are not read.
+        labels: [H, W], labels of a segmenter.
+        recognize: see `Recognize`.
+        locate: see `Locate`.
+
+    Returns:
+        Labels [H, W]: 0 is background, and the objects are numbered from 1.
+    """
+    divided, features = np.zeros(labels.shape, np.int32), _features(frame)
+    for label in np.unique(labels[labels > 0]):
+        objects = _divided(frame, features, labels, label, recognize, locate)
+        divided = np.where(objects > 0, objects + divided.max(), divided)
+    beside, known = _neighbours(divided), _Known(frame, divided, recognize)
+    things = {frozenset([number]) for number in range(1, int(divided.max()) + 1)}
+    known.look_at(sorted(things, key=min))
+    while merged := _merged(things, beside, known):
+        things = merged
+    result = np.zeros(labels.shape, np.int32)
+    for number, thing in enumerate(sorted(things, key=min), start=1):
+        result[_mask(divided, thing)] = number
+    return fit_masks(frame, result, locate)
+
+
+def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> NDArray[np.int32]:
     """Return labels that fit the surfaces of known objects.
 
     A pixel goes to the known object whose surface is nearest to its point, if that is within `ON_SURFACE`. What is
@@ -118,95 +117,133 @@ def fit_masks(
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
         labels: [H, W]; 0 is background, and the objects are numbered from 1.
-        locate: function from a frame with labels to label -> distances from the surface, for all known objects.
+        locate: see `Locate`.
 
     Returns:
         Labels [H, W]: 0 is background as before, and the objects are numbered from 1.
     """
-    points = backproject(frame.depth_m, frame.intrinsics)
     for _ in range(ROUNDS):
         surfaces = locate(dataclasses.replace(frame, labels=labels))
         if not surfaces:
             break
-        known, at = np.array(list(surfaces)), (labels > 0) & (frame.depth_m > 0)
-        distance = np.stack([distances(points[at]) for distances in surfaces.values()])  # [known, n]
-        is_own = known[:, None] == labels[at]
-        own, nearest = np.where(is_own, distance, np.inf).min(axis=0), distance.min(axis=0)
-        moves, leaves = (nearest < ON_SURFACE) & (nearest < own), is_own.any(axis=0) & (own > OFF_SURFACE)
-        rest = int(labels.max()) + 1
-        fitted = np.where(np.isin(labels, known), 0, labels)  # pixels of known objects without depth follow later
-        fitted[at] = np.select([moves, leaves], [known[distance.argmin(axis=0)], rest], labels[at])
-        labels = _tidied(fitted, labels, rest)
-    return labels
+        labels = _fitted(frame, labels, surfaces)
+    return renumbered(labels, np.bincount(labels.ravel(), labels.ravel()) > 0)[0]
 
 
-def _tidied(fitted: NDArray[np.int32], labels: NDArray[np.int32], rest: int) -> NDArray[np.int32]:
-    """Return fitted labels without small pieces of changed objects; the separate pieces of `rest` get numbers each."""
-    tidied, last = np.zeros_like(fitted), 0
+def _fitted(frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, Distances]) -> NDArray[np.int32]:
+    """Return labels after one round of `fit_masks`; new pieces have new numbers, and others keep theirs."""
+    known, at = np.array(list(surfaces)), (labels > 0) & (frame.depth_m > 0)
+    points = frame.points(np.flatnonzero(at))
+    distance = np.stack([distances(points) for distances in surfaces.values()])  # [known, n]
+    is_own = known[:, None] == labels[at]
+    own, nearest = np.where(is_own, distance, np.inf).min(axis=0), distance.min(axis=0)
+    moves, leaves = (nearest < ON_SURFACE) & (nearest < own), is_own.any(axis=0) & (own > OFF_SURFACE)
+    rest = int(labels.max()) + 1
+    fitted = np.where(np.isin(labels, known), 0, labels)  # pixels of known objects without depth follow later
+    fitted[at] = np.select([moves, leaves], [known[distance.argmin(axis=0)], rest], labels[at])
+    tidied = np.zeros_like(labels)  # without small separate pieces of changed objects
     for label in np.unique(fitted[fitted > 0]):
         mask = fitted == label
         numbers, sizes = mask.astype(np.int32), np.array([0, mask.sum()])
         if (mask != (labels == label)).any():
             numbers, sizes = components(mask)
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
-        numbers, end = renumbered(numbers, kept, last)
-        if label != rest:
-            numbers, end = np.minimum(numbers, last + 1), last + 1
-        tidied, last = tidied + numbers, end
+        numbers, _ = renumbered(numbers, kept, label - 1)
+        tidied += numbers if label == rest else np.minimum(numbers, label)
     is_kept = tidied > 0
-    if not is_kept.any():
-        return labels
-    return np.where(labels > 0, tidied[is_kept].take(nearest_known(is_kept)), 0)
+    return np.where(labels > 0, tidied[is_kept].take(nearest_known(is_kept)), 0) if is_kept.any() else labels
 
 
 class _Known:
-    """Recognized candidates.
+    """Recognized candidates among the parts of an image.
 
     Attributes:
-        area: candidate -> number of pixels.
         name: candidate -> name, None for an unknown object.
         odds: candidate -> log-odds of the confidence, 0 for an unknown object.
     """
 
-    def __init__(self, recognize: Callable[[Sequence[Parts]], Sequence[Answer]], sizes: NDArray[np.intp]) -> None:
-        self.area: dict[Parts, int] = {}
+    def __init__(self, frame: RGBDFrame, parts: NDArray[np.int32], recognize: Recognize) -> None:
         self.name: dict[Parts, str | None] = {}
         self.odds: dict[Parts, float] = {}
-        self._recognize, self._sizes = recognize, sizes
+        self._frame, self._parts, self._recognize = frame, parts, recognize
 
     def look_at(self, candidates: Sequence[Parts]) -> None:
         """Recognize the new candidates in one call."""
         new = [each for each in dict.fromkeys(candidates) if each not in self.odds]
-        for each, (name, confidence) in zip(new, self._recognize(new), strict=True):
+        shown = [_shown(self._frame, self._parts, each) for each in new]
+        for each, (name, confidence) in zip(new, self._recognize(shown), strict=True):
             counts = name is not None and confidence >= LEAST
             self.name[each] = name if counts else None
             self.odds[each] = float(logit(min(confidence, MOST))) if counts else 0.0
-            self.area[each] = int(self._sizes[list(each)].sum())
 
 
-def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """Return the part of each pixel [H, W], 0 for the background, and the piece of each part [n + 1]."""
+def _divided(
+    frame: RGBDFrame,
+    features: NDArray[np.float32],
+    labels: NDArray[np.integer],
+    label: int,
+    recognize: Recognize,
+    locate: Locate,
+) -> NDArray[np.int32]:
+    """Return the objects of a piece, and what is left of it, numbered from 1 [H, W]; 0 outside the piece.
+
+    The next object is the candidate with the largest product of its log-odds and its number of pixels.
+    """
+    piece = labels == label
+    things = np.where(piece, 0, labels).astype(np.int32)  # all but the region
+    regions: list[Mask] = [piece]
+    objects: list[Mask] = []
+    left: list[Mask] = []
+    names = set()
+    while regions:
+        region = regions.pop()
+        parts = _parts(features, frame.depth_m > 0, region)
+        count = int(parts.max())
+        known = _Known(frame, np.where((things > 0) & ~region, things + count, parts), recognize)
+        candidates = _candidates(count, _neighbours(parts))
+        known.look_at(candidates)
+        sizes = np.bincount(parts.ravel())
+        best = max(candidates, key=lambda each: known.odds[each] * sizes[list(each)].sum())
+        if known.name[best] is None:
+            left.append(region)
+            continue
+        mask = _mask(parts, best)
+        if surfaces := locate(dataclasses.replace(frame, labels=mask.astype(np.int32))):
+            fitted = _fitted(frame, np.where(mask, 1, np.where(region, 2, 0)).astype(np.int32), surfaces) == 1
+            mask = fitted if fitted.any() else mask
+        names.add(known.name[best])
+        objects.append(mask)
+        things[mask] = things.max() + 1
+        numbers, sizes = components(region & ~mask)
+        regions += [numbers == number for number in np.flatnonzero(sizes >= LEAST_PIXELS)]
+    if len(names) < 2 or sum(mask.sum() for mask in objects) < SHARE * piece.sum():
+        return piece.astype(np.int32)
+    result = np.zeros(piece.shape, np.int32)
+    for number, mask in enumerate([*objects, *left], start=1):
+        result[mask] = number
+    return np.where(piece, result[result > 0].take(nearest_known(result > 0)), 0)
+
+
+def _features(frame: RGBDFrame) -> NDArray[np.float32]:
+    """Return colours and places [H, W, 6], in units of `CELL`."""
     lab = np.asarray(cv2.cvtColor(cv2.medianBlur(frame.color, SMOOTH), cv2.COLOR_RGB2LAB), np.float32)
     points = backproject(frame.depth_m, frame.intrinsics)
-    features = np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
-    parts, piece_of = np.zeros(labels.shape, np.int32), [0]
-    numbers = np.unique(labels)
-    for piece, label in enumerate(numbers[numbers > 0], start=1):
-        mask = labels == label
-        known = mask & (frame.depth_m > 0)
-        count = min(int(known.sum()) // LEAST_PART, MOST_PARTS)
-        numbers_in_piece = np.where(mask, 1, 0).astype(np.int32)
-        if count > 1:
-            cv2.setRNGSeed(0)  # equal frames get equal labels
-            stop = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 20, 1e-3)
-            start = np.zeros((int(known.sum()), 1), np.int32)
-            _, cluster, _ = cv2.kmeans(features[known], count, start, stop, 1, cv2.KMEANS_PP_CENTERS)
-            clusters = np.zeros(labels.shape, np.int32)
-            clusters[known] = np.asarray(cluster).ravel() + 1
-            numbers_in_piece = _connected(clusters, mask, count)
-        parts[mask] = numbers_in_piece[mask] + len(piece_of) - 1
-        piece_of += [piece] * int(numbers_in_piece.max())
-    return parts, np.array(piece_of, np.intp)
+    return np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
+
+
+def _parts(features: NDArray[np.float32], has_depth: Mask, region: Mask) -> NDArray[np.int32]:
+    """Return the part of each pixel [H, W] of a region, numbered from 1; 0 outside the region."""
+    known = region & has_depth
+    count = min(int(known.sum()) // LEAST_PART, MOST_PARTS)
+    if count < 2:
+        return region.astype(np.int32)
+    cv2.setRNGSeed(0)  # equal frames get equal labels
+    stop = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 20, 1e-3)
+    start = np.zeros((int(known.sum()), 1), np.int32)
+    _, cluster, _ = cv2.kmeans(features[known], count, start, stop, 1, cv2.KMEANS_PP_CENTERS)
+    clusters = np.zeros(region.shape, np.int32)
+    clusters[known] = np.asarray(cluster).ravel() + 1
+    return _connected(clusters, region, count)
 
 
 def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[np.int32]:
@@ -238,14 +275,15 @@ def _neighbours(parts: NDArray[np.int32]) -> dict[int, set[int]]:
     return beside
 
 
-def _candidates(piece: Parts, beside: dict[int, set[int]]) -> list[Parts]:
-    """Return the candidates in a piece, the piece itself first."""
-    level = {frozenset([part]) for part in piece}
-    candidates = {piece, *level}
+def _candidates(count: int, beside: dict[int, set[int]]) -> list[Parts]:
+    """Return the candidates in a region of `count` parts, the region itself first."""
+    region = frozenset(range(1, count + 1))
+    level = {frozenset([part]) for part in region}
+    candidates = {region, *level}
     for _ in range(MOST_JOINED - 1):
-        level = {each | {other} for each in level for part in each for other in (beside[part] & piece) - each}
+        level = {each | {other} for each in level for part in each for other in beside[part] - each}
         candidates |= level
-    return [piece, *sorted(candidates - {piece}, key=sorted)]
+    return [region, *sorted(candidates - {region}, key=sorted)]
 
 
 def _mask(parts: NDArray[np.int32], candidate: Parts) -> Mask:
@@ -263,32 +301,6 @@ def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBD
     cx, cy = camera.cx - here[1].start, camera.cy - here[0].start
     moved = dataclasses.replace(camera, cx=cx, cy=cy, width=None, height=None)
     return RGBDFrame(frame.color[here], frame.depth[here], labels, moved)
-
-
-def _best_division(piece: Parts, candidates: Sequence[Parts], known: _Known) -> tuple[Parts, ...]:
-    """Return the division of a piece into candidates with the largest sum of area times log-odds, minus the costs.
-
-    A piece is not divided unless two different known objects result.
-    """
-    area = known.area[piece]
-
-    @functools.cache
-    def best(left: Parts) -> tuple[float, tuple[Parts, ...]]:
-        if not left:
-            return 0.0, ()
-        first, results = min(left), []
-        for candidate in candidates:
-            if first in candidate and candidate <= left:
-                value, others = best(left - candidate)
-                odds = known.odds[candidate]
-                value += known.area[candidate] * odds - area * (COST if odds else COST_OF_UNKNOWN)
-                results.append((value, (candidate, *others)))
-        return max(results, key=lambda result: result[0])
-
-    division = best(piece)[1]
-    named = [each for each in division if known.odds[each]]
-    is_known = len({known.name[each] for each in named}) > 1 and sum(known.area[each] for each in named) >= SHARE * area
-    return division if is_known else (piece,)
 
 
 def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> set[Parts]:

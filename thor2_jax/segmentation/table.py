@@ -32,7 +32,7 @@ LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
 """Smallest and largest area of an object, square metres."""
 
-LARGEST_SHARE = 0.25
+LARGEST_SHARE = 0.4
 """Largest fraction of the image that an object fills."""
 
 LEAST_SUPPORT = 0.3

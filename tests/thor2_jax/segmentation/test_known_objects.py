@@ -1,6 +1,6 @@
 """Pieces that are divided and merged by recognition: toy answers by the overlap with true masks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.known_objects import Answer, Distances, fit_masks, segment_known
+from thor2_jax.segmentation.known_objects import Answer, Distances, Recognize, fit_masks, segment_known
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
 FRAME = render(
@@ -17,8 +17,6 @@ FRAME = render(
 )
 TRUTH = np.asarray(FRAME.labels, np.int32)
 ONE_PIECE = (TRUTH > 0).astype(np.int32)
-
-Recognize = Callable[[Sequence[RGBDFrame]], list[Answer]]
 
 
 def knows(*objects: NDArray[np.bool_]) -> Recognize:
@@ -35,8 +33,13 @@ def knows(*objects: NDArray[np.bool_]) -> Recognize:
     return lambda frames: [answer(frame) for frame in frames]
 
 
+def nowhere(frame: RGBDFrame) -> dict[int, Distances]:
+    """Locate no object."""
+    return {}
+
+
 def test_a_piece_with_two_known_objects_is_divided() -> None:
-    labels = segment_known(FRAME, ONE_PIECE, knows(TRUTH == 1, TRUTH == 2))
+    labels = segment_known(FRAME, ONE_PIECE, knows(TRUTH == 1, TRUTH == 2), nowhere)
     assert labels.max() == 2
     assert (best_overlaps(labels, TRUTH) > 0.9).all()
     np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
@@ -46,31 +49,21 @@ def test_only_pieces_of_one_known_object_are_merged() -> None:
     quantiles = np.quantile(np.nonzero(TRUTH)[1], [0.45, 0.9])
     three = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), quantiles), 0)
     for pieces in (TRUTH, three):
-        np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0)), ONE_PIECE)
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
-
-
-def test_a_piece_is_divided_although_all_of_it_resembles_one_object() -> None:
-    apart = knows(TRUTH == 1, TRUTH == 2)
-
-    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        are_whole = [(frame.label_image == 1).sum() == ONE_PIECE.sum() for frame in frames]
-        return [("0", 0.985) if whole else each for whole, each in zip(are_whole, apart(frames), strict=True)]
-
-    assert (best_overlaps(segment_known(FRAME, ONE_PIECE, recognize), TRUTH) > 0.9).all()
+        np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0), nowhere), ONE_PIECE)
+    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2), nowhere), TRUTH)
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
     unknown: Recognize = lambda frames: [(None, 0.0)] * len(frames)  # noqa: E731
-    assert not segment_known(FRAME, np.zeros_like(TRUTH), unknown).any()
+    assert not segment_known(FRAME, np.zeros_like(TRUTH), unknown, nowhere).any()
     frame = RGBDFrame(FRAME.color, np.zeros_like(FRAME.depth), None, FRAME.intrinsics)
-    np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown), ONE_PIECE)
+    np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown, nowhere), ONE_PIECE)
 
 
 @pytest.mark.parametrize("known", [TRUTH > 0, TRUTH == 1, (None, 0.99), ("a", 0.5), ("a", 0.99)])
 def test_a_piece_with_one_known_object_or_one_answer_remains(known: NDArray[np.bool_] | Answer) -> None:
     recognize = (lambda frames: [known] * len(frames)) if isinstance(known, tuple) else knows(known)
-    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
 
 
 def test_candidates_are_shown_where_they_are() -> None:
@@ -80,10 +73,10 @@ def test_candidates_are_shown_where_they_are() -> None:
         shown.extend(frames)
         return [(None, 0.0)] * len(frames)
 
-    segment_known(FRAME, TRUTH, recognize)
+    segment_known(FRAME, TRUTH, recognize, nowhere)
     points = backproject(FRAME.depth_m, FRAME.intrinsics)[TRUTH == 1]
     whole = [frame for frame in shown if (frame.label_image == 1).sum() == len(points)]
-    assert len(whole) == 1 and (whole[0].label_image > 1).any()
+    assert whole and all((frame.label_image > 1).any() for frame in whole)
     seen = backproject(whole[0].depth_m, whole[0].intrinsics)[whole[0].label_image == 1]
     np.testing.assert_allclose(seen, points, atol=1e-5)
 
@@ -92,6 +85,31 @@ def surface_of(mask: NDArray[np.bool_]) -> Distances:
     """Return the distances from the points of a true mask."""
     tree = KDTree(backproject(FRAME.depth_m, FRAME.intrinsics)[mask & (FRAME.depth_m > 0)])
     return lambda points: np.asarray(tree.query(points)[0])
+
+
+@pytest.mark.parametrize("far", [0.0, 1.0])
+def test_pixels_of_other_surfaces_are_left_for_the_next_object(far: float) -> None:
+    """All of a piece resembles an object at first; a surface without any of its points changes no mask."""
+    masks = TRUTH == 1, TRUTH == 2
+    alike = knows(*masks)
+
+    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
+        are_whole = [(frame.label_image == 1).sum() == ONE_PIECE.sum() for frame in frames]
+        return [("0", 0.985) if whole else each for whole, each in zip(are_whole, alike(frames), strict=True)]
+
+    def locate(frame: RGBDFrame) -> dict[int, Distances]:
+        surfaces = [surface_of(mask) for mask in masks]
+        which = [np.argmax([(mask & (frame.labels == number)).sum() for mask in masks]) for number in frame.instances]
+        return {
+            number: lambda points, surface=surfaces[k]: surface(points) + far
+            for number, k in zip(frame.instances, which, strict=True)
+        }
+
+    labels = segment_known(FRAME, ONE_PIECE, recognize, locate)
+    if far:
+        np.testing.assert_array_equal(labels, ONE_PIECE)
+    else:
+        assert (best_overlaps(labels, TRUTH) > 0.99).all()
 
 
 @pytest.mark.parametrize("known", [(4, 7), (4,)], ids=["both known", "one known"])
