@@ -1,13 +1,13 @@
 """Refinement of a segmentation by recognition, since objects in a pile touch without a visible edge.
 
-labels = segment_known(frame, labels, recognize, locate)  # labels of any segmenter, [H, W]
+labels = segment_known(frame, labels, recognize, locate)  # labels of `segment_table`, [H, W]
 
 Objects are taken from each piece of the segmentation one by one. What is left of the piece is divided into parts of
 similar colour and place. The parts, unions of neighbouring parts and all of it are candidates and are recognized. The
 best one is the next object. If its surface is known, pixels whose points lie on the surface are added to it, and others
-are removed. If only one name was found in a piece, or too little of it is known, the piece remains. Neighbours are then
-merged repeatedly if their union is recognized better than each of them. In the end, pixels go to the object on whose
-surface their points lie.
+are removed. If fewer than two names were found in a piece, or too little of it is known, the piece remains. Neighbours
+are then merged repeatedly if their union is recognized better than each of them. In the end, pixels go to the object on
+whose surface their points lie.
 """
 
 import dataclasses
@@ -85,7 +85,7 @@ def segment_known(
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W], labels of a segmenter.
+        labels: [H, W], labels of `segment_table`.
         recognize: see `Recognize`.
         locate: see `Locate`.
 
@@ -127,7 +127,9 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
         if not surfaces:
             break
         labels = _fitted(frame, labels, surfaces)
-    return renumbered(labels, np.bincount(labels.ravel(), labels.ravel()) > 0)[0]
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return renumbered(labels, sizes > 0)[0]
 
 
 def _fitted(frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, Distances]) -> NDArray[np.int32]:
@@ -187,10 +189,10 @@ def _divided(
 ) -> NDArray[np.int32]:
     """Return the objects of a piece, and what is left of it, numbered from 1 [H, W]; 0 outside the piece.
 
-    The next object is the candidate with the largest product of its log-odds and its number of pixels.
+    The next object is the candidate with the largest product of its log-odds and its number of pixels. If fewer than
+    two names are found, or objects cover less than `SHARE` of the piece, all of it has number 1.
     """
     piece = labels == label
-    things = np.where(piece, 0, labels).astype(np.int32)  # all but the region
     regions: list[Mask] = [piece]
     objects: list[Mask] = []
     left: list[Mask] = []
@@ -199,7 +201,7 @@ def _divided(
         region = regions.pop()
         parts = _parts(features, frame.depth_m > 0, region)
         count = int(parts.max())
-        known = _Known(frame, np.where((things > 0) & ~region, things + count, parts), recognize)
+        known = _Known(frame, np.where((labels > 0) & ~region, labels + count, parts), recognize)
         candidates = _candidates(count, _neighbours(parts))
         known.look_at(candidates)
         sizes = np.bincount(parts.ravel())
@@ -210,13 +212,12 @@ def _divided(
         mask = _mask(parts, best)
         if surfaces := locate(dataclasses.replace(frame, labels=mask.astype(np.int32))):
             fitted = _fitted(frame, np.where(mask, 1, np.where(region, 2, 0)).astype(np.int32), surfaces) == 1
-            mask = fitted if fitted.any() else mask
+            mask = fitted if fitted.sum() >= LEAST_PIXELS else mask
         names.add(known.name[best])
         objects.append(mask)
-        things[mask] = things.max() + 1
         numbers, sizes = components(region & ~mask)
         regions += [numbers == number for number in np.flatnonzero(sizes >= LEAST_PIXELS)]
-    if len(names) < 2 or sum(mask.sum() for mask in objects) < SHARE * piece.sum():
+    if len(names) < 2 or np.any(objects, axis=0).sum() < SHARE * piece.sum():
         return piece.astype(np.int32)
     result = np.zeros(piece.shape, np.int32)
     for number, mask in enumerate([*objects, *left], start=1):

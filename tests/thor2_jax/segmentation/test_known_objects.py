@@ -1,6 +1,6 @@
 """Pieces that are divided and merged by recognition: toy answers by the overlap with true masks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
+from thor2_jax.segmentation import known_objects
 from thor2_jax.segmentation.known_objects import Answer, Distances, Recognize, fit_masks, segment_known
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
@@ -19,18 +20,18 @@ TRUTH = np.asarray(FRAME.labels, np.int32)
 ONE_PIECE = (TRUTH > 0).astype(np.int32)
 
 
-def knows(*objects: NDArray[np.bool_]) -> Recognize:
+def knows(*objects: NDArray[np.bool_], frame: RGBDFrame = FRAME) -> Recognize:
     """Return a recognizer of objects, given their masks, whose confidence is the overlap with the best one."""
 
-    def answer(frame: RGBDFrame) -> Answer:
-        top, left = round(FRAME.intrinsics.cy - frame.intrinsics.cy), round(FRAME.intrinsics.cx - frame.intrinsics.cx)
-        mask = np.zeros(TRUTH.shape, bool)
-        height, width = frame.depth.shape
-        mask[top : top + height, left : left + width] = frame.label_image == 1
+    def answer(shown: RGBDFrame) -> Answer:
+        top, left = round(frame.intrinsics.cy - shown.intrinsics.cy), round(frame.intrinsics.cx - shown.intrinsics.cx)
+        mask = np.zeros(frame.depth.shape, bool)
+        height, width = shown.depth.shape
+        mask[top : top + height, left : left + width] = shown.label_image == 1
         overlaps = [(mask & each).sum() / (mask | each).sum() for each in objects]
         return str(np.argmax(overlaps)), float(max(overlaps))
 
-    return lambda frames: [answer(frame) for frame in frames]
+    return lambda frames: [answer(shown) for shown in frames]
 
 
 def nowhere(frame: RGBDFrame) -> dict[int, Distances]:
@@ -87,9 +88,20 @@ def surface_of(mask: NDArray[np.bool_]) -> Distances:
     return lambda points: np.asarray(tree.query(points)[0])
 
 
-@pytest.mark.parametrize("far", [0.0, 1.0])
-def test_pixels_of_other_surfaces_are_left_for_the_next_object(far: float) -> None:
-    """All of a piece resembles an object at first; a surface without any of its points changes no mask."""
+def located(*masks: NDArray[np.bool_]) -> Callable[[RGBDFrame], dict[int, Distances]]:
+    """Return a function that locates the object with the largest overlap; distances are ten times too large."""
+    surfaces = [surface_of(mask) for mask in masks]
+
+    def locate(frame: RGBDFrame) -> dict[int, Distances]:
+        best = {n: np.argmax([(mask & (frame.labels == n)).sum() for mask in masks]) for n in frame.instances}
+        return {n: lambda points, surface=surfaces[k]: 10 * surface(points) for n, k in best.items()}
+
+    return locate
+
+
+def test_pixels_of_other_surfaces_are_left_for_the_next_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a piece resembles an object at first; without surfaces, the piece remains."""
+    monkeypatch.setattr(known_objects, "ROUNDS", 0)
     masks = TRUTH == 1, TRUTH == 2
     alike = knows(*masks)
 
@@ -97,19 +109,64 @@ def test_pixels_of_other_surfaces_are_left_for_the_next_object(far: float) -> No
         are_whole = [(frame.label_image == 1).sum() == ONE_PIECE.sum() for frame in frames]
         return [("0", 0.985) if whole else each for whole, each in zip(are_whole, alike(frames), strict=True)]
 
+    labels = segment_known(FRAME, ONE_PIECE, recognize, located(*masks))
+    assert labels.max() == 2 and (best_overlaps(labels, TRUTH) > 0.98).all()
+    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
+
+
+def test_an_object_gets_all_pixels_on_its_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the upper half of one object is known."""
+    monkeypatch.setattr(known_objects, "ROUNDS", 0)
+    middle = np.median(np.nonzero(TRUTH == 1)[0])
+    upper = (TRUTH == 1) & (np.arange(480)[:, None] < middle)
+    recognize = knows(upper, TRUTH == 2)
+    labels = segment_known(FRAME, ONE_PIECE, recognize, located(TRUTH == 1, TRUTH == 2))
+    assert labels.max() == 2 and (best_overlaps(labels, TRUTH) > 0.98).all()
+    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+
+
+@pytest.mark.parametrize("seen", [0, 3])
+def test_a_surface_with_few_of_the_points_changes_no_mask(seen: int) -> None:
+    recognized: list[int] = []
+
+    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
+        recognized.append(len(frames))
+        return [("0", 0.985)] * len(frames)
+
     def locate(frame: RGBDFrame) -> dict[int, Distances]:
-        surfaces = [surface_of(mask) for mask in masks]
-        which = [np.argmax([(mask & (frame.labels == number)).sum() for mask in masks]) for number in frame.instances]
-        return {
-            number: lambda points, surface=surfaces[k]: surface(points) + far
-            for number, k in zip(frame.instances, which, strict=True)
-        }
+        return {1: lambda points: np.where(np.arange(len(points)) < seen, 0.0, 1.0)}
 
     labels = segment_known(FRAME, ONE_PIECE, recognize, locate)
-    if far:
-        np.testing.assert_array_equal(labels, ONE_PIECE)
-    else:
-        assert (best_overlaps(labels, TRUTH) > 0.99).all()
+    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    assert len(recognized) < 5
+
+
+@pytest.mark.parametrize(
+    ("widths", "is_small", "found"),
+    [((0.07, 0.07, 0.07), False, 3), ((0.07, 0.07, 0.07), True, 2), ((0.04, 0.04, 0.14), False, 1)],
+)
+def test_what_is_left_is_unknown_unless_it_is_small_or_large(
+    widths: tuple[float, ...], is_small: bool, found: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = np.cumsum([-0.1, *widths])
+    colors = RED, BLUE, (40, 160, 40)
+    boxes = [Box((a + b) / 2, 0, ((b - a) / 2, 0.05), 0.06, c) for a, b, c in zip(ends, ends[1:], colors, strict=False)]
+    frame = render(boxes, tilt=30, size=(480, 640))
+    truth = frame.label_image
+    if is_small:
+        monkeypatch.setattr(known_objects, "LEAST_PIXELS", (truth == 3).sum() * 1.2)
+    recognize = knows(truth == 1, truth == 2, frame=frame)
+    labels = segment_known(frame, (truth > 0).astype(np.int32), recognize, nowhere)
+    assert labels.max() == found
+    assert found < 3 or (best_overlaps(labels, truth) > 0.95).all()
+    np.testing.assert_array_equal(labels > 0, truth > 0)
+
+
+def test_a_piece_with_two_objects_of_one_name_remains() -> None:
+    apart = knows(TRUTH == 1, TRUTH == 2)
+    recognize: Recognize = lambda frames: [("a", confidence) for _, confidence in apart(frames)]  # noqa: E731
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize, nowhere), ONE_PIECE)
 
 
 @pytest.mark.parametrize("known", [(4, 7), (4,)], ids=["both known", "one known"])
