@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, nearest_known, renumbered, window
+from thor2_jax.segmentation.pixels import Mask, components, filled, renumbered, window
 
 __all__ = ["Distances", "fit_masks", "segment_known"]
 
@@ -98,7 +98,6 @@ def segment_known(
         divided = np.where(objects > 0, objects + divided.max(), divided)
     beside, known = _neighbours(divided), _Known(frame, divided, recognize)
     things = {frozenset([number]) for number in range(1, int(divided.max()) + 1)}
-    known.look_at(sorted(things, key=min))
     while merged := _merged(things, beside, known):
         things = merged
     result = np.zeros(labels.shape, np.int32)
@@ -152,8 +151,7 @@ def _fitted(frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, 
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
         numbers, _ = renumbered(numbers, kept, label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
-    is_kept = tidied > 0
-    return np.where(labels > 0, tidied[is_kept].take(nearest_known(is_kept)), 0) if is_kept.any() else labels
+    return filled(tidied, labels > 0) if tidied.any() else labels
 
 
 class _Known:
@@ -199,7 +197,7 @@ def _divided(
     names = set()
     while regions:
         region = regions.pop()
-        parts = _parts(features, frame.depth_m > 0, region)
+        parts = _parts(features, region)
         count = int(parts.max())
         known = _Known(frame, np.where((labels > 0) & ~region, labels + count, parts), recognize)
         candidates = _candidates(count, _neighbours(parts))
@@ -222,7 +220,7 @@ def _divided(
     result = np.zeros(piece.shape, np.int32)
     for number, mask in enumerate([*objects, *left], start=1):
         result[mask] = number
-    return np.where(piece, result[result > 0].take(nearest_known(result > 0)), 0)
+    return filled(result, piece)
 
 
 def _features(frame: RGBDFrame) -> NDArray[np.float32]:
@@ -232,9 +230,9 @@ def _features(frame: RGBDFrame) -> NDArray[np.float32]:
     return np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
 
 
-def _parts(features: NDArray[np.float32], has_depth: Mask, region: Mask) -> NDArray[np.int32]:
+def _parts(features: NDArray[np.float32], region: Mask) -> NDArray[np.int32]:
     """Return the part of each pixel [H, W] of a region, numbered from 1; 0 outside the region."""
-    known = region & has_depth
+    known = region & (features[..., 5] > 0)  # with depth
     count = min(int(known.sum()) // LEAST_PART, MOST_PARTS)
     if count < 2:
         return region.astype(np.int32)
@@ -259,8 +257,7 @@ def _connected(clusters: NDArray[np.int32], mask: Mask, count: int) -> NDArray[n
     kept = large[sizes[large] >= min(LEAST_PART // 4, sizes.max())]
     rank = np.zeros(len(sizes), np.int32)
     rank[kept] = np.arange(1, len(kept) + 1)
-    known = rank[numbers] > 0
-    return np.where(mask, rank[numbers[known]].take(nearest_known(known)), 0)
+    return filled(rank[numbers], mask)
 
 
 def _neighbours(parts: NDArray[np.int32]) -> dict[int, set[int]]:
@@ -308,6 +305,7 @@ def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> s
     """Return objects after neighbours are merged where a known object gains; an empty set if nothing is merged."""
     at = {part: thing for thing in things for part in thing}
     touching = {(at[part], at[other]) for part in at for other in beside[part] if min(at[part]) < min(at[other])}
+    known.look_at(sorted({thing for pair in touching for thing in pair}, key=min))
     pairs = sorted(
         ((a, b) for a, b in touching if len({known.name[a], known.name[b]} - {None}) < 2),
         key=lambda pair: [min(each) for each in pair],

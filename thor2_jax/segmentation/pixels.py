@@ -8,6 +8,7 @@ __all__ = [
     "Mask",
     "close",
     "components",
+    "filled",
     "grow",
     "label_borders",
     "nearest_known",
@@ -82,6 +83,12 @@ def nearest_known(known: Mask) -> NDArray[np.int32]:
     unknown = _bytes(~known)
     _, numbers = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     return np.asarray(numbers, np.int32) - 1  # OpenCV numbers the pixels of the mask from 1 on, row by row
+
+
+def filled(labels: NDArray[np.int32], mask: Mask) -> NDArray[np.int32]:
+    """Return labels in a mask, in which 0 is replaced by the nearest label, and 0 outside; a label must be given."""
+    is_known = labels > 0
+    return np.where(mask, labels[is_known].take(nearest_known(is_known)), 0)
 
 
 def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
