@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation.pixels import Mask, components, filled, renumbered, window
+from thor2_jax.segmentation.pixels import Mask, components, filled, grow, renumbered, window
 
 __all__ = ["Distances", "fit_masks", "segment_known"]
 
@@ -109,9 +109,9 @@ def segment_known(
 def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> NDArray[np.int32]:
     """Return labels that fit the surfaces of known objects.
 
-    A pixel goes to the known object whose surface is nearest to its point, if that is within `ON_SURFACE`. What is
-    farther than `OFF_SURFACE` from the surface of its known object becomes a piece of its own. Otherwise, pieces of
-    unknown objects do not change.
+    A pixel of an object, or beside one, goes to the known object whose surface is nearest to its point, if that is
+    within `ON_SURFACE`. What is farther than `OFF_SURFACE` from the surface of its known object becomes a piece of its
+    own. Otherwise, pieces of unknown objects do not change.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
@@ -119,21 +119,24 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
         locate: see `Locate`.
 
     Returns:
-        Labels [H, W]: 0 is background as before, and the objects are numbered from 1.
+        Labels [H, W]: 0 is background, and the objects are numbered from 1.
     """
+    region = grow(labels > 0, 3)
     for _ in range(ROUNDS):
         surfaces = locate(dataclasses.replace(frame, labels=labels))
         if not surfaces:
             break
-        labels = _fitted(frame, labels, surfaces)
+        labels = _fitted(frame, labels, surfaces, region)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return renumbered(labels, sizes > 0)[0]
 
 
-def _fitted(frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, Distances]) -> NDArray[np.int32]:
-    """Return labels after one round of `fit_masks`; new pieces have new numbers, and others keep theirs."""
-    known, at = np.array(list(surfaces)), (labels > 0) & (frame.depth_m > 0)
+def _fitted(
+    frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, Distances], region: Mask
+) -> NDArray[np.int32]:
+    """Return labels after one round of `fit_masks` inside a region; new pieces have new numbers, others keep theirs."""
+    known, at = np.array(list(surfaces)), region & (frame.depth_m > 0)
     points = frame.points(np.flatnonzero(at))
     distance = np.stack([distances(points) for distances in surfaces.values()])  # [known, n]
     is_own = known[:, None] == labels[at]
@@ -151,7 +154,7 @@ def _fitted(frame: RGBDFrame, labels: NDArray[np.int32], surfaces: Mapping[int, 
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
         numbers, _ = renumbered(numbers, kept, label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
-    return filled(tidied, labels > 0) if tidied.any() else labels
+    return filled(tidied, (labels > 0) | (tidied > 0)) if tidied.any() else labels
 
 
 class _Known:
@@ -209,7 +212,7 @@ def _divided(
             continue
         mask = _mask(parts, best)
         if surfaces := locate(dataclasses.replace(frame, labels=mask.astype(np.int32))):
-            fitted = _fitted(frame, np.where(mask, 1, np.where(region, 2, 0)).astype(np.int32), surfaces) == 1
+            fitted = _fitted(frame, np.where(mask, 1, np.where(region, 2, 0)).astype(np.int32), surfaces, region) == 1
             mask = fitted if fitted.sum() >= LEAST_PIXELS else mask
         names.add(known.name[best])
         objects.append(mask)

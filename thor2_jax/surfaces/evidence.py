@@ -11,7 +11,7 @@ and all shapes are static.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -50,6 +50,10 @@ in free space."""
 
 REACH = 0.012
 """Largest distance of a match in scores and values, metres."""
+
+NEAR, SCALE, POLISHING = 0.008, 0.002, 8
+"""NEAR: distance, metres, beyond which points do not count in the last steps of a refinement. SCALE: point-to-plane
+distance, metres, at which points have half of the weight in `fit_poses`. POLISHING: number of its further steps."""
 
 N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
@@ -95,8 +99,26 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
 
 
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
-    """Return the poses [B, 3, 4] of `evidence`: a rotation and a shift from the camera to the class, metres."""
-    return fit_rows(surfaces, sample_points(clouds), jnp.asarray(class_index))[1]
+    """Return poses [B, 3, 4]: a rotation and a shift from the camera to the class, metres.
+
+    They are those of `evidence`, refined with all points by iteratively reweighted least squares.
+    """
+    index = jnp.asarray(class_index)
+    return _polished(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
+
+
+@jax.jit
+def _polished(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array, poses: jax.Array) -> jax.Array:
+    def polish(row: tuple[jax.Array, ...]) -> jax.Array:
+        points, mask, camera, index, pose = row
+        surface, places = jax.tree.map(lambda field: field[index], surfaces), _homogeneous(points - camera)
+
+        def weigh(distance: jax.Array, residual: jax.Array) -> jax.Array:
+            return mask * (distance < NEAR) / (1 + jnp.square(residual / SCALE))
+
+        return jax.lax.fori_loop(0, POLISHING, lambda _, pose: _refined(surface, pose, places, weigh), pose[None])[0]
+
+    return jax.lax.map(polish, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
 
 
 @jax.jit
@@ -244,20 +266,11 @@ def _describe_neighbourhoods(
 
 def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     """Return the evidence [4] and the pose [3, 4] of one instance for one class."""
-    points, lab = jnp.concatenate([sample.points, jnp.ones_like(sample.points[:, :1])], axis=1).T, sample.lab
-
-    def look_up(q: jax.Array, rows: Sequence[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return offsets [K, 3, n] and distances [K, n] of points [K, 3, n], and rows of the table."""
-        at = ((q - surface.grid[0, :, None]) / surface.grid[1, :, None]).clip(0, GRID - 1).astype(int)
-        nearest = jnp.take(surface.nearest, (at[:, 0] * GRID + at[:, 1]) * GRID + at[:, 2], mode="clip").astype(int)
-        # XLA gathers single numbers on CPUs ten times as fast as rows.
-        entries = jnp.stack([jnp.take(surface.table[k], nearest, mode="clip") for k in (0, 1, 2, *rows)], axis=1)
-        offset = q - entries[:, :3]
-        return offset, jnp.linalg.norm(offset, axis=1), entries[:, 3:]
+    points, lab = _homogeneous(sample.points), sample.lab
 
     def energy(pose: jax.Array, n: int) -> jax.Array:
         """Return the energies [K] of poses from distances and colours; a shift of all colours is tolerated."""
-        _, distance, color = look_up(matmul(pose, points[:, :n]), (3, 4, 5))
+        _, distance, color = _look_up(surface, matmul(pose, points[:, :n]), (3, 4, 5))
         matched = distance < REACH
         differ = lab[:, :n] - color
         total = matmul(differ, matched[..., None].astype(jnp.float32))[..., 0]
@@ -268,17 +281,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
         return (jnp.minimum(distance / REACH, 1) + 0.6 * jnp.where(matched, cost, 1)).mean(axis=1)
 
     def refine(step: jax.Array, pose: jax.Array, n: int) -> jax.Array:
-        q = matmul(pose, points[:, :n])
-        offset, distance, normal = look_up(q, (6, 7, 8))
-        residual = (offset * normal).sum(axis=1, keepdims=True)
-        rows = jnp.concatenate([jnp.cross(q, normal, axis=1), normal, -residual], axis=1)
-        weight = (distance < jnp.maximum(FAR - 0.002 * step, 0.008))[:, None].astype(jnp.float32)
-        system = matmul(rows[:, :6] * weight, rows.mT) + 1e-3 * np.eye(6, 7, dtype=np.float32)
-        for k in range(6):  # Gauss-Jordan elimination; the matrix is positive definite
-            row = system[:, k] / system[:, k, k, None]
-            system = (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
-        turn = _rotation(system[:, :3, 6])
-        return matmul(turn, pose).at[..., 3].add(system[:, 3:, 6])
+        limit = jnp.maximum(FAR - 0.002 * step, NEAR)
+        return _refined(surface, pose, points[:, :n], lambda distance, _: (distance < limit).astype(jnp.float32))
 
     def in_free_space(pose: jax.Array) -> jax.Array:
         """Return the fraction [K] of the surface that poses place in front of what the camera sees."""
@@ -298,7 +302,7 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
         done += steps
     free = in_free_space(pose)
     best = (energy(pose, SAMPLED) + FREE_COST * free).argmin()
-    offset, distance, entries = (each[0] for each in look_up(matmul(pose[best, None], points), range(3, 9)))
+    offset, distance, entries = (each[0] for each in _look_up(surface, matmul(pose[best, None], points), range(3, 9)))
     matched = distance < REACH
     plane = jnp.where(matched, jnp.abs((offset * entries[3:]).sum(axis=0)), REACH)
     counted = matched | ~sample.rim  # masks may be too large
@@ -306,6 +310,45 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     chroma, lightness = (_correlation(lab[k], entries[k], matched) for k in (np.s_[1:3], np.s_[:1]))
     fit = jnp.log((plane + 3e-4) / (sample.rough + 3e-4))
     return jnp.stack([fit, chroma, lightness, free[best]]), pose[best]
+
+
+def _homogeneous(points: jax.Array) -> jax.Array:
+    """Return points [n, 3] as columns [4, n] that poses can be multiplied with."""
+    return jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1).T
+
+
+def _look_up(surface: Surfaces, q: jax.Array, rows: Sequence[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return offsets [K, 3, n] and distances [K, n] of points [K, 3, n], and rows of the table."""
+    at = ((q - surface.grid[0, :, None]) / surface.grid[1, :, None]).clip(0, GRID - 1).astype(int)
+    nearest = jnp.take(surface.nearest, (at[:, 0] * GRID + at[:, 1]) * GRID + at[:, 2], mode="clip").astype(int)
+    # XLA gathers single numbers on CPUs ten times as fast as rows.
+    entries = jnp.stack([jnp.take(surface.table[k], nearest, mode="clip") for k in (0, 1, 2, *rows)], axis=1)
+    offset = q - entries[:, :3]
+    return offset, jnp.linalg.norm(offset, axis=1), entries[:, 3:]
+
+
+def _refined(
+    surface: Surfaces, pose: jax.Array, points: jax.Array, weigh: Callable[[jax.Array, jax.Array], jax.Array]
+) -> jax.Array:
+    """Return poses [K, 3, 4] after one step of the point-to-plane ICP algorithm.
+
+    Args:
+        surface: surface of one class.
+        pose: [K, 3, 4], poses before the step.
+        points: [4, n], see `_homogeneous`.
+        weigh: function from the distances and the point-to-plane distances [K, n] of the points to their weights.
+    """
+    q = matmul(pose, points)
+    offset, distance, normal = _look_up(surface, q, (6, 7, 8))
+    residual = (offset * normal).sum(axis=1, keepdims=True)
+    rows = jnp.concatenate([jnp.cross(q, normal, axis=1), normal, -residual], axis=1)
+    weight = weigh(distance, residual[:, 0])[:, None]
+    system = matmul(rows[:, :6] * weight, rows.mT) + 1e-3 * np.eye(6, 7, dtype=np.float32)
+    for k in range(6):  # Gauss-Jordan elimination; the matrix is positive definite
+        row = system[:, k] / system[:, k, k, None]
+        system = (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
+    turn = _rotation(system[:, :3, 6])
+    return matmul(turn, pose).at[..., 3].add(system[:, 3:, 6])
 
 
 def _candidates(boxes: jax.Array, points: jax.Array) -> jax.Array:

@@ -11,6 +11,7 @@ from segmentation_scenes import Box, best_overlaps, render
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from thor2_jax.segmentation import known_objects
 from thor2_jax.segmentation.known_objects import Answer, Distances, Recognize, fit_masks, segment_known
+from thor2_jax.segmentation.pixels import grow, shrink
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
 FRAME = render(
@@ -138,7 +139,7 @@ def test_a_surface_with_few_of_the_points_changes_no_mask(seen: int) -> None:
         return {1: lambda points: np.where(np.arange(len(points)) < seen, 0.0, 1.0)}
 
     labels = segment_known(FRAME, ONE_PIECE, recognize, locate)
-    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+    assert ((labels > 0) != (ONE_PIECE > 0)).sum() <= seen
     assert len(recognized) < 5
 
 
@@ -171,9 +172,9 @@ def test_a_piece_with_two_objects_of_one_name_remains() -> None:
 
 @pytest.mark.parametrize("known", [(4, 7), (4,)], ids=["both known", "one known"])
 def test_pixels_go_to_the_object_on_whose_surface_they_lie(known: tuple[int, ...]) -> None:
-    """What lies on no known surface becomes a piece."""
+    """Also the nearest pixels of the background; what lies on no known surface becomes a piece."""
     border = np.quantile(np.nonzero(TRUTH == 2)[1], 0.6)
-    shifted = np.where(TRUTH > 0, np.where(np.arange(640) < border, 4, 7), 0).astype(np.int32)
+    shifted = np.where(shrink(TRUTH > 0, 3), np.where(np.arange(640) < border, 4, 7), 0).astype(np.int32)
     surfaces = {4: surface_of(TRUTH == 1), 7: surface_of(TRUTH == 2)}
     shown: list[NDArray[np.integer]] = []
 
@@ -183,9 +184,9 @@ def test_pixels_go_to_the_object_on_whose_surface_they_lie(known: tuple[int, ...
 
     labels = fit_masks(FRAME, shifted, locate)
     np.testing.assert_array_equal(shown[0], shifted)
-    np.testing.assert_array_equal(labels > 0, TRUTH > 0)
-    assert len(shown) == 2
+    assert not labels[TRUTH == 0].any() and len(shown) == 2
     if len(known) == 2:
+        np.testing.assert_array_equal(labels > 0, TRUTH > 0)
         assert (best_overlaps(labels, TRUTH) > 0.99).all()
     else:
         far = surfaces[4](backproject(FRAME.depth_m, FRAME.intrinsics)[labels == 1]) > 0.015
@@ -246,4 +247,5 @@ def test_points_stay_on_the_nearest_of_two_near_surfaces() -> None:
         return np.full(len(points), 0.004)
 
     fitted = fit_masks(frame, TRUTH, lambda frame: {1: distances, 2: distances})
-    assert (fitted != TRUTH).sum() < 20
+    assert (fitted == TRUTH)[TRUTH > 0].mean() > 0.97
+    np.testing.assert_array_equal(fitted > 0, grow(TRUTH > 0, 3))

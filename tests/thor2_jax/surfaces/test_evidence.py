@@ -116,6 +116,21 @@ def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) 
         assert np.isinf(surfaces.distances(index, pose, xyz + 1)).all()
 
 
+def test_points_off_the_surface_hardly_change_a_pose(surfaces: Surfaces, views: list[Cloud]) -> None:
+    """The poses of the search are moved by half a millimetre and more."""
+    near = []
+    for xyz, rgb in views:
+        is_off = np.random.default_rng(0).random((len(xyz), 1)) < 0.3
+        near.append(((xyz - is_off * 0.006 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True)).astype(np.float32), rgb))
+    clouds = PointClouds.pack(near)
+    refined, searched = fit_poses(surfaces, clouds, OWN), fit_rows(surfaces, sample_points(clouds), OWN)[1]
+    after, before = (
+        [np.median(surfaces.distances(OWN[k], np.asarray(poses[k]), xyz)) for k, (xyz, _) in enumerate(views)]
+        for poses in (refined, searched)
+    )
+    assert max(after) < 0.0009 < np.median(before), (after, before)
+
+
 def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> None:
     """Cloud and camera are moved together; the search is not continuous."""
     position = np.array([0.3, -2, 5], np.float32)
