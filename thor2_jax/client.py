@@ -36,6 +36,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.printable import check_name
 from thor2_jax.service.hosts import check_token
 from thor2_jax.types import Descriptors, check_cloud
 
@@ -254,12 +255,12 @@ class Client(_Connection):
             The object, with the generation of the gallery.
 
         Raises:
-            InputError: as `recognize`.
+            InputError: as `recognize`, or the name is invalid, for example None of an unknown object.
             ServiceError: as `describe`; status 409 if the name exists and neither `extend` nor `replace` is given.
             OSError: as `recognize`.
         """
         files = _frame_files(color, depth, labels, intrinsics)
-        fields = {"name": name, "instance": instance, "extend": extend, "replace": replace}
+        fields = {"name": check_name(name), "instance": instance, "extend": extend, "replace": replace}
         files |= {field: str(value).encode() for field, value in fields.items()}
         return self._send("POST", "/v1/objects", lambda response: _known(response.json(), EnrolledObject), files=files)
 

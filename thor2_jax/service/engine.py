@@ -216,9 +216,8 @@ class InferenceEngine:
         oriented = describe_aligned_looks(aligned, cloud_strips, network, config, config.looks)
         inference = infer(self.model, oriented, clouds, embeds=self._embeds)
         first = slice(None, None, config.looks)
-        images, embeddings = oriented.first.images, oriented.first.embeddings
-        computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
-        batch = CloudResult(*jax.tree.map(np.asarray, computed))
+        described = oriented.first.images, oriented.first.embeddings, aligned.points[first], cloud_strips.color[first]
+        batch = CloudResult(*jax.tree.map(np.asarray, (*described, inference)))
         if not instances and batch.inference.samples is not None:  # a mesh may be enrolled later
             compile_comparison(batch.inference.samples)
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]

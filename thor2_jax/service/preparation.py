@@ -10,6 +10,7 @@ import functools
 import multiprocessing
 import queue
 import signal
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -208,20 +209,26 @@ class PreparationPool:
         return self._threads.submit(self._call, deadline, function, arguments)
 
     def _call(self, deadline: float, function: Prepare, arguments: Sequence[Any]) -> PreparedRequest:
-        process = self._idle.get()
+        process, answer = self._idle.get(), None
         try:
             if not process.process.is_alive():
                 process.restart()
-            process.pipe.send((function, arguments))
-            if not process.pipe.poll(max(deadline - time.monotonic(), MIN_SECONDS)):
+            limit = max(deadline, time.monotonic() + MIN_SECONDS)
+            # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
+            timer = threading.Timer(limit - time.monotonic(), process.process.kill)
+            timer.start()
+            with contextlib.suppress(EOFError, OSError):  # The process has ended.
+                process.pipe.send((function, arguments))
+                answer = process.pipe.recv()
+            timer.cancel()
+            is_late = time.monotonic() >= limit
+            if is_late or answer is None:
                 process.restart()
-                raise RequestError(504)
-            result, error = process.pipe.recv()
-        except (EOFError, OSError):
-            process.restart()
-            raise RequestError(422, "body", "The body made the process that decoded it crash.") from None
+                crash = RequestError(422, "body", "The body made the process that decoded it crash.")
+                raise RequestError(504) if is_late else crash
         finally:
             self._idle.put(process)
+        result, error = answer
         if error is not None:
             raise error
         return result

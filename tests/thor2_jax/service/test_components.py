@@ -4,6 +4,7 @@ import asyncio
 import math
 import os
 import queue
+import signal
 import tempfile
 import threading
 import time
@@ -70,6 +71,10 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
         assert error.value.status == status
         with pytest.raises(ProcessLookupError):
             os.kill(replaced, 0)
+    os.kill(pool.submit(FAR, os.getpid).result(HANG), signal.SIGSTOP)
+    with pytest.raises(RequestError) as error:  # It does not receive an argument that fills the pipe.
+        pool.submit(time.monotonic(), len, bytes(10**7)).result(HANG)
+    assert error.value.status == 504
     idle = pool._idle.get()
     idle.process.kill()
     idle.process.join()

@@ -29,6 +29,7 @@ from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
+from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.gallery import store
 from thor2_jax.service import pipeline
@@ -312,6 +313,8 @@ def test_the_client_teaches(http: httpx.Client, files: Files) -> None:
     generation = client.forget("client/tall ü")
     assert client.undo(generation) == generation + 1
     client.forget("client/tall ü")
+    with pytest.raises(InputError, match="name is None"):
+        client.enroll(None, **files, instance=7)  # type: ignore[arg-type]
     with pytest.raises(ServiceError) as missing:
         client.forget("client/tall ü")
     assert (missing.value.status, missing.value.field) == (404, "name")

@@ -260,6 +260,7 @@ def test_page_asks_for_the_token(open_page: Open) -> None:
     field.fill("secret")
     page.get_by_role("button", name="Use token").click()
     expect(field).to_be_hidden()
+    expect(page.locator("#model-title")).to_be_focused()
     choose_sample(page)
 
 

@@ -275,6 +275,7 @@ byId("token-form").addEventListener("submit", async (event) => {
   service.useToken(byId("token").value.trim());
   try {
     loaded = await load();
+    byId("model-title").focus(); // The field, which had the focus, is hidden now.
     setStatus("The token was accepted. Choose a frame.");
   } catch (problem) {
     showProblem(problem);

@@ -39,7 +39,7 @@ function showNotice(text, generation = null) {
  * Connect the form and the notice.
  *
  * `shownFiles()` returns the files of the shown frame, `changed(files)` is called after each change with the files of
- * the frame in which an object was named or a name was undone, and `failed(problem)` with a problem without a field.
+ * the frame in which an object was named or a name was undone, and `failed(problem)` with any other problem.
  */
 export function connectNaming(shownFiles, changed, failed) {
   let files = null;
@@ -49,6 +49,8 @@ export function connectNaming(shownFiles, changed, failed) {
     setBusy(true);
     try {
       await action();
+    } catch (problem) {
+      failed(problem);
     } finally {
       setBusy(false);
     }
@@ -65,7 +67,7 @@ export function connectNaming(shownFiles, changed, failed) {
       try {
         answer = await service.enroll(files, shown.label, name);
       } catch (problem) {
-        if (problem.status === 401 || !(problem instanceof service.Problem)) return failed(problem);
+        if (problem.status === 401 || !(problem instanceof service.Problem)) throw problem;
         markName(problem.message);
         return byId("name").focus();
       }
@@ -83,8 +85,8 @@ export function connectNaming(shownFiles, changed, failed) {
         await service.undo(byId("undo").dataset.generation);
       } catch (problem) {
         // Only the last change can be undone.
-        if (problem.status === 409) return showNotice("Another change was made since, so this one stays.");
-        return failed(problem);
+        if (problem.status !== 409) throw problem;
+        return showNotice("Another change was made since, so this one stays.");
       }
       showNotice(`The name “${byId("notice").dataset.name}” is taken back.`);
       await changed(files);
