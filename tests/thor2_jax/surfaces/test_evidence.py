@@ -116,17 +116,22 @@ def test_distances_from_a_posed_surface(surfaces: Surfaces, views: list[Cloud]) 
         assert np.isinf(surfaces.distances(index, pose, xyz + 1)).all()
 
 
-def test_points_off_the_surface_hardly_change_a_pose(surfaces: Surfaces, views: list[Cloud]) -> None:
-    """The poses of the search are moved by half a millimetre and more."""
-    near = []
+@pytest.mark.parametrize(("is_beside", "share"), [(False, 0.3), (True, 0.5)])
+def test_points_off_the_surface_hardly_change_a_pose(
+    is_beside: bool, share: float, surfaces: Surfaces, views: list[Cloud]
+) -> None:
+    """Depth of some points is wrong, or another object lies beside; the poses of the search are worse."""
+    clouds = []
     for xyz, rgb in views:
-        is_off = np.random.default_rng(0).random((len(xyz), 1)) < 0.3
-        near.append(((xyz - is_off * 0.006 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True)).astype(np.float32), rgb))
-    clouds = PointClouds.pack(near)
-    refined, searched = fit_poses(surfaces, clouds, OWN), fit_rows(surfaces, sample_points(clouds), OWN)[1]
+        is_off = np.random.default_rng(0).random(len(xyz)) < share
+        off = xyz[is_off] + [0, 0.03, 0.01] if is_beside else xyz[is_off] * (1 - 0.006 / xyz[is_off, 2:])
+        kept = np.full(len(xyz), True) if is_beside else ~is_off
+        points = np.concatenate([xyz[kept], off]).astype(np.float32)
+        clouds.append((points, np.concatenate([rgb[kept], rgb[is_off]])))
+    packed = PointClouds.pack(clouds)
     after, before = (
         [np.median(surfaces.distances(OWN[k], np.asarray(poses[k]), xyz)) for k, (xyz, _) in enumerate(views)]
-        for poses in (refined, searched)
+        for poses in (fit_poses(surfaces, packed, OWN), fit_rows(surfaces, sample_points(packed), OWN)[1])
     )
     assert max(after) < 0.0009 < np.median(before), (after, before)
 
@@ -139,6 +144,10 @@ def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> N
     np.testing.assert_allclose(sample_points(moved).points, sample_points(still).points, atol=1e-5)
     before, after = (np.asarray(evidence(surfaces, each, OWN)) for each in (still, moved))
     assert np.abs(after - before).max() < 0.3
+    origin = views[0][0][0] * np.float32(0.99)  # near the surface, where padding lies then
+    clouds = PointClouds.pack([(xyz - origin, rgb) for xyz, rgb in views], 8192, camera=np.tile(-origin, (9, 1)))
+    poses = np.asarray(fit_poses(surfaces, clouds, OWN))
+    assert max(np.median(surfaces.distances(OWN[k], poses[k], xyz)) for k, (xyz, _) in enumerate(views)) < 0.0007
 
 
 def test_rows_do_not_depend_on_padding_and_other_rows(surfaces: Surfaces, views: list[Cloud]) -> None:
