@@ -124,16 +124,16 @@ def test_points_off_the_surface_hardly_change_a_pose(
     clouds = []
     for xyz, rgb in views:
         is_off = np.random.default_rng(0).random(len(xyz)) < share
-        off = xyz[is_off] + [0, 0.03, 0.01] if is_beside else xyz[is_off] * (1 - 0.006 / xyz[is_off, 2:])
+        off = xyz[is_off] + [0.015, 0.03, 0] if is_beside else xyz[is_off] * (1 - 0.006 / xyz[is_off, 2:])
         kept = np.full(len(xyz), True) if is_beside else ~is_off
-        points = np.concatenate([xyz[kept], off]).astype(np.float32)
+        points = np.concatenate([xyz[kept], off]).astype(np.float32) + 1
         clouds.append((points, np.concatenate([rgb[kept], rgb[is_off]])))
-    packed = PointClouds.pack(clouds)
+    packed = PointClouds.pack(clouds, camera=np.ones((9, 3), np.float32))
     after, before = (
         [np.median(surfaces.distances(OWN[k], np.asarray(poses[k]), xyz)) for k, (xyz, _) in enumerate(views)]
         for poses in (fit_poses(surfaces, packed, OWN), fit_rows(surfaces, sample_points(packed), OWN)[1])
     )
-    assert max(after) < 0.0009 < np.median(before), (after, before)
+    assert max(after) < 0.0008 < np.median(before), (after, before)
 
 
 def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> None:
