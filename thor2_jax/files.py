@@ -35,6 +35,7 @@ __all__ = [
     "check_output_file",
     "check_writable",
     "content_digest",
+    "creating",
     "errors_name",
     "file_digest",
     "has_json",
@@ -132,6 +133,20 @@ def check_writable(directory: Path) -> None:
 
 
 @contextlib.contextmanager
+def creating(path: Path) -> Iterator[None]:
+    """Create a directory and its parents if they are missing; after an error, remove those of them that are empty."""
+    created = [each for each in (path, *path.parents) if not each.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for each in created:
+            with contextlib.suppress(OSError):
+                each.rmdir()
+        raise
+
+
+@contextlib.contextmanager
 def atomic_directory(path: str | Path) -> Iterator[Path]:
     """Yield a temporary directory that takes the place of `path` if the block ends without an error.
 
@@ -142,29 +157,21 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
         path: the directory; its parents are created.
     """
     path = Path(path).resolve()
-    created = [parent for parent in path.parents if not parent.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with temporary_directory(path.parent) as temporary:
-            unfinished = temporary / path.name
-            unfinished.mkdir(0o755)
-            yield unfinished
-            with errors_name(path):
-                try:
-                    unfinished.rename(path)
-                except OSError as error:
-                    if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                        raise
-                    files = sorted(unfinished.iterdir())
-                    for file in files:
-                        check_replaceable(path / file.name)
-                    for file in files:
-                        file.replace(path / file.name)
-    except BaseException:
-        for parent in created:
-            with contextlib.suppress(OSError):
-                parent.rmdir()
-        raise
+    with creating(path.parent), temporary_directory(path.parent) as temporary:
+        unfinished = temporary / path.name
+        unfinished.mkdir(0o755)
+        yield unfinished
+        with errors_name(path):
+            try:
+                unfinished.rename(path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                files = sorted(unfinished.iterdir())
+                for file in files:
+                    check_replaceable(path / file.name)
+                for file in files:
+                    file.replace(path / file.name)
 
 
 def remove_written(directory: Path, *patterns: str) -> None:

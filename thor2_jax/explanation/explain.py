@@ -285,8 +285,10 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
 def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
     """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
     samples = sample_points(packed(instance))
+    unused = model.run.surfaces if model.answers_by() == "gallery" else None
     known = ((name, surface) for name in names if (surface := model.surface_of(name)) is not None)
-    for name, (surfaces, index) in itertools.islice(known, OBJECTS):
+    compared = ((name, surface) for name, surface in known if surface[0] is not unused)
+    for name, (surfaces, index) in itertools.islice(compared, OBJECTS):
         (values,), (pose,) = map(np.asarray, fit_rows(surfaces, samples, jnp.array([index])))
         fit, chroma, lightness, free = values.tolist()
         of_points = surfaces.distances(index, pose, instance.points)

@@ -4,13 +4,13 @@ The user's cache directory may be deleted at any time. The environment variable 
 `off` disables the cache.
 """
 
+import contextlib
 import itertools
 import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import content_digest, pack_arrays, read_file, unpack_arrays, write_bytes, write_text
+from thor2_jax.files import content_digest, creating, pack_arrays, read_file, unpack_arrays, write_bytes, write_text
 
 __all__ = [
     "MANIFEST",
@@ -188,22 +188,33 @@ def _shown(value: Any) -> str:
 LOCK = ".lock"
 
 
-def locked(directory: Path) -> AbstractContextManager[object]:
-    """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Hold an exclusive lock on an output directory, which is created if it is missing.
 
-    The operating system releases the lock when the process ends, even if it is killed. The lock file is kept.
+    The operating system releases the lock when the process ends, even if it is killed. The lock file is kept, except
+    after an error in a new directory without other files, which is removed.
 
     Raises:
         InputError: another process holds the lock.
         OSError: the directory cannot be written, or its file system does not support locks.
     """
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
-    try:
-        return filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
-    except filelock.Timeout:
-        raise InputError(
-            f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
-        ) from None
+    is_new = not directory.exists()
+    with creating(directory):
+        try:
+            lock = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
+        except filelock.Timeout:
+            raise InputError(
+                f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
+            ) from None
+        with lock:
+            try:
+                yield
+            except BaseException:
+                if is_new and os.listdir(directory) == [LOCK]:
+                    (directory / LOCK).unlink()
+                raise
 
 
 MANIFEST = "manifest.json"
