@@ -285,7 +285,8 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
 def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
     """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
     samples = sample_points(packed(instance))
-    known = ((name, surface) for name in names if (surface := model.surface_of(name)) is not None)
+    unused = model.run.surfaces if model.answers_by() == "gallery" else None
+    known = ((name, found) for name in names if (found := model.surface_of(name)) and found[0] is not unused)
     for name, (surfaces, index) in itertools.islice(known, OBJECTS):
         (values,), (pose,) = map(np.asarray, fit_rows(surfaces, samples, jnp.array([index])))
         fit, chroma, lightness, free = values.tolist()

@@ -85,7 +85,7 @@ def segment_known(
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W], labels of `segment_table`.
+        labels: [H, W], labels of `segment_table`; any integers, 0 is background.
         recognize: see `Recognize`.
         locate: see `Locate`.
 
@@ -93,7 +93,9 @@ def segment_known(
         Labels [H, W]: 0 is background, and the objects are numbered from 1.
     """
     divided, features = np.zeros(labels.shape, np.int32), _features(frame)
-    for label in np.unique(labels[labels > 0]):
+    values = np.unique(labels[labels > 0])  # renumbered from 1, so that numbers of parts can be added to any label
+    labels = np.where(labels > 0, np.searchsorted(values, labels) + 1, 0).astype(np.int32)
+    for label in range(1, len(values) + 1):
         objects = _divided(frame, features, labels, label, recognize, locate)
         divided = np.where(objects > 0, objects + divided.max(), divided)
     beside, known = _neighbours(divided), _Known(frame, divided, recognize)
@@ -111,7 +113,7 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
 
     A pixel of an object, or beside one, goes to the known object whose surface is nearest to its point, if that is
     within `ON_SURFACE`. What is farther than `OFF_SURFACE` from the surface of its known object becomes a piece of its
-    own. Otherwise, pieces of unknown objects do not change.
+    own, and a known object without any other pixel keeps its mask. Pieces of unknown objects do not change otherwise.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
@@ -154,7 +156,9 @@ def _fitted(
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
         numbers, _ = renumbered(numbers, kept, label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
-    return filled(tidied, (labels > 0) | (tidied > 0)) if tidied.any() else labels
+    lost = np.setdiff1d(known, labels[tidied > 0])  # all points leave, and are too few for a piece
+    tidied = np.where(np.isin(labels, lost), labels, tidied)
+    return filled(tidied, (labels > 0) | (tidied > 0))
 
 
 class _Known:

@@ -318,6 +318,9 @@ def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Expla
         of_own = evidence(surfaces, pack_instances([instance], 1), jnp.array([CLASSES.index(own)]))[0]
         values = np.log(first.distance), first.chroma, first.lightness, first.free_space
         np.testing.assert_allclose(values, of_own, atol=1e-5)
+    recognizer.enroll(own, [(FRAME, 3)], extend=True)  # only its views answer
+    by_gallery = dataclasses.replace(recognizer.model, answer_by="gallery")
+    assert not list(surface_fits(by_gallery, instance, names))
     compared = dataclasses.replace(explanation, instance=instance, surfaces=tuple(fits))
     assert compared.as_json()["surfaces"][0] == {
         "name": own, "distance": first.distance, "chroma": first.chroma, "lightness": first.lightness, "free_space": 0.0

@@ -52,7 +52,9 @@ def test_only_pieces_of_one_known_object_are_merged() -> None:
     three = np.where(TRUTH > 0, 1 + np.digitize(np.arange(640), quantiles), 0)
     for pieces in (TRUTH, three):
         np.testing.assert_array_equal(segment_known(FRAME, pieces, knows(TRUTH > 0), nowhere), ONE_PIECE)
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2), nowhere), TRUTH)
+    large = np.where(TRUTH > 0, TRUTH + (2**31 - 3), 0).astype(np.int32)
+    for labels in (TRUTH, large):
+        np.testing.assert_array_equal(segment_known(FRAME, labels, knows(TRUTH == 1, TRUTH == 2), nowhere), TRUTH)
 
 
 def test_frames_without_pieces_or_without_depth_remain() -> None:
@@ -220,6 +222,9 @@ def test_labels_remain_without_known_objects_or_if_a_small_one_leaves() -> None:
     labels = np.zeros_like(TRUTH)
     np.testing.assert_array_equal(fit_masks(FRAME, labels, lambda frame: {}), labels)
     labels[rows[1000:1150], columns[1000:1150]] = 1
+    fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
+    np.testing.assert_array_equal(fitted, labels)
+    labels = np.where(TRUTH == 2, 2, labels)
     fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
     np.testing.assert_array_equal(fitted, labels)
 

@@ -232,7 +232,7 @@ def test_bad_input_changes_nothing(model: Path, frames: Path, tmp_path: Path, re
     tiny, mask = write_frame(tmp_path / "tiny", {1: "leaf"}), np.zeros((240, 320), np.uint8)
     mask[10:13, 10:13] = 1
     Image.fromarray(mask).save(tiny / "mask.png")
-    assert "'brick'" in refused("enroll", "--frames", frames, "--model", model)
+    assert "add views to it (--extend)" in refused("enroll", "--frames", frames, "--model", model)
     for given, words in (
         (("new", "--mesh", large), "mm.ply"),
         (("--frames", tiny), "points"),

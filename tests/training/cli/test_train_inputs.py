@@ -119,6 +119,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--frames frames --baselines thor", "baselines: thor"),
         ("--frames frames --coordinator localhost:1 --processes 2", "coordinator: "),
         ("--dataset views --frames frames --sequences table.yaml", "sequences is table.yaml; expected none"),
+        ("--meshes meshes --out meshes", "--out: meshes already contains"),
         ("--frames frames frames/0 --embedding 9 --distractors meshes", "also a class"),
     ):
         command = ("train", "--out", tmp_path / "run", *TINY, *STEPS[4:], *arguments.split())
