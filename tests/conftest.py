@@ -215,6 +215,13 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
 
 
 @pytest.fixture(scope="module")
+def module_patch() -> Iterator[pytest.MonkeyPatch]:
+    """Replaces attributes for the tests of a file."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
 def small_classifiers() -> Iterator[None]:
     """Let classifiers have two small hidden layers: a training and its checkpoints take a third of the time.
 

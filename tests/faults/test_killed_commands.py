@@ -11,10 +11,10 @@ from commands import Command, frame_options, run_thor2
 from image_files import small_frame, write_frame_files
 from processes import HANG
 from rendered_objects import write_box
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 from written_files import files_of
 
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from training.baselines.baseline import baseline_file, read_baseline
 from training.train_run import read_metrics
 
@@ -77,14 +77,6 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run directory with random weights."""
-    out = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), out)
-    return out
-
-
 STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
 
 
@@ -113,7 +105,8 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
 
 
-def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
+def test_recognize(frames: Path, tmp_path: Path) -> None:
+    model = save_untrained_run(tmp_path / "run", ("brick", "stick"), ("tops", "tops2"))
     command, out = ("recognize", "--model", model, *frame_options(frames / "one"), "--out"), tmp_path / "out"
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command

@@ -28,11 +28,9 @@ SAVEFIG = Figure.savefig
 
 
 @pytest.fixture(scope="module", autouse=True)
-def blank_pictures() -> Iterator[None]:
+def blank_pictures(module_patch: pytest.MonkeyPatch) -> None:
     """Let the pictures of figures be blank: many commands draw some, which takes a fifth of the time of a training."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda _, file, **options: Image.new("RGB", (400, 300)).save(file, "PNG"))
-        yield
+    module_patch.setattr(Figure, "savefig", lambda _, file, **options: Image.new("RGB", (400, 300)).save(file, "PNG"))
 
 
 @pytest.fixture
@@ -88,12 +86,10 @@ def weights(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def small_networks() -> Iterator[None]:
+def small_networks(module_patch: pytest.MonkeyPatch) -> None:
     """Let the embeddings of runs have small networks, which are fitted in small batches."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(fit, "BATCH_SIZE", 64)
-        yield
+    module_patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+    module_patch.setattr(fit, "BATCH_SIZE", 64)
 
 
 @pytest.fixture(scope="module")
