@@ -238,6 +238,17 @@ def small_classifiers() -> Iterator[None]:
     small_runs._drawn.cache_clear()
 
 
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of two meshes, a red brick and a green box."""
+    from rendered_objects import write_box
+
+    folder = tmp_path_factory.mktemp("meshes")
+    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
+    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Directory of real scans, frames and golden files beside the checkout; skips the test if it is absent."""
