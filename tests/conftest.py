@@ -215,6 +215,13 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
 
 
 @pytest.fixture(scope="module")
+def module_patch() -> Iterator[pytest.MonkeyPatch]:
+    """Replaces attributes for the tests of a file."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
 def small_classifiers() -> Iterator[None]:
     """Let classifiers have two small hidden layers: a training and its checkpoints take a third of the time.
 
@@ -229,6 +236,17 @@ def small_classifiers() -> Iterator[None]:
         small_runs._drawn.cache_clear()
         yield
     small_runs._drawn.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of two meshes, a red brick and a green box."""
+    from rendered_objects import write_box
+
+    folder = tmp_path_factory.mktemp("meshes")
+    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
+    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
+    return folder
 
 
 @pytest.fixture(scope="session")

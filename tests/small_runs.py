@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,14 +42,18 @@ def untrained_run(
     return TrainedRun(config, network, tuple(classes), classifiers, record or {})
 
 
+def save_untrained_run(folder: Path, *arguments: Any, **options: Any) -> Path:
+    """Write the run that `untrained_run` returns for these arguments, and return its directory."""
+    save_run(untrained_run(*arguments, **options), folder)
+    return folder
+
+
 def save_trained_run(
     folder: Path, source: ViewSource, config: thor2.DescriptorConfig, temperatures: Mapping[str, float] = {}, **fit: int
 ) -> Path:
     """Write an untrained run of TOPS with the record of a training on these views; `fit` has epochs, folds and fold."""
     record = {"dataset": dict(source.record), "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0, **fit}
-    run = untrained_run(source.classes, ("tops",), config, record | {"temperatures": temperatures})
-    save_run(run, folder)
-    return folder
+    return save_untrained_run(folder, source.classes, ("tops",), config, record | {"temperatures": temperatures})
 
 
 @functools.cache

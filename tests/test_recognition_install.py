@@ -13,11 +13,10 @@ from processes import finish_programs, start_program
 from refusals import assert_refused
 from rendered_objects import write_box
 from small_clouds import random_clouds
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.model.run_directory import save_run
 from training.cli.app import TRAINING_PACKAGES
 
 ROOT = Path(__file__).parents[1]
@@ -42,9 +41,7 @@ def run_without(*arguments: object, before: str = "") -> subprocess.CompletedPro
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    save_run(untrained_run(("bowl", "mug"), ("tops", "tops2")), directory)
-    return directory
+    return save_untrained_run(tmp_path_factory.mktemp("run"), ("bowl", "mug"), ("tops", "tops2"))
 
 
 RECOGNITION = (

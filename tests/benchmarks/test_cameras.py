@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from image_files import small_frame, write_frame_files
 from refusals import assert_refused
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 from toy_recognizers import ToyRun, toy_answer
 
 from benchmarks import cameras
-from thor2_jax.model.run_directory import save_run
 from training.augmentation.simulated_cameras import CHOOSE
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 
@@ -84,7 +83,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     for k in range(2):
         write_frame_files(tmp_path / "video" / f"{k}", small_frame(k), {1: "mug", 4: "dragon"})
     for seed in range(2):
-        save_run(untrained_run(CLASSES, ("tops",), seed=seed), tmp_path / f"run{seed}")
+        save_untrained_run(tmp_path / f"run{seed}", CLASSES, ("tops",), seed=seed)
     out, picture = tmp_path / "out.json", tmp_path / "cameras.jpg"
     arguments = f"--model {tmp_path}/run0 {tmp_path}/run1 --frames {tmp_path}/video --out {out} --picture {picture}"
     monkeypatch.setattr(sys, "argv", ["cameras", *arguments.split()])

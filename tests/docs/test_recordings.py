@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 from commands import Command, json_lines, run_thor2
 from doc_pages import ROOT, thor2_commands
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics
 from training.rendering.sample_recording import FRAMES, write_sample_recording
@@ -22,7 +21,7 @@ COMMANDS = thor2_commands("docs/recordings.md")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the run and the recording of the page."""
     folder = tmp_path_factory.mktemp("recordings")
-    save_run(untrained_run(("apple", "mug")), folder / "run")
+    save_untrained_run(folder / "run", ("apple", "mug"))
     write_sample_recording(folder / "table.mcap")
     (folder / "thor2_jax").symlink_to(ROOT / "thor2_jax")
     return folder

@@ -20,14 +20,13 @@ from doc_pages import PAGES, ROOT, thor2_commands
 from image_files import patches, tilted, write_frame_files
 from recording_files import table_frame
 from small_clouds import random_clouds
-from small_runs import untrained_run
+from small_runs import save_untrained_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax import recognizer as recognizer_module
 from thor2_jax.client import Client
 from thor2_jax.frames.frames import backproject
-from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings import realsense
 from thor2_jax.tracking.tracker import Tracker
 
@@ -64,7 +63,7 @@ def test_every_python_block_is_executed() -> None:
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Change to a folder with an untrained run, also where the demo writes its own."""
     monkeypatch.chdir(tmp_path)
-    save_run(untrained_run(("mug", "bowl")), "run")
+    save_untrained_run(Path("run"), ("mug", "bowl"))
     Path("demo-report").symlink_to(".")
     return tmp_path
 

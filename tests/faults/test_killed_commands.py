@@ -10,11 +10,10 @@ import pytest
 from commands import Command, frame_options, run_thor2
 from image_files import small_frame, write_frame_files
 from processes import HANG
-from rendered_objects import write_box
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 from written_files import files_of
 
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from training.baselines.baseline import baseline_file, read_baseline
 from training.train_run import read_metrics
 
@@ -60,29 +59,12 @@ def finish(*command: object) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory of two boxes with vertex colors."""
-    folder = tmp_path_factory.mktemp("meshes")
-    for name, sides, level in (("brick", (0.1, 0.05, 0.03), 40), ("stick", (0.2, 0.02, 0.02), 220)):
-        write_box(folder / f"{name}.ply", sides, (level, level, level))
-    return folder
-
-
-@pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory of two frames of a brick and a stick."""
+    """Directory of two frames of a brick and a box."""
     folder = tmp_path_factory.mktemp("frames")
     for seed, name in enumerate(("one", "two")):
-        write_frame_files(folder / name, small_frame(seed), {1: "brick", 4: "stick"})
+        write_frame_files(folder / name, small_frame(seed), {1: "brick", 4: "box"})
     return folder
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run directory with random weights."""
-    out = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), out)
-    return out
 
 
 STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
@@ -99,7 +81,7 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
         assert all(written[name] == expected[name] for name in written if name.startswith(compared))
         assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
         if "run.json" in written:
-            assert load_run(out).classes == ("brick", "stick")
+            assert load_run(out).classes == ("box", "brick")
         else:
             assert f"{out} is not a run directory" in refused("evaluate", "frames", frames, "--model", out)
         if "checkpoints/begun.json" in written:
@@ -109,11 +91,12 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
     assert written.keys() == expected.keys()
     different = {name for name in written if written[name] != expected[name]}  # these two hold measured times
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
-    first, second = (read_baseline(baseline_file(folder, "forest"), ("brick", "stick")) for folder in (out, whole))
+    first, second = (read_baseline(baseline_file(folder, "forest"), ("box", "brick")) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
 
 
-def test_recognize(frames: Path, model: Path, tmp_path: Path) -> None:
+def test_recognize(frames: Path, tmp_path: Path) -> None:
+    model = save_untrained_run(tmp_path / "run", ("box", "brick"), ("tops", "tops2"))
     command, out = ("recognize", "--model", model, *frame_options(frames / "one"), "--out"), tmp_path / "out"
     kill("before recognition.json", *command, out)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command

@@ -14,11 +14,11 @@ import pytest
 from dataset_files import READERS, write_dataset
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from thor2_jax.testing import damaged
 from training.storage.jobs import MANIFEST
 from training.views.dataset import Shard, ViewDataset, encode
@@ -115,8 +115,7 @@ def test_networks(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> N
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("runs") / "run"
-    save_run(untrained_run(("mug", "bowl"), ("ce",), record={"epochs": 3}), path)
+    path = save_untrained_run(tmp_path_factory.mktemp("run"), ("mug", "bowl"), ("ce",), record={"epochs": 3})
     assert load_run(path).classes == ("mug", "bowl")
     return path
 

@@ -4,14 +4,12 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
-from rendered_objects import write_box
 from small_runs import random_classifier
 
 from thor2_jax import figures
@@ -28,11 +26,9 @@ SAVEFIG = Figure.savefig
 
 
 @pytest.fixture(scope="module", autouse=True)
-def blank_pictures() -> Iterator[None]:
+def blank_pictures(module_patch: pytest.MonkeyPatch) -> None:
     """Let the pictures of figures be blank: many commands draw some, which takes a fifth of the time of a training."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda _, file, **options: Image.new("RGB", (400, 300)).save(file, "PNG"))
-        yield
+    module_patch.setattr(Figure, "savefig", lambda _, file, **options: Image.new("RGB", (400, 300)).save(file, "PNG"))
 
 
 @pytest.fixture
@@ -88,18 +84,7 @@ def weights(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def small_networks() -> Iterator[None]:
+def small_networks(module_patch: pytest.MonkeyPatch) -> None:
     """Let the embeddings of runs have small networks, which are fitted in small batches."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-        patch.setattr(fit, "BATCH_SIZE", 64)
-        yield
-
-
-@pytest.fixture(scope="module")
-def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory of two meshes, a red brick and a green box."""
-    folder = tmp_path_factory.mktemp("meshes")
-    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
-    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
-    return folder
+    module_patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+    module_patch.setattr(fit, "BATCH_SIZE", 64)

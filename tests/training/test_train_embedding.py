@@ -1,7 +1,6 @@
 """Trainings of an embedding alone: files of a run, interruptions, folds, and the user's cache."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -38,12 +37,11 @@ SOURCE.surfaces = surfaces_of(list(builtin_objects().values())[: len(CLASSES)])
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(small_networks: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cache(small_networks: None, tmp_path_factory: pytest.TempPathFactory, module_patch: pytest.MonkeyPatch) -> Path:
     """A user's cache, in which the first training keeps the samples of the distractors."""
     directory = tmp_path_factory.mktemp("cache")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("THOR2_CACHE", str(directory))
-        yield directory
+    module_patch.setenv("THOR2_CACHE", str(directory))
+    return directory
 
 
 SETTINGS = Protocol((), FitOptions(), SMALL_CONFIG, distractors=DISTRACTORS)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -60,18 +59,9 @@ def logged_rows(path: Path) -> list[tuple[Any, ...]]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def every_step_is_reported() -> Iterator[None]:
+def every_step_is_reported(module_patch: pytest.MonkeyPatch) -> None:
     """Report each step, so that a training can be interrupted at any of them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "STEPS_PER_REPORT", 1)
-        yield
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun]:
-    """A run of an uninterrupted training."""
-    out = tmp_path_factory.mktemp("whole") / "run"
-    return out, train(out, ("tops", "ce"))
+    module_patch.setattr(loop, "STEPS_PER_REPORT", 1)
 
 
 @pytest.mark.usefixtures("drawn_pictures")
@@ -124,9 +114,9 @@ def test_nothing_is_written_for_bad_views(tmp_path: Path) -> None:
         assert names(tmp_path) == []
 
 
-def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is interrupted first where an epoch is logged and has no checkpoint yet."""
-    out = tmp_path / "run"
+    whole, out = train(tmp_path / "whole", ("tops", "ce")), tmp_path / "run"
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
         patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))
         train(out, ("tops", "ce"))
@@ -136,9 +126,9 @@ def test_an_interrupted_run(whole: tuple[Path, TrainedRun], tmp_path: Path, monk
             train(out, ("tops", "ce"), progress=stop_when(stage, step))
         assert_refused(r"run\.json", load_run, out)
     run = train(out, ("tops", "ce"))
-    same_weights(run, whole[1])
-    assert run.record == whole[1].record
-    assert logged_rows(out) == logged_rows(whole[0])
+    same_weights(run, whole)
+    assert run.record == whole.record
+    assert logged_rows(out) == logged_rows(tmp_path / "whole")
     assert names(out) == FINISHED
 
 

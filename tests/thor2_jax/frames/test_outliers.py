@@ -118,7 +118,7 @@ def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 30, 31, 32, 101, 400])
-@pytest.mark.parametrize("side", [0.01, 0.03, 0.06, 0.2])
+@pytest.mark.parametrize("side", [0.01, 0.02, 0.03, 0.06, 0.2])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
     """Tests clouds that are dense in the middle, with isolated points around."""
@@ -127,14 +127,3 @@ def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
     before = points.copy()
     np.testing.assert_equal(remove_outliers(points), kept_by_loops(points))
     np.testing.assert_array_equal(points, before)
-
-
-@pytest.mark.parametrize("share", [0.02, 0.06, 0.1, 0.15, 0.3, 1.0])
-@pytest.mark.parametrize("depth", [1, 4, 10])
-def test_clouds_on_the_voxel_grid_against_loops(share: float, depth: int) -> None:
-    """Some of the 3 mm cubes of a thin or thick slab hold one point."""
-    rng = np.random.default_rng(depth)
-    cubes = np.argwhere(rng.random((20, 20, depth)) < share)
-    cubes = cubes[rng.permutation(len(cubes))[:1200]]
-    points = (cubes + rng.random(cubes.shape)) * 0.003 - [0.03, 0.01, -0.8]
-    np.testing.assert_equal(remove_outliers(points), kept_by_loops(points))

@@ -23,11 +23,11 @@ from page_actions import upload
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from processes import HANG, wait_until
 from segmentation_scenes import APART, render
-from small_runs import small_embedding, untrained_run
+from small_runs import save_untrained_run, small_embedding
 
 import thor2_jax as thor2
 from thor2_jax.frames.frames import encode_image
-from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
 from thor2_jax.service.pipeline import Service
@@ -52,15 +52,13 @@ def one_tls_context() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = untrained_run(CLASSES, config=thor2.DescriptorConfig(), record={"meshes": "/a/local/path"})
-    folder = tmp_path_factory.mktemp("service") / "run"
-    save_run(run, folder)
-    return folder
+    options: Any = {"config": thor2.DescriptorConfig(), "record": {"meshes": "/a/local/path"}}
+    return save_untrained_run(tmp_path_factory.mktemp("service"), CLASSES, **options)
 
 
 def write_run(folder: Path, trained: tuple[str, ...] = ("a", "b"), record: dict[str, object] | None = None) -> Path:
     """Write a run with trained classes and a small embedding, which compiles quickly."""
-    save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), folder)
+    save_untrained_run(folder, trained, ("tops", "tops2") if trained else (), record=record)
     small_embedding().save(folder / EMBEDDING_FILE)
     return folder
 

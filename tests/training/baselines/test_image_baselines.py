@@ -1,7 +1,6 @@
 """Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
 
 import dataclasses
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,14 +68,12 @@ def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick_network() -> Iterator[None]:
+def quick_network(module_patch: pytest.MonkeyPatch) -> None:
     """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
     vit = dataclasses.replace(VIT_TINY, width=96, depth=1)
     architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ARCHITECTURES, SMALL, architecture)
-        patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
-        yield
+    module_patch.setitem(ARCHITECTURES, SMALL, architecture)
+    module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
 
 @pytest.fixture(scope="module")

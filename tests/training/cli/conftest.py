@@ -1,17 +1,15 @@
 """Fixtures shared by the tests of the command line."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from commands import Command, Recognize, json_lines
-from small_runs import SMALL_CONFIG, untrained_run
+from small_runs import SMALL_CONFIG, save_untrained_run
 from small_runs import small_embedding as embedding_of_tests
 
 from thor2_jax.gallery import enrollment
 from thor2_jax.model import model as models
-from thor2_jax.model.run_directory import save_run
 from thor2_jax.networks import embedding
 from training import protocol
 from training.protocol import DEFAULT, PAPER
@@ -24,9 +22,8 @@ COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
 @pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
-    directory = tmp_path_factory.mktemp("run")
-    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), COVERING, seed=1), directory)
-    return directory
+    folder, classes = tmp_path_factory.mktemp("run"), ("bowl", "mug", "plate")
+    return save_untrained_run(folder, classes, ("tops", "tops2"), COVERING, seed=1)
 
 
 @pytest.fixture
@@ -36,21 +33,17 @@ def recognize(model: Path, printed: Command) -> Recognize:
 
 
 @pytest.fixture(scope="module")
-def small_descriptors(small_networks: None) -> Iterator[None]:
+def small_descriptors(small_networks: None, module_patch: pytest.MonkeyPatch) -> None:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
-    with pytest.MonkeyPatch.context() as patch:
-        networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
-        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
-        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
-        yield
+    networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
+    module_patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
+    module_patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
 
 
 @pytest.fixture(scope="module")
-def small_embedding() -> Iterator[None]:
+def small_embedding(module_patch: pytest.MonkeyPatch) -> None:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
     small = embedding_of_tests()
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (embedding, enrollment, models):
-            patch.setattr(module, "load_default", lambda: small)
-        patch.setattr(mesh_views, "MESH_VIEWS", 1)
-        yield
+    for module in (embedding, enrollment, models):
+        module_patch.setattr(module, "load_default", lambda: small)
+    module_patch.setattr(mesh_views, "MESH_VIEWS", 1)

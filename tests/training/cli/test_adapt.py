@@ -9,12 +9,11 @@ import pytest
 from commands import Command, json_lines, run_thor2
 from image_files import write_frame
 from refusals import assert_refused
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.model.model import ColorTransform
-from thor2_jax.model.run_directory import save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.runs import load_runs
 from training.readers.frames import frame_files
@@ -26,8 +25,7 @@ OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(tuple(OBJECTS.values()), ("tops", "tops2"), seed=1), directory)
+    directory = save_untrained_run(tmp_path_factory.mktemp("model"), tuple(OBJECTS.values()), ("tops", "tops2"), seed=1)
     (directory / "metrics.jsonl").write_text("{}\n")
     (directory / "checkpoints").mkdir()
     return directory

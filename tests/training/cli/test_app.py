@@ -20,10 +20,9 @@ from image_files import write_frame
 from processes import HANG
 from refusals import assert_refused
 from rich.progress import Progress
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.model.run_directory import save_run
 from training.cli.app import enable_compilation_cache, finish, show_progress
 from training.cli.options import FrameOptions
 from training.storage.jobs import numbered
@@ -307,7 +306,7 @@ def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, m
 @pytest.mark.slow
 def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick"})
-    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
+    save_untrained_run(tmp_path / "run", ("brick", "stick"), ("tops", "tops2"))
 
     def recognize() -> tuple[set[str], str]:
         """Return the names of the cached programs, and what was printed."""

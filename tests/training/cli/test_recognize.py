@@ -15,12 +15,11 @@ from image_files import frame_of_squares, small_frame, write_frame_files
 from PIL import Image
 from recording_files import COLOR, DEPTH, PERIOD, START, bag_writer, image, table_frame, write_images, write_recording
 from rosbags.highlevel import AnyReader
-from small_runs import untrained_run
+from small_runs import save_untrained_run
 from written_files import files_of
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.model.run_directory import save_run
 from training.cli import recognize as recognize_command
 from training.readers.frames import FrameFiles
 
@@ -108,7 +107,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
     write_frame_files(Path("frames/two"), small_frame(1))
     Path("frames/names.json").write_text("{}")
     write_recording(Path("in.mcap"), FRAMES[:1])
-    save_run(untrained_run((), ()), Path("gallery-only"))
+    save_untrained_run(Path("gallery-only"), (), ())
     Path("poses").write_text("[")
     unit, double = np.eye(4).tolist(), (2 * np.eye(4)).tolist()
     for name, poses in {"number": 7, "few": [unit], "other": {"one": unit}, "scaled": [unit, double]}.items():

@@ -42,11 +42,9 @@ learned_block = nnx.jit(lambda model, *inputs: model.learned(*inputs))
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small_batches() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "BATCH_SIZE", 32)
-        patch.setattr(fit, "RATE", 5e-3)
-        yield
+def small_batches(module_patch: pytest.MonkeyPatch) -> None:
+    module_patch.setattr(fit, "BATCH_SIZE", 32)
+    module_patch.setattr(fit, "RATE", 5e-3)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 from image_files import patches, tilted
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import untrained_embedding_run, untrained_run, with_surfaces
+from small_runs import save_untrained_run, untrained_embedding_run, with_surfaces
 
 import colornet
 from thor2_jax.config import DescriptorConfig
@@ -30,8 +30,7 @@ CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
 
 def make(folder: Path, classes: Sequence[str] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG) -> Path:
     """Write an untrained run with CE only."""
-    save_run(untrained_run(classes, ("ce",), config, seed=seed), folder)
-    return folder
+    return save_untrained_run(folder, classes, ("ce",), config, seed=seed)
 
 
 def test_folds_have_names_and_digests(tmp_path: Path) -> None:
