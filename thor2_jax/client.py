@@ -255,7 +255,7 @@ class Client(_Connection):
             The object, with the generation of the gallery.
 
         Raises:
-            InputError: as `recognize`, or the name is invalid, for example None of an unknown object.
+            InputError: as `recognize`, or the name is invalid, such as None, the name of an unknown object.
             ServiceError: as `describe`; status 409 if the name exists and neither `extend` nor `replace` is given.
             OSError: as `recognize`.
         """

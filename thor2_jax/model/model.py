@@ -208,8 +208,9 @@ class Model:
     def surface_of(self, name: str) -> tuple[Surfaces, int] | None:
         """Return surfaces, and which of them is that of the object with this name; None if it has none."""
         gallery, trained = self.gallery, self.run.surfaces
-        if name in gallery.objects and (enrolled := gallery.surfaces.get(gallery.names.index(name))) is not None:
-            return enrolled, 0
+        if name in gallery.objects and self.answers_by() != "classifiers":
+            if (enrolled := gallery.surfaces.get(gallery.names.index(name))) is not None:
+                return enrolled, 0
         if trained is None or name not in self.run.classes or name in gallery.hidden:
             return None
         return trained, self.run.classes.index(name)

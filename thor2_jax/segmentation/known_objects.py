@@ -85,7 +85,7 @@ def segment_known(
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
-        labels: [H, W], labels of `segment_table`; any integers, 0 is background.
+        labels: [H, W] integers, for example from `segment_table`; 0 is background.
         recognize: see `Recognize`.
         locate: see `Locate`.
 
@@ -123,7 +123,7 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
     Returns:
         Labels [H, W]: 0 is background, and the objects are numbered from 1.
     """
-    region = grow(labels > 0, 3)
+    region = grow(labels > 0, 3)  # by one pixel
     for _ in range(ROUNDS):
         surfaces = locate(dataclasses.replace(frame, labels=labels))
         if not surfaces:

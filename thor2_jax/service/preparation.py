@@ -217,10 +217,13 @@ class PreparationPool:
             # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
             timer = threading.Timer(limit - time.monotonic(), process.process.kill)
             timer.start()
-            with contextlib.suppress(EOFError, OSError):  # The process has ended.
+            try:
                 process.pipe.send((function, arguments))
                 answer = process.pipe.recv()
-            timer.cancel()
+            except (EOFError, OSError):
+                pass  # The process has ended.
+            finally:
+                timer.cancel()
             is_late = time.monotonic() >= limit
             if is_late or answer is None:
                 process.restart()

@@ -51,9 +51,9 @@ in free space."""
 REACH = 0.012
 """Largest distance of a match in scores and values, metres."""
 
-NEAR, SCALE, POLISHING = 0.008, 0.002, 8
+NEAR, SCALE, REFINEMENTS = 0.008, 0.002, 8
 """NEAR: distance, metres, beyond which points do not count in the last steps of a refinement. SCALE: point-to-plane
-distance, metres, at which points have half of the weight in `fit_poses`. POLISHING: number of its further steps."""
+distance, metres, at which points have half of the weight in `fit_poses`. REFINEMENTS: number of its steps."""
 
 N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
@@ -99,26 +99,27 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
 
 
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
-    """Return poses [B, 3, 4]: a rotation and a shift from the camera to the class, metres.
+    """Return the poses [B, 3, 4] of instances: a rotation and a shift from the camera to the class, metres.
 
-    They are those of `evidence`, refined with all points by iteratively reweighted least squares.
+    The pose of the search is refined by further steps of the ICP algorithm with all points within `NEAR` of the surface
+    and Cauchy weights. The arguments are those of `evidence`; the pose of an empty cloud is zero.
     """
     index = jnp.asarray(class_index)
-    return _polished(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
+    return _refined_poses(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
 
 
 @jax.jit
-def _polished(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array, poses: jax.Array) -> jax.Array:
-    def polish(row: tuple[jax.Array, ...]) -> jax.Array:
+def _refined_poses(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array, poses: jax.Array) -> jax.Array:
+    def refine(row: tuple[jax.Array, ...]) -> jax.Array:
         points, mask, camera, index, pose = row
         surface, places = jax.tree.map(lambda field: field[index], surfaces), _homogeneous(points - camera)
 
         def weigh(distance: jax.Array, residual: jax.Array) -> jax.Array:
             return mask * (distance < NEAR) / (1 + jnp.square(residual / SCALE))
 
-        return jax.lax.fori_loop(0, POLISHING, lambda _, pose: _refined(surface, pose, places, weigh), pose[None])[0]
+        return jax.lax.fori_loop(0, REFINEMENTS, lambda _, pose: _refined(surface, pose, places, weigh), pose[None])[0]
 
-    return jax.lax.map(polish, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
+    return jax.lax.map(refine, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
 
 
 @jax.jit
@@ -169,7 +170,7 @@ def sample_points(clouds: PointClouds) -> Sample:
 
 @jax.jit
 def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the values of `evidence` and of `fit_poses` for samples of B instances, from one search for poses."""
+    """Return the values of `evidence` for samples of B instances, and the poses [B, 3, 4] of the search."""
 
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)

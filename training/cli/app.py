@@ -245,16 +245,15 @@ def main() -> None:
 def _with_options(message: str) -> str:
     """Return a message with the given options in place of the arguments that they set: --max-gap, not max_gap.
 
-    Each argument is replaced once, since a second one is part of a value, and so is what follows an argument: "--out:
-    meshes already contains ...". A word before a file of a frame is the name of that frame: "color: --labels: ..." is
-    about the labels of color.png.
+    Each argument is replaced once, and the word after "argument: " is its value, such as a path. A word before a file
+    of a frame is the name of that frame: "color: --labels: ..." is about the labels of color.png.
     """
     options = {argument.split("=")[0] for argument in sys.argv if argument.startswith("--")}
     names = {option[2:].replace("-", "_"): option for option in options}
     names |= {"segmenter": "--segment"} if "--segment" in options else {}
     word = rf"({'|'.join(map(re.escape, names))})(?=:? )(?!: (?:color|depth|labels|intrinsics):? )"
     replaced = re.sub(rf"(^| and |: ){word}((?:: [^\s:]+)?)", lambda m: m[1] + names.pop(m[2], m[2]) + m[3], message)
-    return re.sub(r"\((extend|replace)\)", r"(--\1)", replaced)  # options that were not given
+    return re.sub(r"(add views to it|replace it) \((extend|replace)\)", r"\1 (--\2)", replaced)
 
 
 def _check_not_empty(arguments: list[str]) -> None:

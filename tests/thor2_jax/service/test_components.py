@@ -71,7 +71,9 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
         assert error.value.status == status
         with pytest.raises(ProcessLookupError):
             os.kill(replaced, 0)
-    os.kill(pool.submit(FAR, os.getpid).result(HANG), signal.SIGSTOP)
+    stopped = pool.submit(FAR, os.getpid).result(HANG)
+    os.kill(stopped, signal.SIGSTOP)
+    request.addfinalizer(lambda: Path(f"/proc/{stopped}").exists() and os.kill(stopped, signal.SIGKILL))
     with pytest.raises(RequestError) as error:  # It does not receive an argument that fills the pipe.
         pool.submit(time.monotonic(), len, bytes(10**7)).result(HANG)
     assert error.value.status == 504

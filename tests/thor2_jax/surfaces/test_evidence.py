@@ -133,7 +133,7 @@ def test_points_off_the_surface_hardly_change_a_pose(
         [np.median(surfaces.distances(OWN[k], np.asarray(poses[k]), xyz)) for k, (xyz, _) in enumerate(views)]
         for poses in (fit_poses(surfaces, packed, OWN), fit_rows(surfaces, sample_points(packed), OWN)[1])
     )
-    assert max(after) < 0.0008 < np.median(before), (after, before)
+    assert max(after) < 0.0009 < np.median(before), (after, before)
 
 
 def test_the_camera_may_be_anywhere(surfaces: Surfaces, views: list[Cloud]) -> None:

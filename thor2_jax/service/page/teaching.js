@@ -39,7 +39,8 @@ function showNotice(text, generation = null) {
  * Connect the form and the notice.
  *
  * `shownFiles()` returns the files of the shown frame, `changed(files)` is called after each change with the files of
- * the frame in which an object was named or a name was undone, and `failed(problem)` with any other problem.
+ * the frame in which an object was named or a name was undone, and `failed(problem)` with a problem that is
+ * not shown beside the name.
  */
 export function connectNaming(shownFiles, changed, failed) {
   let files = null;
