@@ -75,7 +75,7 @@ ON_SURFACE, OFF_SURFACE = 0.008, 0.015
 """A point within ON_SURFACE of another object can go to it; a point beyond OFF_SURFACE leaves its object; metres."""
 
 LEAST_PIXELS = 200
-"""Number of pixels of the smallest separate piece; smaller ones go to the nearest piece."""
+"""Number of pixels of the smallest separate piece; smaller ones stay, or go to the nearest piece."""
 
 
 def segment_known(
@@ -112,8 +112,8 @@ def fit_masks(frame: RGBDFrame, labels: NDArray[np.int32], locate: Locate) -> ND
     """Return labels that fit the surfaces of known objects.
 
     A pixel of an object, or beside one, goes to the known object whose surface is nearest to its point, if that is
-    within `ON_SURFACE`. What is farther than `OFF_SURFACE` from the surface of its known object becomes a piece of its
-    own, and a known object without any other pixel keeps its mask. Pieces of unknown objects do not change otherwise.
+    within `ON_SURFACE`. Pixels farther than `OFF_SURFACE` from the surface of their known object become a piece if at
+    least `LEAST_PIXELS` of them are connected. Otherwise, pieces of unknown objects do not change.
 
     Args:
         frame: colour, depth and intrinsics; its labels are not read.
@@ -156,8 +156,7 @@ def _fitted(
         kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
         numbers, _ = renumbered(numbers, kept, label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
-    lost = np.setdiff1d(known, labels[tidied > 0])  # all points leave, and are too few for a piece
-    tidied = np.where(np.isin(labels, lost), labels, tidied)
+    tidied = np.where((fitted == rest) & (tidied == 0), labels, tidied)  # too few for a piece: they stay
     return filled(tidied, (labels > 0) | (tidied > 0))
 
 

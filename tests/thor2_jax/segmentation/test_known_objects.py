@@ -225,8 +225,14 @@ def test_labels_remain_without_known_objects_or_if_a_small_one_leaves() -> None:
     fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
     np.testing.assert_array_equal(fitted, labels)
     labels = np.where(TRUTH == 2, 2, labels)
-    fitted = fit_masks(FRAME, labels, lambda frame: {1: lambda points: np.full(len(points), 0.018)})
-    np.testing.assert_array_equal(fitted, labels)
+    center = backproject(FRAME.depth_m, FRAME.intrinsics)[labels == 1].mean(axis=0)
+    for near in (0.0, 0.01):  # all of it leaves, or the rest
+
+        def distances(points: NDArray[np.floating], near: float = near) -> NDArray[np.float64]:
+            return np.where(np.linalg.norm(points - center, axis=1) < near, 0.0, 0.018)
+
+        fitted = fit_masks(FRAME, labels, lambda frame, distances=distances: {1: distances})
+        np.testing.assert_array_equal(fitted[labels > 0], labels[labels > 0])
 
 
 def test_separate_pieces_of_an_object_keep_its_number() -> None:
