@@ -224,11 +224,12 @@ class PreparationPool:
                 pass  # The process has ended.
             finally:
                 timer.cancel()
-            is_late = time.monotonic() >= limit
-            if is_late or answer is None:
+            if time.monotonic() >= limit:
                 process.restart()
-                crash = RequestError(422, "body", "The body made the process that decoded it crash.")
-                raise RequestError(504) if is_late else crash
+                raise RequestError(504)
+            if answer is None:
+                process.restart()
+                raise RequestError(422, "body", "The body made the process that decoded it crash.")
         finally:
             self._idle.put(process)
         result, error = answer

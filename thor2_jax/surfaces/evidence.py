@@ -53,7 +53,7 @@ REACH = 0.012
 
 NEAR, SCALE, REFINEMENTS = 0.008, 0.002, 8
 """NEAR: distance, metres, beyond which points do not count in the last steps of a refinement. SCALE: point-to-plane
-distance, metres, at which points have half of the weight in `fit_poses`. REFINEMENTS: number of its steps."""
+distance, metres, at which points have half of the weight in `fit_poses`. REFINEMENTS: number of steps there."""
 
 N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
@@ -101,8 +101,8 @@ def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) ->
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
     """Return the poses [B, 3, 4] of instances: a rotation and a shift from the camera to the class, metres.
 
-    The pose of the search is refined by further steps of the ICP algorithm with all points within `NEAR` of the surface
-    and Cauchy weights. The arguments are those of `evidence`; the pose of an empty cloud is zero.
+    The pose of the search is refined by steps of the ICP algorithm with Cauchy weights and all points that are within
+    `NEAR` of the surface. The arguments are those of `evidence`; the pose of an empty cloud is zero.
     """
     index = jnp.asarray(class_index)
     return _refined_poses(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
