@@ -11,7 +11,10 @@ and all shapes are static.
 """
 
 import functools
+import math
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -61,6 +64,10 @@ EXPONENT = np.float32(0.5)
 """See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
 `KNOWN_WEIGHTS`, of free space. The other values are from real frames, since the probabilities of the networks depend
 more on the camera than surfaces do."""
+
+
+_THREADS = ThreadPoolExecutor(thread_name_prefix="surfaces")
+"""Threads that call compiled functions, since XLA computes on CPUs what one thread calls one after the other."""
 
 
 class Sample(NamedTuple):
@@ -122,7 +129,6 @@ def _refined_poses(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Arr
     return jax.lax.map(refine, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
 
 
-@jax.jit
 def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
@@ -132,6 +138,18 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     all classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class
     that is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
     """
+    n_parts = 1 << ((os.cpu_count() or 1) - 1).bit_length() if jax.default_backend() == "cpu" else 1
+    size = len(probabilities) // math.gcd(len(probabilities), n_parts)
+    change = functools.partial(_with_evidence, probabilities, surfaces, samples, size=size)
+    others = [_THREADS.submit(change, first) for first in range(size, len(probabilities), size)]
+    return jnp.concatenate([change(0), *(other.result() for other in others)])
+
+
+@functools.partial(jax.jit, static_argnames="size")
+def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample, first: int, size: int) -> jax.Array:
+    """Return `with_evidence` for `size` rows from `first` on."""
+    rows = probabilities, samples
+    probabilities, samples = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, size), rows)
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30))
 
