@@ -35,7 +35,17 @@ from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_stri
 from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch, check_types, matmul
+from thor2_jax.types import (
+    Descriptors,
+    Diagrams,
+    Parameters,
+    PointClouds,
+    Strips,
+    check_batch,
+    check_types,
+    is_positive_integer,
+    matmul,
+)
 
 __all__ = [
     "BATCH_AXIS",
@@ -222,7 +232,8 @@ def describe(
         descriptor of zeros.
 
     Raises:
-        InputError: `clouds` is not a batch of clouds, or another argument is of another type.
+        InputError: `clouds` is not a batch of clouds, its fields have other shapes, points or colours are not
+            floating, or another argument is of another type.
     """
     check_batch(clouds)
     check_types(network=network, config=config, parameters=parameters)
@@ -260,11 +271,11 @@ def describe_stream(
         Descriptors of up to `batch` clouds, as NumPy arrays.
 
     Raises:
-        InputError: `batch` is not positive, or `PointClouds.pack` refuses a cloud; the message gives the index of the
-            cloud in its batch.
+        InputError: `batch` is not a positive integer, or `PointClouds.pack` refuses a cloud; the message gives the
+            index of the cloud in its batch.
     """
-    if batch < 1:
-        raise InputError(f"batch is {batch}; expected at least 1")
+    if not is_positive_integer(batch):
+        raise InputError(f"batch is {batch!r}; expected a positive integer")
     return _stream(iter(clouds), network, config, capacity, batch)
 
 
