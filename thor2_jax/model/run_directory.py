@@ -115,7 +115,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         contents = {name: pack_arrays(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
-        embedding = run.embedding
+        embedding, references = run.embedding, unfinished / REFERENCES_FILE
         description = {
             "format": RUN_FORMAT if run.surfaces is None else FORMAT_WITH_SURFACES,
             "descriptor_version": DESCRIPTOR_VERSION,
@@ -125,7 +125,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "classifiers": list(run.classifiers),
             "weights": {name: content_digest([content]) for name, content in contents.items()},
             **({} if embedding is None else {"embedding": embedding.fingerprint}),
-            **({} if embedding is None or embedding.references is None else {"references": True}),
+            **({"references": content_digest([references.read_bytes()])} if references.exists() else {}),
             **({} if run.surfaces is None else {"surfaces": content_digest([run.surfaces.content])}),
             "record": run.record,
         }
@@ -165,8 +165,11 @@ def load_run(path: str | Path) -> TrainedRun:
     stored = None if embedding is None else embedding.fingerprint
     if description.get("embedding", stored) != stored:
         raise _unfit(file, "is missing" if embedding is None else "is not the embedding that run.json names")
-    if embedding is not None and embedding.references is None and description.get("references"):
+    digest = description.get("references")  # True in runs of earlier versions
+    if embedding is not None and embedding.references is None and digest:
         raise _unfit(path / REFERENCES_FILE, "is missing")
+    if isinstance(digest, str):
+        _intact(path / REFERENCES_FILE, digest)
     surfaces = None
     if description["format"] == FORMAT_WITH_SURFACES:
         surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description.get("surfaces", "")))
