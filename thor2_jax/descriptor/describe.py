@@ -11,9 +11,9 @@ On CPUs, large batches are computed in chunks of clouds, so that intermediate ta
 `map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators, both simply call the function.
 `describe_stream` describes more clouds than fit into memory, and `describe_sharded` a batch on several devices:
 
->>> mesh = batch_mesh()                                             # doctest: +SKIP   # all devices of all processes
->>> clouds = shard_clouds(PointClouds.pack(local), mesh)            # doctest: +SKIP   # the clouds of this process
->>> descriptors = describe_sharded(clouds, network, config)         # doctest: +SKIP   # sharded like the clouds
+>>> mesh = batch_mesh()  # all devices of all processes             # doctest: +SKIP
+>>> clouds = shard_clouds(PointClouds.pack(local), mesh)  # the clouds of this process   # doctest: +SKIP
+>>> descriptors = describe_sharded(clouds, network, config)  # sharded like the clouds   # doctest: +SKIP
 """
 
 import functools
