@@ -93,9 +93,13 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
     moved = np.eye(4)
     moved[0, 3] = 0.09  # 77 pixels at a depth of 0.7 m
     boxes = frame_of_squares({1: (10, 110, SURE_A)}), frame_of_squares({1: (10, 33, SURE_A)})
-    with_poses, without = Tracker(ToyRecognizer()), Tracker(ToyRecognizer())
+    on_map = np.eye(4)
+    on_map[:3, 3] = 500_000, 4_000_000, 100
+    with_poses, without, far = (Tracker(ToyRecognizer()) for _ in range(3))
     assert [with_poses.update(f, p)[0].track for f, p in zip(boxes, (np.eye(4), moved), strict=True)] == [1, 1]
     assert [without.update(f)[0].track for f in boxes] == [1, 2]
+    below = frame_of_squares({1: (10, 60, SURE_A)}), frame_of_squares({1: (70, 60, SURE_A)})
+    assert [far.update(f, on_map)[0].track for f in below] == [1, 2]
 
 
 def test_views_with_poses_are_described_as_one_cloud() -> None:
