@@ -35,17 +35,7 @@ from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_stri
 from thor2_jax.descriptor.slicing import RegionSets, color_sets, region_sets, strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.types import (
-    Descriptors,
-    Diagrams,
-    Parameters,
-    PointClouds,
-    Strips,
-    check_batch,
-    check_types,
-    is_positive_integer,
-    matmul,
-)
+from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips, check_batch, check_types, matmul
 
 __all__ = [
     "BATCH_AXIS",
@@ -274,7 +264,7 @@ def describe_stream(
         InputError: `batch` is not a positive integer, or `PointClouds.pack` refuses a cloud; the message gives the
             index of the cloud in its batch.
     """
-    if not is_positive_integer(batch):
+    if not isinstance(batch, int | np.integer) or batch < 1:
         raise InputError(f"batch is {batch!r}; expected a positive integer")
     return _stream(iter(clouds), network, config, capacity, batch)
 

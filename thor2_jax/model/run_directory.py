@@ -165,10 +165,7 @@ def load_run(path: str | Path) -> TrainedRun:
     stored = None if embedding is None else embedding.fingerprint
     if description.get("embedding", stored) != stored:
         raise _unfit(file, "is missing" if embedding is None else "is not the embedding that run.json names")
-    digest = description.get("references")  # True in runs of earlier versions
-    if embedding is not None and embedding.references is None and digest:
-        raise _unfit(path / REFERENCES_FILE, "is missing")
-    if isinstance(digest, str):
+    if digest := description.get("references"):
         _intact(path / REFERENCES_FILE, digest)
     surfaces = None
     if description["format"] == FORMAT_WITH_SURFACES:
@@ -191,15 +188,18 @@ def weights_file(run: Path, name: str) -> Path:
     return run / "weights" / f"{name}.safetensors"
 
 
-def _intact(path: Path, digest: str) -> bytes:
-    """Return the content of a file; raise InputError if it is missing or its SHA-256 is not `digest`."""
+def _intact(path: Path, digest: str | bool) -> bytes:
+    """Return the content of a file; raise InputError if it is missing or its SHA-256 is not `digest`.
+
+    Runs of earlier versions have True in place of the digest of references.
+    """
     try:
         content = read_file(path)
     except FileNotFoundError:
         raise _unfit(path, "is missing") from None
     except OSError as error:
         raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
-    if content_digest([content]) != digest:
+    if digest is not True and content_digest([content]) != digest:
         raise _unfit(path, f"is damaged: its SHA-256 is not the one in {RUN_FILE}")
     return content
 
