@@ -5,6 +5,7 @@ take these arguments.
 """
 
 import doctest
+import importlib
 import json
 import re
 import sys
@@ -57,6 +58,14 @@ def run_blocks(page: str, *numbers: int, **names: Any) -> dict[str, Any]:
 
 def test_every_python_block_is_executed() -> None:
     assert {page: len(blocks_of(page)) for page in PAGES if blocks_of(page)} == BLOCKS
+
+
+@pytest.mark.slow
+def test_examples_in_docstrings_give_what_they_show() -> None:
+    files = [path for package in ("colornet", "thor2_jax", "training") for path in (ROOT / package).rglob("*.py")]
+    modules = [str(path.relative_to(ROOT))[:-3].replace("/", ".") for path in files if ">>> " in path.read_text()]
+    results = {name: doctest.testmod(importlib.import_module(name)) for name in modules}
+    assert len(results) > 10 and not any(result.failed for result in results.values())
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ On CPUs, large batches are computed in chunks of clouds, so that intermediate ta
 `map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators, both simply call the function.
 `describe_stream` describes more clouds than fit into memory, and `describe_sharded` a batch on several devices:
 
->>> mesh = batch_mesh()                                             # doctest: +SKIP   # all devices of all processes
->>> clouds = shard_clouds(PointClouds.pack(local), mesh)            # doctest: +SKIP   # the clouds of this process
->>> descriptors = describe_sharded(clouds, network, config)         # doctest: +SKIP   # sharded like the clouds
+>>> mesh = batch_mesh()  # all devices of all processes             # doctest: +SKIP
+>>> clouds = shard_clouds(PointClouds.pack(local), mesh)  # the clouds of this process   # doctest: +SKIP
+>>> descriptors = describe_sharded(clouds, network, config)  # sharded like the clouds   # doctest: +SKIP
 """
 
 import functools
@@ -222,7 +222,8 @@ def describe(
         descriptor of zeros.
 
     Raises:
-        InputError: `clouds` is not a batch of clouds, or another argument is of another type.
+        InputError: `clouds` is not a batch of clouds, its fields have other shapes, points or colours are not
+            floating, or another argument is of another type.
     """
     check_batch(clouds)
     check_types(network=network, config=config, parameters=parameters)
@@ -260,11 +261,11 @@ def describe_stream(
         Descriptors of up to `batch` clouds, as NumPy arrays.
 
     Raises:
-        InputError: `batch` is not positive, or `PointClouds.pack` refuses a cloud; the message gives the index of the
-            cloud in its batch.
+        InputError: `batch` is not a positive integer, or `PointClouds.pack` refuses a cloud; the message gives the
+            index of the cloud in its batch.
     """
-    if batch < 1:
-        raise InputError(f"batch is {batch}; expected at least 1")
+    if not isinstance(batch, int | np.integer) or batch < 1:
+        raise InputError(f"batch is {batch!r}; expected a positive integer")
     return _stream(iter(clouds), network, config, capacity, batch)
 
 

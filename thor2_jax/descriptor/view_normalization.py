@@ -2,7 +2,7 @@
 
 >>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
 >>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
->>> aligned = turn(normal, DescriptorConfig())                   # doctest: +SKIP   the same as align(clouds, config)
+>>> aligned = turn(normal, DescriptorConfig())  # equals align(clouds, config)   # doctest: +SKIP
 
 View normalization rotates a cloud to a pose that does not depend on the camera's pose: that of an approximately
 minimal-volume oriented bounding box (O'Rourke 1985). Along each of its axes, a minimal box projects to a minimum-area

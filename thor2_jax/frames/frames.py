@@ -102,8 +102,9 @@ class RGBDFrame:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
             )
-        if labels is not None and labels.min() < 0:
-            raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
+        for value in () if labels is None else (labels.min(), labels.max()):
+            if not 0 <= value < 2**63:
+                raise InputError(f"labels has the value {value}; expected 0 to 2^63 - 1")
         intrinsics = Intrinsics.of(self.intrinsics)
         check_camera(intrinsics, *size)
         for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):

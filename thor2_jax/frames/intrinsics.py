@@ -136,12 +136,12 @@ class Intrinsics:
         """
         if isinstance(values, Intrinsics):
             return values
-        if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, (str, bytes)):
+        if hasattr(values, "__array__") or (isinstance(values, Sequence) and not isinstance(values, (str, bytes))):
             return cls.of_matrix(values)
         if hasattr(values, "distortion_model"):  # a CameraInfo message
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
         if not isinstance(values, Mapping):
-            raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
+            raise InputError(f"intrinsics is a {type(values).__name__}; expected fx, fy, cx, cy, or a 3 x 3 matrix")
         camera = values["intrinsic"] if isinstance(values.get("intrinsic"), Mapping) else values  # of Open3D
         matrix, scale = _parts(camera)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale
@@ -176,7 +176,8 @@ class Intrinsics:
 
 def _coefficients(distortion: Any) -> tuple[float, ...]:
     """Check the coefficients of a lens distortion and return them, or none if all are 0."""
-    if isinstance(distortion, (str, bytes, Mapping)) or not isinstance(distortion, (Sequence, np.ndarray)):
+    is_sequence = isinstance(distortion, Sequence) and not isinstance(distortion, (str, bytes))
+    if not (is_sequence or hasattr(distortion, "__array__")):
         raise InputError(f"intrinsics.distortion is {distortion!r}; expected a list of coefficients")
     values = np.asarray(distortion, dtype=object).ravel().tolist()
     for value in values:

@@ -9,6 +9,7 @@ import dataclasses
 import datetime
 import functools
 import math
+import threading
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -159,6 +160,10 @@ FEW = 10
 """Number of views of an object (without a background: of objects) below which few unknown objects are rejected."""
 
 
+_CHANGE = threading.Lock()
+"""Held during every change, so that no thread loses the change of another one. An attribute could not be pickled."""
+
+
 class ObjectGallery:
     """Enrolled objects beside the trained classes of a run.
 
@@ -245,13 +250,14 @@ class ObjectGallery:
         def change_stored(stored: Gallery) -> Gallery:
             return self._of_run(change(self._of_run(stored)))
 
-        if self.directory is None:
-            self.gallery = change_stored(self.gallery)
-            return
         embedding = None if rebuild else self.embedding.fingerprint
-        self.gallery = store.update_gallery(
-            self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
-        )
+        with _CHANGE:
+            if self.directory is None:
+                self.gallery = change_stored(self.gallery)
+            else:
+                self.gallery = store.update_gallery(
+                    self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
+                )
 
     def _of_run(self, gallery: Gallery) -> Gallery:
         """Return a gallery with the values of the run and the options; it has references only if it has objects."""

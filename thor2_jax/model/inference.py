@@ -66,15 +66,16 @@ def compute_by_chunks(
             if instance.reason is None:
                 yield instance
 
-    remaining, results = usable(), list[T]()
+    remaining, results, counts = usable(), list[T](), list[int]()
     while (chunk := list(itertools.islice(remaining, size))) or not results:
         capacity = batch_points(len(instance.points) for instance in chunk) if size > MIN_PART else None
         results.append(compute(pack_instances(chunk, padded_rows(len(chunk), size), capacity)))
-    n_rows = padded_rows(sum(instance.reason is None for instance in prepared), size)
+        counts.append(len(chunk))
+    n_padding = padded_rows(sum(counts), size) - sum(counts)
 
     def concatenate(*arrays: jax.Array) -> NDArray[Any]:
-        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
-        return np.concatenate([*arrays, padding])
+        rows = [np.asarray(array)[:count] for array, count in zip(arrays, counts, strict=True)]
+        return np.concatenate([*rows, np.zeros((n_padding, *rows[0].shape[1:]), rows[0].dtype)])
 
     return prepared, jax.tree.map(concatenate, *results)
 

@@ -183,7 +183,7 @@ class Model:
         if names is None:
             return tuple(name for name in (*THOR2, EMBEDDING) if name in self.classifiers) or tuple(self.classifiers)
         if not isinstance(names, (list, tuple)) or not names or not set(names) <= set(self.classifiers):
-            raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(self.classifiers)}")
+            raise InputError(f"classifiers is {names!r}; expected a list of some of {', '.join(self.classifiers)}")
         return tuple(dict.fromkeys(names))
 
     def answers_by(self, answer_by: str | None = None) -> AnswerBy:

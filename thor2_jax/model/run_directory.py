@@ -115,7 +115,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         contents = {name: pack_arrays(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
-        embedding = run.embedding
+        embedding, references = run.embedding, unfinished / REFERENCES_FILE
         description = {
             "format": RUN_FORMAT if run.surfaces is None else FORMAT_WITH_SURFACES,
             "descriptor_version": DESCRIPTOR_VERSION,
@@ -125,7 +125,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "classifiers": list(run.classifiers),
             "weights": {name: content_digest([content]) for name, content in contents.items()},
             **({} if embedding is None else {"embedding": embedding.fingerprint}),
-            **({} if embedding is None or embedding.references is None else {"references": True}),
+            **({"references": content_digest([references.read_bytes()])} if references.exists() else {}),
             **({} if run.surfaces is None else {"surfaces": content_digest([run.surfaces.content])}),
             "record": run.record,
         }
@@ -165,8 +165,8 @@ def load_run(path: str | Path) -> TrainedRun:
     stored = None if embedding is None else embedding.fingerprint
     if description.get("embedding", stored) != stored:
         raise _unfit(file, "is missing" if embedding is None else "is not the embedding that run.json names")
-    if embedding is not None and embedding.references is None and description.get("references"):
-        raise _unfit(path / REFERENCES_FILE, "is missing")
+    if digest := description.get("references"):
+        _intact(path / REFERENCES_FILE, digest)
     surfaces = None
     if description["format"] == FORMAT_WITH_SURFACES:
         surfaces = Surfaces.of_content(_intact(path / SURFACES_FILE, description.get("surfaces", "")))
@@ -188,15 +188,18 @@ def weights_file(run: Path, name: str) -> Path:
     return run / "weights" / f"{name}.safetensors"
 
 
-def _intact(path: Path, digest: str) -> bytes:
-    """Return the content of a file; raise InputError if it is missing or its SHA-256 is not `digest`."""
+def _intact(path: Path, digest: str | bool) -> bytes:
+    """Return the content of a file; raise InputError if it is missing or its SHA-256 is not `digest`.
+
+    Runs of earlier versions have True in place of the digest of references.
+    """
     try:
         content = read_file(path)
     except FileNotFoundError:
         raise _unfit(path, "is missing") from None
     except OSError as error:
         raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
-    if content_digest([content]) != digest:
+    if digest is not True and content_digest([content]) != digest:
         raise _unfit(path, f"is damaged: its SHA-256 is not the one in {RUN_FILE}")
     return content
 

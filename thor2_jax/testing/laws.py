@@ -2,7 +2,7 @@
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
-        assert_permutation_invariant(my_descriptor, clouds, seed)
+        assert_permutation_invariant(my_descriptor, clouds, seed, config)
 
 Each docstring states whether the property holds bit by bit. Otherwise the assertion takes a `drift`, the distance by
 which rounding may move an aligned point (`alignment_drift`), from which the bounds on images and embeddings follow

@@ -319,17 +319,13 @@ class Tracker:
             track.evidence.add(weight, probabilities, by_name)
 
     def _answers(self, tracks: Sequence[_Track]) -> list[TrackedRecognition]:
-        if not tracks:
-            return []
         model = self._recognizer.model
-        fused = [track.evidence.fused() for track in tracks]
-        probabilities = {name: np.stack([each[0][name] for each in fused]) for name in fused[0][0]}
-        scores = None
-        if fused[0][1] is not None:
-            scores = np.array([[(each or {}).get(name, 0.0) for name in model.gallery.names] for _, each in fused])
-        inference = Inference(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
-        answered = answers(model, [track.instance for track in tracks], inference)
-        return [
-            TrackedRecognition(**vars(answer), track=track.number, frames=track.frames)
-            for track, answer in zip(tracks, answered, strict=True)
-        ]
+        answered = []
+        for track in tracks:  # one by one: tracks without a recent view may have the outputs of other classifiers
+            fused, by_name = track.evidence.fused()
+            probabilities = {name: p[None] for name, p in fused.items()}
+            scores = None if by_name is None else np.array([[by_name.get(name, 0.0) for name in model.gallery.names]])
+            inference = Inference(np.array([track.overflow]), probabilities, scores=scores)
+            (answer,) = answers(model, [track.instance], inference)
+            answered.append(TrackedRecognition(**vars(answer), track=track.number, frames=track.frames))
+        return answered

@@ -97,9 +97,9 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
     ]
 
 
-def transform(pose: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float32]:
-    """Return points [n, 3] moved by a pose [4, 4]."""
-    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3], np.float32)
+def transform(pose: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float64]:
+    """Return points [n, 3] moved by a pose [4, 4]; world coordinates of maps are too large for float32."""
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3], np.float64)
 
 
 def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInstance:
@@ -114,7 +114,7 @@ def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInsta
     """
     last, pose = views[-1]
     to_last = np.linalg.inv(pose)
-    points = np.concatenate([transform(to_last @ other, view.points) for view, other in views])
+    points = np.concatenate([transform(to_last @ other, view.points) for view, other in views]).astype(np.float32)
     colors = np.concatenate([view.colors for view, _ in views])
     points, colors = downsample_to_fit(points, colors, DESCRIPTOR_VOXEL / sigma_s)
     return dataclasses.replace(last, points=points, colors=colors, boundary=np.zeros(len(points), bool), rim=None)

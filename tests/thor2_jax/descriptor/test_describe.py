@@ -66,6 +66,23 @@ def test_arguments_of_other_types_are_named() -> None:
     assert_refused(exchanged, thor2.Parameters.of, CLOSED, NETWORK)
 
 
+def test_fields_that_do_not_fit_a_batch_are_named() -> None:
+    packed = thor2.PointClouds.pack(random_clouds(1, [60, 50]))
+    fields = {
+        "colors": [np.zeros((2, 512, 3), np.uint8), packed.colors[:1]],
+        "points": [packed.points.astype(int), np.zeros((2, 512, 4), np.float32)],
+        "mask": [packed.mask[:, :1]],
+        "camera": [packed.camera[0]],
+        "boundary": [None],
+    }
+    for name, values in fields.items():
+        for value in values:
+            changed = dataclasses.replace(packed, **{name: value})
+            assert_refused(rf"clouds\.{name} is ", thor2.describe, changed, NETWORK, CLOSED)
+    empty = jax.tree.map(lambda a: a[:0], packed)
+    assert_refused(r"clouds\.points is float32 \[0, 512, 3\]", thor2.describe, empty, NETWORK, CLOSED)
+
+
 def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
     """Clouds of all sizes with the same bucket and batch size, and all parameters, share one compilation."""
     config = thor2.DescriptorConfig(homology="closed_form", alpha=0.7)  # used by no other test
@@ -150,6 +167,7 @@ def test_a_stream_is_read_two_batches_ahead_at_most() -> None:
 
 
 def test_bad_input_of_a_stream() -> None:
-    assert_refused("batch is 0", describe.describe_stream, stream(2), NETWORK, CLOSED, batch=0)
+    for batch in (0, 2.5):
+        assert_refused(f"batch is {batch}", describe.describe_stream, stream(2), NETWORK, CLOSED, batch=batch)
     bad = [*stream(2), (np.full((3, 3), np.nan), np.zeros((3, 3), np.uint8))]
     assert_refused("2", list, describe.describe_stream(bad, NETWORK, CLOSED, capacity=512, batch=4))

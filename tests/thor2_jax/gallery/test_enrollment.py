@@ -3,7 +3,10 @@
 import dataclasses
 import functools
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,6 +156,21 @@ def test_a_forgotten_class_is_never_answered() -> None:
         assert answer.name in left or (answer.name is None and not left)
         assert all(name in left for top in answer.top.values() for name, _ in top)
     assert_refused("name", recognizer.forget, next(iter(first)))
+
+
+def test_threads_do_not_lose_changes_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    recognizer, with_object = taught(run()), Gallery.with_object
+    objects = recognizer.objects
+
+    def slowly(gallery: Gallery, *given: Any, **options: Any) -> Gallery:
+        time.sleep(0.02)
+        return with_object(gallery, *given, **options)
+
+    monkeypatch.setattr(Gallery, "with_object", slowly)
+    with ThreadPoolExecutor(4) as threads:
+        for name in "defg":
+            threads.submit(objects.add, {name: objects.gallery.objects["brick"]})
+    assert set(objects.gallery.names) == {"brick", "book", *"defg"}
 
 
 def test_unusable_views_are_refused_and_nothing_changes() -> None:

@@ -93,10 +93,10 @@ def edited(**changes: Any) -> Callable[[Path], None]:
     return edit
 
 
-def flip_a_bit(path: Path) -> None:
-    content = bytearray(weights_file(path, "ce").read_bytes())
-    content[len(content) // 2] ^= 1
-    weights_file(path, "ce").write_bytes(content)
+def flip_a_bit(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
 
 
 def directory_as_weights(path: Path) -> None:
@@ -129,7 +129,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
-    "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
+    "flipped bit": (lambda path: flip_a_bit(weights_file(path, "ce")), "weights/ce.safetensors is damaged"),
+    "flipped reference": (lambda path: flip_a_bit(path / REFERENCES_FILE), "references.safetensors is damaged: its"),
     "other embedding": (other_embedding, "embedding.safetensors is not the embedding"),
     "no embedding": (lambda path: (path / EMBEDDING_FILE).unlink(), "embedding.safetensors is missing"),
     "no references": (lambda path: (path / REFERENCES_FILE).unlink(), "references.safetensors is missing; copy"),
@@ -137,6 +138,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a directory as weights": (directory_as_weights, "weights/tops.safetensors cannot be read (Is a directory)"),
     "no weights": (lambda path: weights_file(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
+
+
+def test_references_of_earlier_versions_have_no_digest(saved: Path, tmp_path: Path) -> None:
+    edited(references=True)(shutil.copytree(saved, tmp_path / "run"))
+    assert load_run(tmp_path / "run").embedding.references is not None
 
 
 @pytest.mark.parametrize("name", DAMAGES)

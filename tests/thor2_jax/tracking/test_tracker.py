@@ -74,13 +74,32 @@ def test_the_first_answer_is_that_of_the_frame_alone(is_taught: bool) -> None:
         assert_same_answers(answers, alone, 1e-3)
 
 
+@pytest.mark.parametrize("answer_by", ["both", "gallery"])
+def test_tracks_answer_as_their_last_views_after_enrolling(answer_by: str) -> None:
+    rng = np.random.default_rng(0)
+    recognizer = Recognizer(run(), embedding=small_embedding(), answer_by=answer_by)
+    image = frame_of_squares({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
+    image = dataclasses.replace(image, color=rng.integers(0, 256, image.color.shape, dtype=np.uint8))
+    tracker = recognizer.track()
+    first, _ = tracker.update(image)
+    recognizer.enroll("mug", [(image, 2)])
+    labels = np.where(image.label_image == 2, 2, 0)
+    (second,) = tracker.update(dataclasses.replace(image, labels=labels))
+    earlier, later = tracker.tracks()
+    assert "gallery" in second.top and later == second and earlier.confidence == first.confidence
+
+
 def test_poses_match_objects_of_a_camera_that_moved() -> None:
     moved = np.eye(4)
     moved[0, 3] = 0.09  # 77 pixels at a depth of 0.7 m
     boxes = frame_of_squares({1: (10, 110, SURE_A)}), frame_of_squares({1: (10, 33, SURE_A)})
-    with_poses, without = Tracker(ToyRecognizer()), Tracker(ToyRecognizer())
+    on_map = np.eye(4)
+    on_map[:3, 3] = 500_000, 4_000_000, 100
+    with_poses, without, far = (Tracker(ToyRecognizer()) for _ in range(3))
     assert [with_poses.update(f, p)[0].track for f, p in zip(boxes, (np.eye(4), moved), strict=True)] == [1, 1]
     assert [without.update(f)[0].track for f in boxes] == [1, 2]
+    below = frame_of_squares({1: (10, 60, SURE_A)}), frame_of_squares({1: (70, 60, SURE_A)})
+    assert [far.update(f, on_map)[0].track for f in below] == [1, 2]
 
 
 def test_views_with_poses_are_described_as_one_cloud() -> None:
