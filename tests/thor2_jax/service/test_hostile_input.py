@@ -1,11 +1,13 @@
 """Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
+import asyncio
 import contextlib
 import dataclasses
 import io
 import json
 import socket
 import struct
+import threading
 import zipfile
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 from failures import Pickled
 from image_files import deep_png, encode_npy, png_of_zeros
-from processes import HANG
+from processes import HANG, wait_until
 from service_requests import check_refused
 
 from thor2_jax.frames.frames import encode_image
@@ -117,6 +119,26 @@ def test_body_that_never_arrives(service: Service, teaching_url: str, monkeypatc
         headers = b"Host: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
         slow.sendall(b"POST /v1/describe HTTP/1.1\r\n" + headers)
         assert b" 408 " in slow.recv(4096).split(b"\r\n")[0]
+
+
+def test_a_request_ends_when_its_client_disconnects(
+    service: Service, teaching_url: str, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not occupy the queue until the deadline."""
+    begun, dropped = threading.Event(), service.metrics.requests.labels("/v1/recognize", "400")._value
+
+    async def never_end(*_: Any) -> None:
+        begun.set()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(service, "recognize", never_end)
+    monkeypatch.setattr(service, "settings", dataclasses.replace(service.settings, deadline=10 * HANG))
+    before = dropped.get()
+    with pytest.raises(httpx.ReadTimeout):
+        httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=httpx.Timeout(HANG, read=0.2))
+    assert begun.wait(HANG)
+    wait_until(lambda: service._in_progress == 0)
+    wait_until(lambda: dropped.get() == before + 1)
 
 
 NPZ = {"content-type": "application/octet-stream"}
