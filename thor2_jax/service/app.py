@@ -72,6 +72,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
         version="1",
         description="Recognition of the objects in an RGB-D frame with an instance segmentation.",
         lifespan=lifespan,
+        responses=error_responses(403),
         docs_url=None,  # The interactive documentation loads scripts from another server.
         redoc_url=None,
     )
@@ -129,7 +130,7 @@ def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     of_frame: dict[str, Any] = {"responses": FRAME_ERRORS, "openapi_extra": {"requestBody": schemas.FRAME_FORM}}
     if service.settings.adapt:  # A frame then changes how the next ones are recognized.
-        of_frame |= {"responses": FRAME_ERRORS | error_responses(403), "dependencies": [Depends(_check_same_site)]}
+        of_frame["dependencies"] = [Depends(_check_same_site)]
 
     @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
@@ -225,7 +226,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             raise RequestError(403, None, "Enrolling is disabled; start the service with `thor2 serve --teach`.")
 
     guards = [Depends(check_teaches), Depends(_check_same_site)]
-    routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)
+    routes = APIRouter(dependencies=guards, include_in_schema=service.settings.teach)
 
     @routes.post(
         "/v1/objects",

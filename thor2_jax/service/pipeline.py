@@ -154,7 +154,8 @@ class Service:
                 log.exception("compiling explanations failed")
             else:
                 if self.state == "ready":
-                    log.info("explanations of clouds of %d points are compiled", programs[0])
+                    source = "classifiers" if programs[1] else "gallery"
+                    log.info("explanations of clouds of %d points are compiled (%s)", programs[0], source)
 
         if programs not in self._compiled:
             self._compiled[programs] = self._compiler.submit(compile_all)

@@ -202,6 +202,7 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
     check_refused(http.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
 
 
+NO_NUMBERS = b'"1"', b"true", b"null"
 INVALID_JSON = [
     *[(body, "body") for body in (b"", b"{", b"[" * 100_000, b'{"clouds":' * 10_000, b"[]", b"\xff\xfe")],
     *[(body, "clouds") for body in (b"{}", b'{"clouds": []}', b'{"clouds": 3}')],
@@ -213,6 +214,14 @@ INVALID_JSON = [
     (b'{"clouds": [{"points": [[0, 0]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
     (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 256]]}]}', "clouds.0.colors.0.2"),
     (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 0.5]]}]}', "clouds.0.colors.0.2"),
+    *[
+        (b'{"clouds": [{"points": [[%b, 0, 0]], "colors": [[0, 0, 0]]}]}' % x, "clouds.0.points.0.0")
+        for x in NO_NUMBERS
+    ],
+    *[
+        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[%b, 0, 0]]}]}' % x, "clouds.0.colors.0.0")
+        for x in NO_NUMBERS
+    ],
     (b'{"clouds": [{"points": [], "colors": [], "other": 1}]}', "clouds.0.other"),
 ]
 
