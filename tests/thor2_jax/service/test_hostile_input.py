@@ -75,7 +75,7 @@ def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files)
             assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
-def test_invalid_forms(http: httpx.Client, files: Files) -> None:
+def test_invalid_forms(server: Any, http: httpx.Client, files: Files) -> None:
     for name in files.keys() - {"labels"}:  # A frame without labels is segmented.
         incomplete = {other: content for other, content in files.items() if other != name}
         check_refused(post(http, incomplete), 422, name, "missing")
@@ -87,8 +87,10 @@ def test_invalid_forms(http: httpx.Client, files: Files) -> None:
     check_refused(http.post("/v1/recognize", json={"color": "x"}), 415, "body")
     for boundary in ("", "; boundary=", "; boundary=" + "x" * 500):
         headers = {"content-type": f"multipart/form-data{boundary}"}
-        answer = http.post("/v1/recognize", content=b"--x\r\n\r\n", headers=headers)
-        assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
+        for content in (b"--x\r\n\r\n", b"damaged"):
+            answer = http.post("/v1/recognize", content=content, headers=headers)
+            assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
+    assert "boundary" not in server.log.read_text()
     for charset in ("punycode", "undefined", "utf-16", "none"):
         headers = {"content-type": f"multipart/form-data; boundary=x; charset={charset}"}
         check_refused(http.post("/v1/recognize", content=b"--x--\r\n", headers=headers), 415, "body", "utf-8")
