@@ -139,7 +139,10 @@ def main() -> None:
     options = parser.parse_args()
     if options.seed < 0:
         parser.error(f"--seed is {options.seed}; expected at least 0")
-    options.out.mkdir(parents=True, exist_ok=True)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out is {options.out}, which cannot be created ({error.strerror}); choose another directory")
     start = time.perf_counter()
     network, rng = colornet.load_default(), np.random.default_rng(options.seed)
 

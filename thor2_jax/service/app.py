@@ -1,6 +1,5 @@
 """HTTP routes, the page at /, authentication and error responses."""
 
-import asyncio
 import contextlib
 import io
 import secrets
@@ -73,6 +72,7 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
         version="1",
         description="Recognition of the objects in an RGB-D frame with an instance segmentation.",
         lifespan=lifespan,
+        responses=error_responses(403),
         docs_url=None,  # The interactive documentation loads scripts from another server.
         redoc_url=None,
     )
@@ -130,12 +130,12 @@ def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     of_frame: dict[str, Any] = {"responses": FRAME_ERRORS, "openapi_extra": {"requestBody": schemas.FRAME_FORM}}
     if service.settings.adapt:  # A frame then changes how the next ones are recognized.
-        of_frame |= {"responses": FRAME_ERRORS | error_responses(403), "dependencies": [Depends(_check_same_site)]}
+        of_frame["dependencies"] = [Depends(_check_same_site)]
 
     @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; a frame without labels is segmented."""
-        async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
+        async with service.admit(request, partial(read_form, form=schemas.FRAME_FORM)) as (admitted, files):
             model, prepared, _, recognitions = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
@@ -148,7 +148,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
-        async with service.admit(partial(read_form, request, schemas.FRAME_FORM)) as (admitted, files):
+        async with service.admit(request, partial(read_form, form=schemas.FRAME_FORM)) as (admitted, files):
             arguments = *await service.recognize(files, admitted, with_label_map=True), admitted.milliseconds()
             content = await run_in_threadpool(lambda: explained_frame(*arguments).model_dump_json())
         return Response(content, media_type="application/json")
@@ -159,7 +159,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
         The status is 503 until explanations of clouds of this size are compiled; this begins after the start.
         """
-        async with service.admit(partial(read_form, request, schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
+        async with service.admit(request, partial(read_form, form=schemas.WHY_FORM), WHY_SECONDS) as (admitted, files):
             return await service.why(files, admitted)
 
     responses = {200: {"content": {NPZ: schemas.ARRAYS}}, **error_responses(408, 413, 415, 422, 429, 503, 504)}
@@ -175,7 +175,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type not in (NPZ, "application/json"):
             raise RequestError(415, "body", f"The body must be application/json or {NPZ} (npz).")
-        async with service.admit(partial(read_body, request)) as (admitted, content):
+        async with service.admit(request, read_body) as (admitted, content):
             results = await service.describe(content, content_type == NPZ, admitted)
             if content_type == NPZ:
                 return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
@@ -226,7 +226,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
             raise RequestError(403, None, "Enrolling is disabled; start the service with `thor2 serve --teach`.")
 
     guards = [Depends(check_teaches), Depends(_check_same_site)]
-    routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)
+    routes = APIRouter(dependencies=guards, include_in_schema=service.settings.teach)
 
     @routes.post(
         "/v1/objects",
@@ -238,7 +238,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
         For a name that exists, set extend or replace.
         """
-        async with service.admit(partial(read_form, request, schemas.ENROLLMENT_FORM)) as (admitted, files):
+        async with service.admit(request, partial(read_form, form=schemas.ENROLLMENT_FORM)) as (admitted, files):
             known = await service.enroll(files, admitted)
         stored_name = find_name(files["name"], known.gallery.names)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == stored_name]
@@ -253,14 +253,14 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     )
     async def undo(request: Request) -> schemas.ChangeAnswer:
         """Undo the last change of the gallery, unless it has changed again since then."""
-        async with service.admit(partial(read_form, request, schemas.UNDO_FORM)) as (admitted, files):
+        async with service.admit(request, partial(read_form, form=schemas.UNDO_FORM)) as (admitted, files):
             known = await service.change(lambda objects: objects.undo(files["generation"]), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 
     @routes.delete("/v1/objects/{name:any}", responses=GALLERY_ERRORS | error_responses(404))
-    async def forget(name: str) -> schemas.ChangeAnswer:
+    async def forget(request: Request, name: str) -> schemas.ChangeAnswer:
         """Forget an object: remove its views; a trained class is no longer predicted."""
-        async with service.admit(partial(asyncio.sleep, 0)) as (admitted, _):  # The request has no body.
+        async with service.admit(request, read_body) as (admitted, _):
             known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.gallery.generation)
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from starlette.requests import ClientDisconnect, Request
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
@@ -75,6 +76,12 @@ class AdmittedRequest:
         """Return the durations of all finished stages and the total so far."""
         total = time.monotonic() - self._start
         return {name: round(seconds * 1e3, 3) for name, seconds in {**self.seconds, "total": total}.items()}
+
+
+async def _end_if_disconnected(http: Request, limit: asyncio.Timeout) -> None:
+    await http.receive()  # Only a disconnection follows the body.
+    if not limit.expired():
+        limit.reschedule(0)
 
 
 class Service:
@@ -147,7 +154,8 @@ class Service:
                 log.exception("compiling explanations failed")
             else:
                 if self.state == "ready":
-                    log.info("explanations of clouds of %d points are compiled", programs[0])
+                    source = "classifiers" if programs[1] else "gallery"
+                    log.info("explanations of clouds of %d points are compiled (%s)", programs[0], source)
 
         if programs not in self._compiled:
             self._compiled[programs] = self._compiler.submit(compile_all)
@@ -179,17 +187,19 @@ class Service:
 
     @contextlib.asynccontextmanager
     async def admit(
-        self, read_body: Callable[[], Awaitable[T]], min_seconds: float = 0.0
+        self, http: Request, read_body: Callable[[Request], Awaitable[T]], min_seconds: float = 0.0
     ) -> AsyncIterator[tuple[AdmittedRequest, T]]:
-        """Admit a request for the duration of the context; yield it with its body.
+        """Admit a request for the duration of the context, or until its client disconnects; yield it with its body.
 
         Args:
-            read_body: function that waits for the body of the request; called only if the request is admitted.
+            http: the request.
+            read_body: function that waits for its whole body; called only if the request is admitted.
             min_seconds: shortest time until the deadline, if that of the settings is shorter.
 
         Raises:
             RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
                 has not arrived and 504 otherwise; also as `read_body`.
+            ClientDisconnect: the client has disconnected.
         """
         self.check_ready()
         if self._in_progress >= self.settings.queue:
@@ -200,12 +210,18 @@ class Service:
         self._accepted += 1
         self.metrics.in_progress.inc()
         try:
-            async with asyncio.timeout(seconds):
+            async with asyncio.timeout(seconds) as limit:
                 with timed(request.seconds, "upload"):
-                    body = await read_body()
-                yield request, body
+                    body = await read_body(http)
+                watch = asyncio.create_task(_end_if_disconnected(http, limit))
+                try:
+                    yield request, body
+                finally:
+                    watch.cancel()
         except TimeoutError:
-            raise (RequestError(504) if "upload" in request.seconds else RequestError(408, "body")) from None
+            if "upload" not in request.seconds:
+                raise RequestError(408, "body") from None
+            raise (ClientDisconnect() if watch.done() else RequestError(504)) from None
         finally:
             self._in_progress -= 1
             self.metrics.in_progress.dec()

@@ -27,8 +27,10 @@ MAX_EXPLAINED = 32
 """Largest number of instances of a frame that are explained."""
 
 Milliseconds = dict[str, float]
-Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
-Channel = Annotated[int, Field(ge=0, le=255)]
+Coordinate = Annotated[
+    float, Field(strict=True, ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)
+]
+Channel = Annotated[float, Field(strict=True, ge=0, le=255, multiple_of=1)]
 
 
 class Candidate(BaseModel):

@@ -89,6 +89,7 @@ class LiveView:
 
     Attributes:
         n_frames: number of recognized frames.
+        first_error: name and error of the first frame that could not be recognized; empty if there is none.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class LiveView:
         self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
         self._times: deque[float] = deque(maxlen=FPS_FRAMES)
         self._last: dict[str, Any] = {}
-        self.n_frames = 0
+        self.n_frames, self.first_error = 0, ""
         self.publish_state("waiting", "Waiting for the first frame; the model is being compiled.")
 
     def publish_state(self, state: str, message: str) -> None:
@@ -122,6 +123,7 @@ class LiveView:
             recognitions = self._recognize(frame)
         except (InputError, OSError) as error:
             self._last = {**self._last, **values, "error": reason_of(error)}
+            self.first_error = self.first_error or f"{recorded.name}: {reason_of(error)}"
         else:
             milliseconds = 1000 * (time.perf_counter() - start)
             detections = sorted(detections_of(frame, recognitions), key=_order)

@@ -89,7 +89,8 @@ def watch(
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)
             raise
-        recognized = f"{view.n_frames} of {n_shown} were recognized"
+        first_error = f" (first error: {view.first_error})" if view.first_error else ""
+        recognized = f"{view.n_frames} of {n_shown} were recognized{first_error}"
         shown = f"no more frames, {recognized}; Ctrl-C ends"
         command = "recognize", *(given_frames.arguments or ["FRAME"])
         same = {"segment": segment, **vars(arguments)}

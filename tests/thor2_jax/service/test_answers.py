@@ -99,7 +99,8 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
     degenerate = Client(server.url, timeout=HANG).describe([empty, one_point, far_apart])
     assert not degenerate.tops2[0].any() and np.isfinite(degenerate.tops2).all()
-    assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
+    for cloud in ({"points": [], "colors": []}, {"points": [[1, 0.5, 0]], "colors": [[255.0, 0, 1]]}):
+        assert http.post("/v1/describe", json={"clouds": [cloud]}).status_code == 200
 
 
 def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
@@ -124,6 +125,8 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
         assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
     for path in ("/", "/healthz", "/v1/model", "/metrics", "/openapi.json", "/missing"):
         assert http.get(path).headers.get_list("x-content-type-options") == ["nosniff"]
+    operations = [each for path in http.get("/openapi.json").json()["paths"].values() for each in path.values()]
+    assert all("403" in operation["responses"] for operation in operations)
     for path in ("/", "/v1/objects", "/v1/recognize"):
         check_refused(http.get(path, headers={"Host": "evil.example"}), 403, "Host", "evil.example")
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):

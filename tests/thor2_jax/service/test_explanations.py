@@ -167,7 +167,7 @@ def test_compiled_explanations_are_logged_unless_the_service_stops(
         monkeypatch.setattr(service, "state", state)
         monkeypatch.setattr(service, "_compiled", {})
         service._compile_explanations((size, True)).result(HANG)
-        assert (f"clouds of {size} points are compiled" in caplog.text) == (state == "ready")
+        assert (f"clouds of {size} points are compiled (classifiers)" in caplog.text) == (state == "ready")
 
 
 @pytest.mark.slow

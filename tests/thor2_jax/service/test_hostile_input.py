@@ -1,11 +1,13 @@
 """Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
+import asyncio
 import contextlib
 import dataclasses
 import io
 import json
 import socket
 import struct
+import threading
 import zipfile
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 from failures import Pickled
 from image_files import deep_png, encode_npy, png_of_zeros
-from processes import HANG
+from processes import HANG, wait_until
 from service_requests import check_refused
 
 from thor2_jax.frames.frames import encode_image
@@ -73,7 +75,7 @@ def test_invalid_intrinsics(http: httpx.Client, files: Files, unlabelled: Files)
             assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
-def test_invalid_forms(http: httpx.Client, files: Files) -> None:
+def test_invalid_forms(server: Any, http: httpx.Client, files: Files) -> None:
     for name in files.keys() - {"labels"}:  # A frame without labels is segmented.
         incomplete = {other: content for other, content in files.items() if other != name}
         check_refused(post(http, incomplete), 422, name, "missing")
@@ -85,8 +87,10 @@ def test_invalid_forms(http: httpx.Client, files: Files) -> None:
     check_refused(http.post("/v1/recognize", json={"color": "x"}), 415, "body")
     for boundary in ("", "; boundary=", "; boundary=" + "x" * 500):
         headers = {"content-type": f"multipart/form-data{boundary}"}
-        answer = http.post("/v1/recognize", content=b"--x\r\n\r\n", headers=headers)
-        assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
+        for content in (b"--x\r\n\r\n", b"damaged"):
+            answer = http.post("/v1/recognize", content=content, headers=headers)
+            assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
+    assert "boundary" not in server.log.read_text()
     for charset in ("punycode", "undefined", "utf-16", "none"):
         headers = {"content-type": f"multipart/form-data; boundary=x; charset={charset}"}
         check_refused(http.post("/v1/recognize", content=b"--x--\r\n", headers=headers), 415, "body", "utf-8")
@@ -117,6 +121,26 @@ def test_body_that_never_arrives(service: Service, teaching_url: str, monkeypatc
         headers = b"Host: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
         slow.sendall(b"POST /v1/describe HTTP/1.1\r\n" + headers)
         assert b" 408 " in slow.recv(4096).split(b"\r\n")[0]
+
+
+def test_a_request_ends_when_its_client_disconnects(
+    service: Service, teaching_url: str, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not occupy the queue until the deadline."""
+    begun, dropped = threading.Event(), service.metrics.requests.labels("/v1/recognize", "400")._value
+
+    async def never_end(*_: Any) -> None:
+        begun.set()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(service, "recognize", never_end)
+    monkeypatch.setattr(service, "settings", dataclasses.replace(service.settings, deadline=10 * HANG))
+    before = dropped.get()
+    with pytest.raises(httpx.ReadTimeout):
+        httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=httpx.Timeout(HANG, read=0.2))
+    assert begun.wait(HANG)
+    wait_until(lambda: service._in_progress == 0)
+    wait_until(lambda: dropped.get() == before + 1)
 
 
 NPZ = {"content-type": "application/octet-stream"}
@@ -180,6 +204,7 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
     check_refused(http.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
 
 
+NO_NUMBERS = b'"1"', b"true", b"null"
 INVALID_JSON = [
     *[(body, "body") for body in (b"", b"{", b"[" * 100_000, b'{"clouds":' * 10_000, b"[]", b"\xff\xfe")],
     *[(body, "clouds") for body in (b"{}", b'{"clouds": []}', b'{"clouds": 3}')],
@@ -191,6 +216,14 @@ INVALID_JSON = [
     (b'{"clouds": [{"points": [[0, 0]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
     (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 256]]}]}', "clouds.0.colors.0.2"),
     (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 0.5]]}]}', "clouds.0.colors.0.2"),
+    *[
+        (b'{"clouds": [{"points": [[%b, 0, 0]], "colors": [[0, 0, 0]]}]}' % x, "clouds.0.points.0.0")
+        for x in NO_NUMBERS
+    ],
+    *[
+        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[%b, 0, 0]]}]}' % x, "clouds.0.colors.0.0")
+        for x in NO_NUMBERS
+    ],
     (b'{"clouds": [{"points": [], "colors": [], "other": 1}]}', "clouds.0.other"),
 ]
 
