@@ -14,6 +14,7 @@ recognition, `error`, and `objects`: the fields of the answer, box, position and
 import base64
 import contextlib
 import json
+import math
 import socket
 import threading
 import time
@@ -44,15 +45,15 @@ _JPEG_QUALITY = 80
 def paced(frames: Iterable[RecordedFrame]) -> Iterator[RecordedFrame]:
     """Yield the frames of a recording at the speed at which they were taken; late frames are skipped.
 
-    If a frame is more than `LONGEST_PAUSE` late or early, because programs are compiled or the recording has a gap, the
-    clock is reset to this frame.
+    The clock is reset to the second frame if it is late, since the first one waits until programs are compiled, and to
+    any frame that is more than `LONGEST_PAUSE` late or early, because the recording has a gap.
     """
-    offset: float | None = None  # from the time stamps to the clock
-    for frame in frames:
+    offset = -math.inf  # from the time stamps to the clock
+    for number, frame in enumerate(frames):
         stamp, now = frame.stamp / 1e9, time.monotonic()
-        if offset is None or abs(stamp + offset - now) > LONGEST_PAUSE:
-            offset = now - stamp
         ahead = stamp + offset - now
+        if not (0 if number == 1 else -LONGEST_PAUSE) <= ahead <= LONGEST_PAUSE:
+            offset, ahead = now - stamp, 0.0
         if ahead >= 0:
             time.sleep(ahead)
             yield frame

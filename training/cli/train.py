@@ -1,6 +1,7 @@
 """`thor2 train`: train a recognizer."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -183,6 +184,8 @@ def train(
             raise InputError(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
+        if not re.fullmatch(r".+:[0-9]+", coordinator):
+            raise InputError(f"coordinator is {coordinator!r}; expected HOST:PORT of process 0")
         jax.distributed.initialize(coordinator, processes, process)
     from training.objects.meshes import find_meshes
     from training.protocol import DEFAULT, PAPER, QUICK

@@ -54,7 +54,7 @@ STAMPS = [100 + k / 10 for k in range(10)]
     ("stamps", "work", "expected"),
     [
         (STAMPS, [], [(stamp, stamp - 100) for stamp in STAMPS]),
-        (STAMPS, [0.25] * 10, [(100, 0), (100.3, 0.3), (100.6, 0.6), (100.9, 0.9)]),
+        (STAMPS, [0.25] * 10, [(100, 0), (100.1, 0.25), (100.4, 0.55), (100.7, 0.85)]),
         # A first frame that takes long, as programs are compiled, loses no others.
         (STAMPS, [LONGEST_PAUSE + 5, 0.25], [(100, 0), (100.1, 7), *[(stamp, stamp - 93.1) for stamp in STAMPS[4:]]]),
         # A gap, and time stamps that go back.

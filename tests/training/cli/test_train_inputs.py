@@ -111,6 +111,7 @@ def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeyp
         ("--dataset views --processes 2", "processes is 2"),
         ("--dataset views --process 1", "process 1;"),
         ("--dataset views --coordinator localhost:1 --processes 2 --process 2", "process is 2"),
+        ("--dataset views --coordinator head --processes 2", "coordinator is 'head'; expected HOST:PORT"),
         ("--frames unlabelled", "no frame has"),
         ("--frames one", "the objects are brick; expected at least two"),
         ("--frames frames/0", "one usable instance of 'brick', 'book'"),
