@@ -210,18 +210,19 @@ def compared(
 
     Every instance and name is compared on its own, so that other numbers of instances and names compile nothing.
     """
+
+    def fit(row: int, number: int) -> NDArray[np.float32]:
+        alone = jax.tree.map(lambda a: a[row : row + 1], samples)
+        return np.asarray(fit_rows(surfaces[number], alone, np.zeros(1, int))[0])
+
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
-    largest = np.take_along_axis(probabilities, index, axis=1)
+    largest, best = np.take_along_axis(probabilities, index, axis=1), np.full(len(index), -np.inf)
     logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
     is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
-    alone = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in range(len(index))]
-    best = np.full(len(index), -np.inf)
     for k in range(index.shape[1]):
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
-        # All are dispatched before the first result is awaited.
-        fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
-        values[rows, k] = np.concatenate([values[:0, k], *fits])
+        values[rows, k] = np.concatenate([values[:0, k], *_THREADS.map(fit, rows, index[rows, k])])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
     arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
