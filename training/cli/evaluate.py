@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters, first_names
 from training.cli import options
 from training.cli.app import Table, app, console, finish, show_help, show_progress
@@ -51,15 +52,18 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames with named objects: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
     A FRAME that is a run directory, or the directory of a training with several folds, is used as a further model.
+    Recordings cannot be evaluated, since they do not contain the names of their objects.
     """
     from thor2_jax.model.run_record import run_directories
     from training.readers.frames import FrameFolder
 
+    if given.bag is not None:
+        raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     paths = given.frames or ()
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
     folder = FrameFolder(given.sources())
-    dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, (given.color, given.bag)))
+    dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
         console.print(f"skipped: {escape_characters(folder.note)}")
     _evaluate("frames", folder, dataset, job, runs, given=given.arguments)

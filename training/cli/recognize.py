@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -102,7 +103,8 @@ class _Answers:
         self._tables.write(self._given.coco, self._given.bop)
 
     def _add(self, answer: "FrameAnswer") -> None:
-        from thor2_jax.model.result_files import write_recognitions
+        from thor2_jax.files import remove_written
+        from thor2_jax.model.result_files import RESULT_FILES, write_recognitions
 
         frame, place, out = answer.frame, answer.recorded, self._given.out
         if frame is None and not self._several:
@@ -112,6 +114,8 @@ class _Answers:
         if frame is None:
             self._failed.append(answer.name)
             print_note(f"failed: {answer.name}: {answer.error}")
+            if out is not None:  # answers of an earlier call would look like new ones
+                remove_written(out / answer.name, *map(re.escape, RESULT_FILES))
             return
         self.failures.append(answer.segmentation_failure)
         self._has_unknown |= any(each.name is None for each in answer.recognitions)

@@ -50,6 +50,8 @@ def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, texts: Te
     coco_file = tmp_path / "new" / "a" / "coco.json"
     outputs = ("--out", tmp_path / "out", "--coco", coco_file)
     command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
+    (tmp_path / "out" / "000002").mkdir(parents=True)
+    (tmp_path / "out" / "000002" / "recognition.json").write_text("[]")  # answers of an earlier call
     for _ in range(2):  # it may be repeated
         out, err = texts(*command, status=2)
         answers = {line["frame"]: line for line in json_lines(out)}
