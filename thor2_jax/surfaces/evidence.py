@@ -65,9 +65,8 @@ EXPONENT = np.float32(0.5)
 `KNOWN_WEIGHTS`, of free space. The other values are from real frames, since the probabilities of the networks depend
 more on the camera than surfaces do."""
 
-
 _THREADS = ThreadPoolExecutor(thread_name_prefix="surfaces")
-"""Threads that call compiled functions, since XLA computes on CPUs what one thread calls one after the other."""
+"""Threads that call compiled functions, since XLA computes the calls of one thread one after the other on CPUs."""
 
 
 class Sample(NamedTuple):
@@ -138,7 +137,8 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     all classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class
     that is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
     """
-    n_parts = 1 << ((os.cpu_count() or 1) - 1).bit_length() if jax.default_backend() == "cpu" else 1
+    threads = jax.default_backend() == "cpu" and not isinstance(probabilities, jax.core.Tracer)
+    n_parts = 1 << ((os.cpu_count() or 1) - 1).bit_length() if threads else 1
     size = len(probabilities) // math.gcd(len(probabilities), n_parts)
     change = functools.partial(_with_evidence, probabilities, surfaces, samples, size=size)
     others = [_THREADS.submit(change, first) for first in range(size, len(probabilities), size)]

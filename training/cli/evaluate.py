@@ -57,6 +57,7 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     from thor2_jax.model.run_record import run_directories
     from training.readers.frames import FrameFolder
 
+    given.check()
     if given.bag is not None:
         raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     paths = given.frames or ()
