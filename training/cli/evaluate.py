@@ -57,12 +57,12 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     from thor2_jax.model.run_record import run_directories
     from training.readers.frames import FrameFolder
 
-    given.check()
-    if given.bag is not None:
-        raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     paths = given.frames or ()
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
+    given.check()
+    if given.bag is not None:
+        raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
