@@ -11,10 +11,14 @@ while the host prepares the next one.
 
 import dataclasses
 import itertools
+import math
+import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +30,7 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.surfaces.evidence import Sample, sample_points, with_evidence
+from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import PointClouds
 
 __all__ = [
@@ -136,7 +141,7 @@ def infer(
         return Inference(oriented.overflow, probabilities)
     samples = sample_points(clouds)
     if surfaces is not None:
-        probabilities[EMBEDDING] = with_evidence(probabilities[EMBEDDING], surfaces, samples)
+        probabilities[EMBEDDING] = _with_evidence(probabilities[EMBEDDING], surfaces, samples)
     if not embeds:
         return Inference(oriented.overflow, probabilities)
     ours, config = model.embedding.config, model.run.config
@@ -146,6 +151,28 @@ def infer(
         first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
     first = jax.tree.map(lambda a: a[:, :LOOKS], first)
     return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), samples=samples)
+
+
+def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
+    """Return `with_evidence`, computed in threads on CPUs, where XLA computes the calls of a thread one by one."""
+    if jax.default_backend() != "cpu" or isinstance(probabilities, jax.core.Tracer):
+        return with_evidence(probabilities, surfaces, samples)
+    n_rows, n_cores = len(probabilities), os.cpu_count() or 1
+    size = n_rows // math.gcd(n_rows, 1 << (n_cores - 1).bit_length())
+    parts = dict[int, jax.Array]()
+
+    def compute(first: int) -> None:
+        parts[first] = with_evidence(probabilities, surfaces, samples, first, size)
+
+    starts = range(0, n_rows, size)
+    # An executor would refuse calls while the interpreter waits for other threads at its end.
+    threads = [threading.Thread(target=compute, args=(first,)) for first in starts[1:]]
+    for thread in threads:
+        thread.start()
+    compute(0)
+    for thread in threads:
+        thread.join()
+    return jnp.concatenate([parts[first] for first in starts])
 
 
 def infer_clouds(

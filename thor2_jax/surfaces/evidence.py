@@ -11,10 +11,7 @@ and all shapes are static.
 """
 
 import functools
-import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -64,9 +61,6 @@ EXPONENT = np.float32(0.5)
 """See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
 `KNOWN_WEIGHTS`, of free space. The other values are from real frames, since the probabilities of the networks depend
 more on the camera than surfaces do."""
-
-_THREADS = ThreadPoolExecutor(thread_name_prefix="surfaces")
-"""Threads that call compiled functions, since XLA computes the calls of one thread one after the other on CPUs."""
 
 
 class Sample(NamedTuple):
@@ -128,7 +122,10 @@ def _refined_poses(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Arr
     return jax.lax.map(refine, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
 
 
-def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
+@functools.partial(jax.jit, static_argnames="size")
+def with_evidence(
+    probabilities: jax.Array, surfaces: Surfaces, samples: Sample, first: int = 0, size: int | None = None
+) -> jax.Array:
     """Return class probabilities [B, C] of an embedding, changed by the evidence e of the most probable classes.
 
     Up to `N_COMPARED` classes are compared, in the order of their probabilities p, until the next one could not come
@@ -136,20 +133,12 @@ def with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample)
     compared classes share their total probability in proportion to p^`EXPONENT` exp(`NAME_WEIGHTS` e). The odds o of
     all classes against the distractors then become s o^`EXPONENT` exp(`KNOWN_WEIGHTS` e + `KNOWN_BIAS`) for the class
     that is then most probable: s is its fraction of the total probability of all classes, and e its evidence.
+
+    With a `size`, this number of rows is changed and returned, from row `first` on.
     """
-    threads = jax.default_backend() == "cpu" and not isinstance(probabilities, jax.core.Tracer)
-    n_parts = 1 << ((os.cpu_count() or 1) - 1).bit_length() if threads else 1
-    size = len(probabilities) // math.gcd(len(probabilities), n_parts)
-    change = functools.partial(_with_evidence, probabilities, surfaces, samples, size=size)
-    others = [_THREADS.submit(change, first) for first in range(size, len(probabilities), size)]
-    return jnp.concatenate([change(0), *(other.result() for other in others)])
-
-
-@functools.partial(jax.jit, static_argnames="size")
-def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample, first: int, size: int) -> jax.Array:
-    """Return `with_evidence` for `size` rows from `first` on."""
-    rows = probabilities, samples
-    probabilities, samples = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, size), rows)
+    if size is not None:
+        rows = probabilities, samples
+        probabilities, samples = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, size), rows)
     largest, index = jax.lax.top_k(probabilities, min(N_COMPARED, probabilities.shape[1]))  # [B, K]
     logits = EXPONENT * jnp.log(jnp.maximum(largest, 1e-30))
 
@@ -210,19 +199,18 @@ def compared(
 
     Every instance and name is compared on its own, so that other numbers of instances and names compile nothing.
     """
-
-    def fit(row: int, number: int) -> NDArray[np.float32]:
-        alone = jax.tree.map(lambda a: a[row : row + 1], samples)
-        return np.asarray(fit_rows(surfaces[number], alone, np.zeros(1, int))[0])
-
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
-    largest, best = np.take_along_axis(probabilities, index, axis=1), np.full(len(index), -np.inf)
+    largest = np.take_along_axis(probabilities, index, axis=1)
     logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
     is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
+    alone = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in range(len(index))]
+    best = np.full(len(index), -np.inf)
     for k in range(index.shape[1]):
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
-        values[rows, k] = np.concatenate([values[:0, k], *_THREADS.map(fit, rows, index[rows, k])])
+        # All are dispatched before the first result is awaited.
+        fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
+        values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
     arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
