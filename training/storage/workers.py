@@ -25,7 +25,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.signals import signals_blocked
+from thor2_jax.signals import ended_by_signals, signals_blocked
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
 
@@ -124,10 +124,13 @@ class _Processes:
         ) from reason
 
     def close(self) -> None:
-        """Wait for running calls, cancel the others, and end the processes."""
-        self._threads.shutdown(cancel_futures=True)
-        while not self._idle.empty():
-            self._idle.get().shutdown()
+        """Wait for running calls, cancel the others, and end the processes; Ctrl-C ends this process meanwhile."""
+        # With an exception here, Python would wait at its end, possibly forever. Only the main thread handles signals.
+        is_main = threading.current_thread() is threading.main_thread()
+        with ended_by_signals() if is_main else contextlib.nullcontext():
+            self._threads.shutdown(cancel_futures=True)
+            while not self._idle.empty():
+                self._idle.get().shutdown()
 
 
 def local_workers(workers: int = 1) -> WorkerPool:
