@@ -155,7 +155,8 @@ def infer(
 
 def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return `with_evidence`, computed in threads on CPUs, where XLA computes the calls of a thread one by one."""
-    if jax.default_backend() != "cpu" or isinstance(probabilities, jax.core.Tracer):
+    is_traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((probabilities, surfaces, samples)))
+    if jax.default_backend() != "cpu" or is_traced or not len(probabilities):
         return with_evidence(probabilities, surfaces, samples)
     n_rows, n_cores = len(probabilities), os.cpu_count() or 1
     size = n_rows // math.gcd(n_rows, 1 << (n_cores - 1).bit_length())
