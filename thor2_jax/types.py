@@ -183,13 +183,14 @@ def check_batch(clouds: PointClouds) -> None:
     if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
         actual = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
         raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
-    b, n, _ = clouds.points.shape
+    b, n, _ = (max(size, 1) for size in clouds.points.shape)
     shapes = {"points": (b, n, 3), "colors": (b, n, 3), "mask": (b, n), "camera": (b, 3), "boundary": (b, n)}
     for name, shape in shapes.items():
         array, kind = getattr(clouds, name), "floating " if len(shape) == 3 else ""
-        if 0 in shape or np.shape(array) != shape or (kind and not jnp.issubdtype(array.dtype, jnp.floating)):
+        dtype = getattr(array, "dtype", type(array))
+        if np.shape(array) != shape or (kind and not jnp.issubdtype(dtype, jnp.floating)):
             raise InputError(
-                f"clouds.{name} is {getattr(array, 'dtype', array)} {list(np.shape(array))}; expected {kind}"
+                f"clouds.{name} is {getattr(dtype, '__name__', dtype)} {list(np.shape(array))}; expected {kind}"
                 f"{list(shape)}, with at least one cloud and one point; use PointClouds.pack"
             )
 

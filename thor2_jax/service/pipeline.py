@@ -101,7 +101,6 @@ class Service:
         self.progress = ""
         self._in_progress = self._accepted = 0
         self._compiled: dict[ExplanationPrograms, Future[None]] = {}
-        self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy only one thread.
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
@@ -110,6 +109,8 @@ class Service:
         self._batcher = Batcher(self._process_batch, settings.max_batch)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
+        # Changes that wait for another process occupy only one thread, also if their clients have disconnected.
+        self._changer = ThreadPoolExecutor(1, thread_name_prefix="gallery")
         self._warmed_up = self._compiler.submit(self._warm_up)
         jax.monitoring.register_event_duration_secs_listener(self._count_compilation)
 
@@ -182,6 +183,7 @@ class Service:
         self._pool.close()
         self._batcher.close()
         self._explainer.shutdown(cancel_futures=True)
+        self._changer.shutdown(cancel_futures=True)
         jax.monitoring.unregister_event_duration_listener(self._count_compilation)
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
@@ -325,12 +327,16 @@ class Service:
             RequestError: 500 if the gallery cannot be read, 503 while another process writes to it, 507 if it cannot be
                 written, `refused` for other errors. The gallery is unchanged.
         """
+
+        def change_copy() -> ObjectGallery:
+            copied = copy.copy(self.engine.objects)
+            copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
+            with self._gallery_errors(refused, field):
+                change(copied)
+            return copied
+
         with timed(request.seconds, "gallery"):
-            async with self._gallery_lock:
-                copied = copy.copy(self.engine.objects)
-                copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
-                with self._gallery_errors(refused, field):
-                    await asyncio.to_thread(change, copied)
+            copied = await asyncio.wrap_future(self._changer.submit(change_copy))
         self.engine.refresh()
         return copied
 

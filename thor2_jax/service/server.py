@@ -59,7 +59,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     with listening(host, port) as (listener, url):
         settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
         loggers = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
-        loggers["python_multipart"] = {"level": "CRITICAL"}  # It warns of invalid forms, which get status 400.
+        loggers["python_multipart"] = {"level": "CRITICAL"}  # It warns of invalid forms, which are refused.
         config = uvicorn.Config(
             functools.partial(_create_worker, settings, workers),
             factory=True,

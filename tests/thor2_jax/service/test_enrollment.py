@@ -1,5 +1,6 @@
 """Enrolling and forgetting objects over HTTP: changes, undo, several processes, and bad input."""
 
+import asyncio
 import json
 import shutil
 import threading
@@ -32,10 +33,11 @@ from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.gallery import store
+from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.service import pipeline
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine, recognize
-from thor2_jax.service.pipeline import Service
+from thor2_jax.service.pipeline import AdmittedRequest, Service
 from thor2_jax.service.settings import Settings
 
 from .conftest import Files
@@ -255,6 +257,28 @@ def test_a_change_waits_for_another_writer(
         assert recognized(http, files)[2:] == ["wide", "tall"]
     monkeypatch.undo()
     assert files_of(gallery) == before and enroll(http, files, "other").status_code == 200
+
+
+def test_a_change_that_waits_occupies_one_thread(http: httpx.Client, service: Service) -> None:
+    """It does so also if its client has disconnected, which cancels the request."""
+    begun, at_once, end = list[ObjectGallery](), list[int](), threading.Event()
+
+    def wait(objects: ObjectGallery) -> None:
+        begun.append(objects)
+        end.wait(HANG)
+
+    async def change_twice() -> None:
+        first, second = (asyncio.create_task(service.change(wait, 409, "name", AdmittedRequest(HANG))) for _ in "12")
+        while not begun:
+            await asyncio.sleep(0.01)
+        first.cancel()
+        await asyncio.wait([second], timeout=0.2)
+        at_once.append(len(begun))
+        end.set()
+        await second
+
+    asyncio.run(change_twice())
+    assert at_once == [1] and len(begun) == 2
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
     assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
     assert view_counts(model) == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
-    assert "--bag is " in refused("evaluate", "frames", "--bag", bag, "--model", model)
+    assert "no labels.json" in refused("evaluate", "frames", "--bag", bag, "--model", model)
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
