@@ -18,6 +18,9 @@ from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "voxel_downsample"]
 
+MAX_TABLE = 2**20
+"""Largest number of voxels of a grid whose points are counted without sorting."""
+
 
 def voxel_downsample(
     points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
@@ -49,8 +52,7 @@ def voxel_downsample(
         raise InputError(f"size is {size!r}; expected a larger one for a cloud with side lengths {sides}")
     cubes = places.astype(np.int64)
     extent = cubes.max(axis=1) + 1
-    key = (cubes[0] * extent[1] + cubes[1]) * extent[2] + cubes[2]
-    cube = np.unique(key, return_inverse=True)[1]
+    cube = _renumbered((cubes[0] * extent[1] + cubes[1]) * extent[2] + cubes[2], math.prod(extent.tolist()))
     counts = np.bincount(cube)
 
     def mean(planes: NDArray[Any]) -> NDArray[np.float64]:
@@ -60,6 +62,17 @@ def voxel_downsample(
     if colors.dtype == np.uint8:
         mean_colors = np.floor(mean_colors + 0.5)
     return mean(exact).astype(points.dtype), mean_colors.astype(colors.dtype)
+
+
+def _renumbered(key: NDArray[np.int64], n_keys: int) -> NDArray[np.intp]:
+    """Return the rank [n] of each of `key` [n], all from 0 to `n_keys` - 1, among the different ones."""
+    if n_keys > MAX_TABLE:
+        return np.unique(key, return_inverse=True)[1]
+    occurs, rank = np.zeros(n_keys, bool), np.empty(n_keys, np.intp)
+    occurs[key] = True
+    different = np.flatnonzero(occurs)
+    rank[different] = np.arange(len(different))
+    return rank[key]
 
 
 def downsample_to_fit(

@@ -139,8 +139,9 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
     (first, last), column = pixels[[0, -1]] // frame.depth.shape[1], pixels % frame.depth.shape[1]
     columns = slice(max(column.min() - RIM, 0), column.max() + RIM + 1)
     window = frame.label_image[max(first - RIM, 0) : last + RIM + 1, columns] == label
-    # This equals `scipy.ndimage.minimum_filter`, in half the time.
-    padded, (height, width) = np.pad(window, RIM, mode="edge"), window.shape
+    # This equals `scipy.ndimage.minimum_filter`, in less than half the time.
+    (height, width), padded = window.shape, np.ones(np.add(window.shape, 2 * RIM), bool)
+    padded[RIM:-RIM, RIM:-RIM] = window
     inside = np.logical_and.reduce([padded[k : k + height] for k in range(2 * RIM + 1)])
     inside = np.logical_and.reduce([inside[:, k : k + width] for k in range(2 * RIM + 1)])
     return ~inside[window]
@@ -298,7 +299,8 @@ def _around(frame: RGBDFrame, label: int) -> NDArray[np.float32]:
     corners = enlarged(row[0], row[-1], height) * width + enlarged(column.min(), column.max(), width)
     low, high = pixel_rays(corners, width, camera)
     x, y, _ = np.linspace(low, high, AROUND).T
-    around = np.stack([*np.meshgrid(x, y), np.zeros((AROUND, AROUND))], axis=-1).astype(np.float32)
+    around = np.zeros((AROUND, AROUND, 3), np.float32)
+    around[..., 0], around[..., 1] = x, y[:, None]
     u, v = around[..., 0], around[..., 1]
     if camera.distortion:
         u, v = distort(u, v, camera.distortion)

@@ -26,10 +26,10 @@ def means_by_cube(points: np.ndarray, values: np.ndarray, size: float) -> tuple[
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 501])
-@pytest.mark.parametrize("size", [0.003, 0.05, 10.0])
+@pytest.mark.parametrize("size", [0.0001, 0.003, 0.05, 10.0])
 def test_means_of_cubes(count: int, size: float) -> None:
     rng = np.random.default_rng(count)
-    points = rng.uniform(-0.1, 0.2, (count, 3))
+    points = rng.uniform(-0.1, 0.2, (count, 3)).round(2)  # some are equal
     colors = rng.uniform(0, 1, (count, 3))
     before = points.copy(), colors.copy()
     means = voxel_downsample(points, colors, size)
