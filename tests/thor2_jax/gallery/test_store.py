@@ -224,6 +224,7 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
         rebuilt = update_gallery(
             directory, lambda gallery: dataclasses.replace(gallery, embedding=FINGERPRINT), rebuild=True
         )
+        assert rebuilt.generation == {1: expected.generation + 1, 2: 1}[len(names)]
         if len(names) == 1:  # Without the former index, the two files of the mug are equally old.
             assert object_files(rebuilt) == object_files(expected)
         for name, views in load_gallery(directory, FINGERPRINT).objects.items():

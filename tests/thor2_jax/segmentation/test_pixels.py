@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from thor2_jax.segmentation.pixels import label_borders, nearest_known
+from thor2_jax.segmentation.pixels import label_borders, nearest_known, watershed
 
 MASK = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(60, 90)), 2) > 0
 
@@ -22,3 +22,14 @@ def test_borders_have_two_labels_around(largest: int) -> None:
     labels = np.where(MASK, largest, 1).astype(np.int32)
     low, high = (f(labels, size=3, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
     assert np.array_equal(label_borders(labels, 3), low != high)
+
+
+def test_a_flood_ends_at_the_edge_of_two_colors() -> None:
+    color, markers = np.full((20, 30, 3), 200, np.uint8), np.zeros((20, 30), np.int32)
+    color[:, 12:] = (30, 60, 190)
+    markers[:, 2], markers[:, 25] = 4, 7
+    flooded, expected = watershed(color, markers), np.where(np.arange(30) < 12, 4, 7)
+    np.testing.assert_array_equal(
+        np.delete(flooded, [11, 12], axis=1), np.delete(np.tile(expected, (20, 1)), [11, 12], axis=1)
+    )
+    assert np.isin(flooded, (4, 7)).all() and markers.sum() == 20 * 11

@@ -10,7 +10,7 @@ from segmentation_scenes import APART, CAMERA, TABLE_TOP, Box, best_overlaps, ca
 from slow_tier import slow
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.segmentation.table import _refined, _trimmed, segment_table
+from thor2_jax.segmentation.table import _refined, _trimmed, _without_holes, segment_table
 
 RED, BLUE, YELLOW = (190, 30, 40), (30, 60, 190), (220, 200, 40)
 TOUCHING = [Box(0.0, 0.12, (0.08, 0.03), 0.2, RED), Box(0.01, -0.06, (0.05, 0.03), 0.1, (180, 40, 40))]
@@ -150,6 +150,15 @@ def test_borders_are_refined_as_in_the_whole_image() -> None:
     labels[0:4, 0:4], labels[44:48, 60:64] = 2, 3
     np.testing.assert_array_equal(alone == 1, _refined(labels, color, 2) == 1)
     assert not _refined(np.zeros_like(labels), color, 2).any()
+
+
+@pytest.mark.parametrize(("hole", "is_filled"), [(8, True), (14, False)])
+def test_small_holes_in_a_thing_are_filled(hole: int, is_filled: bool) -> None:
+    mask = np.ones((20, 20), bool)
+    mask[:4, :4] = False  # at the border, so that it is no hole
+    whole, first = mask.copy(), 10 - hole // 2
+    mask[first : first + hole, first : first + hole] = False
+    np.testing.assert_array_equal(_without_holes(mask), whole if is_filled else mask)
 
 
 def test_the_rim_of_thick_things_is_trimmed() -> None:

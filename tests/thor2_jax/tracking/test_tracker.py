@@ -13,7 +13,7 @@ from small_runs import assert_same_answers, small_embedding, untrained_run
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.inference import Inference
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.tracker import FusedEvidence, Tracker
+from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
 from thor2_jax.tracking.viewpoints import ViewTable
 from training.rendering.camera import camera_pose
 
@@ -57,6 +57,8 @@ def test_a_view_of_fewer_points_has_a_smaller_weight() -> None:
     first *= 0.5 ** (1 / 30)  # a view loses half of its weight in 30 further ones
     mean = np.exp(np.average(np.log([SURE_A, UNSURE_B]), axis=0, weights=[first, second]))
     assert second < first / 2 and answer.confidence == pytest.approx(mean[0] / mean.sum(), abs=1e-4)
+    whole, hidden = (dataclasses.replace(recognizer.described[0], occluded=occluded) for occluded in (False, True))
+    assert view_weight(hidden) == view_weight(whole) / 2
 
 
 @pytest.mark.parametrize("is_taught", [False, True])
