@@ -123,8 +123,10 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     gallery = tmp_path / "gallery"
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     text = printed("explain", *given, frame, "--out", tmp_path / "out")
-    assert " --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
+    assert f" NAME {frame} --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
     assert seen == [(0.9, "classifiers", gallery)] * 2
+    write_frame(tmp_path / "other", {1: "book"})
+    assert " NAME FRAME --instance 1 " in printed("explain", *given, tmp_path, "--out", tmp_path / "more")
 
 
 def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:
