@@ -182,7 +182,8 @@ def _changes_text(explanation: Explanation) -> str:
 
 def _answer_table(answer: Recognition) -> Table:
     sources = [source for source in _SOURCES if answer.top.get(source)]
-    columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source]] for source in sources]
+    # Names without views in the gallery have a probability of 0.
+    columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source] if value] for source in sources]
     ranked = enumerate(itertools.zip_longest(*columns, fillvalue=""), 1)
     return ["", *(_SOURCES[source] for source in sources)], [[str(rank), *cells] for rank, cells in ranked]
 

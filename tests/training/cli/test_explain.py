@@ -15,6 +15,7 @@ from written_files import ParsedPage
 
 from thor2_jax import capacity
 from thor2_jax.errors import InputError
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.cli.app import option_arguments
@@ -81,6 +82,13 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
         assert names == ["explanation.html", "explanation.json", "scan.ply"]
     assert "photo.png" in refused(*command, 4)
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
+
+
+def test_names_without_enrolled_views_are_left_out() -> None:
+    answer = Recognition(
+        1, "mug", 0.9, top={"embedding": [("mug", 0.9), ("bowl", 0.1)], "gallery": [("mug", 1.0), ("bowl", 0.0)]}
+    )
+    assert explanation_page._answer_table(answer)[1] == [["1", "mug 90.0 %", "mug >99.9 %"], ["2", "bowl 10.0 %", ""]]
 
 
 def test_texts_of_a_page() -> None:
