@@ -241,8 +241,7 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
-        name = escape_characters(r.name or "unrecognized")
-        occluded = "yes" if r.occluded else "no"
+        name, occluded = escape_characters(r.name or "unrecognized"), "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:
