@@ -310,8 +310,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     """Read the depth channel of an EXR file."""
-    with open_file(path):  # raises OSError if it cannot be opened, unlike OpenEXR
-        pass
+    open_file(path).close()  # raises OSError if it cannot be opened, unlike OpenEXR
     with needs_extra(f"depth: {path} is an EXR file; expected PNG, TIFF or NPY; EXR", "OpenEXR", "exr"):
         import OpenEXR
     with decoding(f"depth: {path} is a damaged EXR file", _EXPECTED):

@@ -82,7 +82,7 @@ class GalleryObject:
         clouds: the views as they were enrolled.
         source: source of the views: "mesh", "frames" or "mesh and frames".
         date: date of the last enrollment, ISO 8601.
-        surface: `Surfaces.arrays` of its mesh; None without a mesh, and for objects of version 0.2 and before.
+        surface: `Surfaces.arrays` of its mesh; None without a mesh, and for objects of earlier versions.
         file: name of its file in the gallery on disk; None until it is written.
     """
 

@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 GALLERY_FORMAT, FORMAT_WITH_SURFACES = 1, 2
-"""Versions of the layout above; the second one is written if an object has a surface, which version 0.2 cannot read."""
+"""Versions of the layout above; the second one, with surfaces, is one that earlier versions cannot read."""
 
 GALLERY_DIRECTORY = "gallery"
 """Name of the gallery in a run directory."""
@@ -199,7 +199,7 @@ def _object_content(name: str, views: GalleryObject) -> bytes:
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
-    """Return the name of an object (None in files of version 0.2 and before) and the object."""
+    """Return the name of an object (None in files of earlier versions) and the object."""
     try:
         content = read_file(path)
     except FileNotFoundError:

@@ -15,6 +15,7 @@ import functools
 import io
 import itertools
 import os
+import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -36,7 +37,7 @@ CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
 
-_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
+_REPAIR = {".bag": "rosbag reindex {}", ".mcap": "mcap recover {} -o recovered.mcap", ".db3": "ros2 bag reindex {}"}
 """Suffix of a file -> command that repairs it; for directories, the command of .db3."""
 
 MAX_DECOMPRESSED = 2**28
@@ -169,10 +170,13 @@ class Bag:
                 "or raise max_gap"
             )
 
+    def _repair(self, suffix: str) -> str:
+        return _REPAIR[suffix].format(shlex.quote(str(self.path)))
+
     def _truncation(self) -> InputError:
         return InputError(
             f"bag: {self.path} is truncated after {self.counts.color} colour images: its end is missing; "
-            f"repair it: {_REPAIR['.mcap']} {self.path.name}, or record it again"
+            f"repair it: {self._repair('.mcap')}, or record it again"
         )
 
     def _read(self, color_message: Any, depth_message: Any) -> RGBDFrame:
@@ -234,11 +238,11 @@ class Bag:
         except Exception as error:
             reason = reason_of(error).rstrip(".")
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
-            repair = _REPAIR.get(".db3" if self.path.is_dir() else self.path.suffix)
+            suffix = ".db3" if self.path.is_dir() else self.path.suffix
             raise InputError(
                 f"bag: {self.path} is damaged or of another format{after} ({reason}); expected a ROS 1 bag (.bag), a "
                 f"ROS 2 bag (directory, .db3) or MCAP of ROS 2"
-                + (f"; repair it: {repair} {self.path.name}" if repair else "")
+                + (f"; repair it: {self._repair(suffix)}" if suffix in _REPAIR else "")
             ) from None
 
 

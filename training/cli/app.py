@@ -218,6 +218,8 @@ def main() -> None:
     sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:
         _check_not_empty(sys.argv[1:])
+        # If a signal ends this process, the process that then removes the semaphores of its workers would warn of them.
+        sys.warnoptions.append("ignore:resource_tracker")
         enable_compilation_cache()
         if 0 < gc.get_threshold()[0] < COLLECTION_THRESHOLD:  # tests set a higher one
             gc.set_threshold(COLLECTION_THRESHOLD)

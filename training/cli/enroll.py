@@ -38,7 +38,7 @@ def enroll(
     ] = None,
     labelled: Annotated[
         list[Path] | None,
-        typer.Option("--frames", metavar="FRAME...", help="Frames whose labelled objects are all enrolled; no NAME."),
+        typer.Option("--frames", metavar="FRAME...", help="Frames; without NAME, all their labelled objects."),
     ] = None,
     target: EnrollOptions,
     segment: options.SegmentOption = None,

@@ -67,5 +67,6 @@ def explain(
         finish(pages, "list the objects of the model", "objects", model=model, gallery=gallery)
     else:
         purpose = "if a name is wrong, add this view of the object"
-        command = "enroll", "NAME", *given.arguments
+        # In several frames, the same label number is of different objects.
+        command = "enroll", "NAME", *(given.arguments if len(sources) == 1 else ["FRAME"])
         finish(pages, purpose, *command, segment=segment, instance=last, model=model, gallery=gallery, extend=True)

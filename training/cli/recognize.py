@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import itertools
 import json
-import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -103,10 +102,16 @@ class _Answers:
         self._tables.write(self._given.coco, self._given.bop)
 
     def _add(self, answer: "FrameAnswer") -> None:
-        from thor2_jax.files import remove_written
         from thor2_jax.model.result_files import RESULT_FILES, write_recognitions
 
         frame, place, out = answer.frame, answer.recorded, self._given.out
+        if out is not None and self._several:
+            out = out / answer.name
+        if frame is None and out is not None:  # answers of an earlier call would look like new ones
+            for file in reversed(RESULT_FILES):
+                (out / file).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # The directory is missing or has other files.
+                out.rmdir()
         if frame is None and not self._several:
             raise InputError(str(answer.error))
         if self._as_json:
@@ -114,8 +119,6 @@ class _Answers:
         if frame is None:
             self._failed.append(answer.name)
             print_note(f"failed: {answer.name}: {answer.error}")
-            if out is not None:  # answers of an earlier call would look like new ones
-                remove_written(out / answer.name, *map(re.escape, RESULT_FILES))
             return
         self.failures.append(answer.segmentation_failure)
         self._has_unknown |= any(each.name is None for each in answer.recognitions)
@@ -124,7 +127,7 @@ class _Answers:
         if self._given.coco or self._given.bop:
             self._tables.add(answer.name, frame, answer.detections, answer.seconds)
         if out is not None:
-            write_recognitions(out / answer.name if self._several else out, frame, answer.recognitions)
+            write_recognitions(out, frame, answer.recognitions)
         if self._bag is not None and place is not None:
             self._bag.write(frame, answer.detections, stamp=place.stamp, frame_id=place.frame_id)
         if self._rerun is not None:
@@ -238,8 +241,7 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
-        name = escape_characters(r.name or "unrecognized")
-        occluded = "yes" if r.occluded else "no"
+        name, occluded = escape_characters(r.name or "unrecognized"), "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:

@@ -222,7 +222,7 @@ def _report(directory: Path, runs: Sequence[Any], has_baselines: bool) -> None:
         for name, accuracy in run.record["held_out_accuracy"].items():
             console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
         if run.embedding is not None and run.surfaces is None:
-            console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of version 0.2 or before")
+            console.print(f"{fold}no surfaces: a class has no mesh, or its dataset is of an earlier version")
     model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
     if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
         views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())

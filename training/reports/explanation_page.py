@@ -28,12 +28,6 @@ _SOURCES = {
     "gallery": "gallery",
 }
 
-_DECIDED = (
-    "The attribution of a point is approximately how much the answer would lose without it. {check} Points that are "
-    "left out together can matter more, or less, than the sum of their attributions; the exact check shows how large "
-    "this difference is for the strips of this object."
-)
-
 _SURFACES = (
     "Recognition also compares the points with the surfaces of the most probable objects, in the pose that fits best. "
     "This changes their probabilities, and decides whether the object is known. The distance is that of the points "
@@ -112,10 +106,12 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     answer += " The attributions below explain this number."
     if explanation.runner_up is not None:
         answer += f" The best other name is {explanation.runner_up}."
-    comparison = (
-        "Without the tenth of the points with the highest attributions, the answer "
-        f"{loss_text(explanation, check.most_attributed)}; without a random tenth, it "
-        f"{loss_text(explanation, check.random)} on average."
+    decided = (
+        "The attribution of a point is approximately how much the answer would lose without it. Without the tenth of "
+        f"the points with the highest attributions, the answer {loss_text(explanation, check.most_attributed)}; "
+        f"without a random tenth, it {loss_text(explanation, check.random)} on average. Points that are left out "
+        "together can matter more, or less, than the sum of their attributions; the exact check shows how large this "
+        "difference is for the strips of this object."
     )
     surfaces = [
         Section("Does it fit the surfaces?", _SURFACES, _surfaces_table(explanation), pictures.get("surfaces", ()))
@@ -123,7 +119,7 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
     return [
         Section("The answer", answer, _answer_table(explanation.recognition)),
-        Section("What decided", _DECIDED.format(check=comparison), pictures=pictures["decided"]),
+        Section("What decided", decided, pictures=pictures["decided"]),
         *(surfaces if explanation.surfaces else []),
         Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
         *resembling,
@@ -182,7 +178,8 @@ def _changes_text(explanation: Explanation) -> str:
 
 def _answer_table(answer: Recognition) -> Table:
     sources = [source for source in _SOURCES if answer.top.get(source)]
-    columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source]] for source in sources]
+    # Names without views in the gallery have a probability of 0.
+    columns = [[f"{name} {_percent(value)}" for name, value in answer.top[source] if value] for source in sources]
     ranked = enumerate(itertools.zip_longest(*columns, fillvalue=""), 1)
     return ["", *(_SOURCES[source] for source in sources)], [[str(rank), *cells] for rank, cells in ranked]
 

@@ -76,9 +76,7 @@ def _figure(picture: Picture) -> str:
 
 
 def _content(section: Section) -> str:
-    elements = []
-    if section.text:
-        elements.append(f"<p>{html.escape(section.text)}</p>")
+    elements = [f"<p>{html.escape(section.text)}</p>"] if section.text else []
     if section.table is not None:
         elements.append(_table(section.table))
     figures = "".join(map(_figure, section.pictures))

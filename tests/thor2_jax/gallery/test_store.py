@@ -236,7 +236,7 @@ def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> No
     index = json.loads((directory / "index.json").read_text())
     for entry, name in zip(index["objects"], ("mug ", "unknown"), strict=True):
         path = directory / "objects" / f"{entry['file']}.safetensors"
-        content = safetensors.numpy.save(safetensors.numpy.load_file(path))  # without a name, as version 0.2 wrote it
+        content = safetensors.numpy.save(safetensors.numpy.load_file(path))  # without a name, as of earlier versions
         entry |= {"name": name, "file": hashlib.sha256(content).hexdigest()}
         path.unlink()
         path.with_name(f"{entry['file']}.safetensors").write_bytes(content)

@@ -208,7 +208,7 @@ def test_columns_of_other_types_and_sizes(tmp_path: Path, computed: str, monkeyp
 
 def test_no_recording_or_no_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "x.bag").mkdir()
-    message = "damaged or of another format.*metadata.yaml((?!repair).)*repair it: ros2 bag reindex x.bag$"
+    message = "damaged or of another format.*metadata.yaml((?!repair).)*repair it: ros2 bag reindex .*/x.bag$"
     assert_refused(message, Bag(tmp_path / "x.bag").__enter__)
     for open_file, name in ((Bag, "bag"), (DetectionBag, "out_bag"), (RerunFile, "rerun")):
         assert_refused(f"^{name} is 'a.x00b'; expected a path", open_file, "a\0b")

@@ -158,6 +158,24 @@ import training.cli
     assert (done.returncode, done.stderr) == (130, "")
 
 
+def test_a_signal_with_workers_leaves_no_warning() -> None:
+    code = """
+import os, signal, sys
+import training.cli
+from training.storage.workers import local_workers
+
+def command(**_):
+    results = local_workers(2)(eval, ["1"] * 9)
+    next(results)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+sys.modules["training.cli.app"].app = command
+sys.modules["training.cli.app"].main()
+"""
+    done = run_python("-c", code)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
+
 class Finalized:
     """An object whose finalizer is interrupted."""
 

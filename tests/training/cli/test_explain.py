@@ -15,6 +15,7 @@ from written_files import ParsedPage
 
 from thor2_jax import capacity
 from thor2_jax.errors import InputError
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.cli.app import option_arguments
@@ -83,6 +84,13 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 
 
+def test_names_without_enrolled_views_are_left_out() -> None:
+    answer = Recognition(
+        1, "mug", 0.9, top={"embedding": [("mug", 0.9), ("bowl", 0.1)], "gallery": [("mug", 1.0), ("bowl", 0.0)]}
+    )
+    assert explanation_page._answer_table(answer)[1] == [["1", "mug 90.0 %", "mug >99.9 %"], ["2", "bowl 10.0 %", ""]]
+
+
 def test_texts_of_a_page() -> None:
     """Advice on a wrong name, and what is said if surfaces or an enrolled object decided against the best score."""
     change = SimpleNamespace(kind="color")
@@ -123,8 +131,10 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     gallery = tmp_path / "gallery"
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     text = printed("explain", *given, frame, "--out", tmp_path / "out")
-    assert " --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
+    assert f" NAME {frame} --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
     assert seen == [(0.9, "classifiers", gallery)] * 2
+    write_frame(tmp_path / "other", {1: "book"})
+    assert " NAME FRAME --instance 1 " in printed("explain", *given, tmp_path, "--out", tmp_path / "more")
 
 
 def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:

@@ -20,6 +20,7 @@ from written_files import files_of
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.model.result_files import RESULT_FILES
 from training.cli import recognize as recognize_command
 from training.readers.frames import FrameFiles
 
@@ -38,6 +39,14 @@ def test_output_for_one_frame(model: Path, recognize: Recognize, tmp_path: Path,
     Image.fromarray(np.zeros_like(small_frame().labels)).save(folder / "mask.png")
     background = printed("recognize", "--model", model, folder)
     assert "no instances" in background and "confidence" not in background
+
+
+def test_a_frame_that_fails_has_no_earlier_answer(model: Path, tmp_path: Path, refused: Command) -> None:
+    folder, out = write_frame_files(tmp_path / "one", small_frame()), tmp_path / "out"
+    command = ("recognize", "--model", model, *frame_options(folder), "--out", out)
+    assert run_thor2(*command) == 0 and sorted(path.name for path in out.iterdir()) == sorted(RESULT_FILES)
+    (folder / "depth.png").write_bytes(b"damaged")
+    assert "depth.png" in refused(*command) and not out.exists()
 
 
 def test_one_failing_frame_loses_no_other(model: Path, tmp_path: Path, texts: Texts) -> None:
@@ -303,11 +312,11 @@ def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: C
 
 
 def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, texts: Texts) -> None:
-    path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
+    path = write_recording(tmp_path / "a b.mcap", [table_frame(k) for k in range(8)])
     path.write_bytes(path.read_bytes()[: -(10**6)])
     out, err = texts("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", status=2)
     n_frames = len(json_lines(out))
-    assert 0 < n_frames < 8 and "mcap recover" in err and err.count("\n") == 1
+    assert 0 < n_frames < 8 and f"mcap recover '{path}' -o" in err and err.count("\n") == 1
     assert f"frames recognized before: {n_frames}, written to {tmp_path / 'out.mcap'}" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == n_frames
 
