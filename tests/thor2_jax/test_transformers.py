@@ -68,6 +68,8 @@ def test_shape_needs_no_colors() -> None:
     np.testing.assert_array_equal(transformer.transform([xyz for xyz, _ in clouds]), expected)
     same_size = np.stack([clouds[0][0]] * 2)
     np.testing.assert_allclose(transformer.transform(same_size), expected[[0, 0]], atol=1e-6)
+    np.testing.assert_array_equal(transformer.transform(tuple(xyz for xyz, _ in clouds[:2])), expected[:2])
+    assert_refused("X is two arrays", transformer.transform, (clouds[0][0], np.random.rand(*clouds[0][0].shape)))
 
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
