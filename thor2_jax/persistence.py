@@ -178,6 +178,7 @@ def images(
             not a positive number.
     """
     check_types(diagrams=diagrams)
+    diagrams = jax.tree.map(lambda values: _as_jax("diagrams", values, "arrays"), diagrams)
     dtype = getattr(diagrams.births, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")
