@@ -203,6 +203,14 @@ def test_a_first_surface_comes_with_views_that_are_stored() -> None:
         assert enrolled.surface is given and len(enrolled.clouds) == count
 
 
+def test_surfaces_of_objects_are_unknown_to_classifiers_alone() -> None:
+    for answer_by in ("both", "gallery", "classifiers"):
+        recognizer = taught(run(), answer_by=answer_by)
+        recognizer.objects.enroll("mesh", [instance_view(CLUTTER, 1, 2.5)], "mesh", Surfaces.empty().arrays)
+        assert (recognizer.model.surface_of("mesh") is None) == (answer_by == "classifiers")
+        assert recognizer.model.surface_of("brick") is recognizer.model.surface_of("a") is None
+
+
 def test_views_get_augmented_copies() -> None:
     recognizer = taught(untrained_run((), ()))
     views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
