@@ -47,8 +47,8 @@ def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Dia
     of the edge. They exist where no two heights are equal.
 
     Args:
-        heights: [..., N] floating, one height for each vertex. A vertex of height NaN or infinity is absent and its
-            neighbours are not connected, so that lines of different lengths are padded with either.
+        heights: [..., N] floating, one height for each vertex. A vertex of height NaN, infinity or -infinity is absent
+            and its neighbours are not connected, so that lines of different lengths are padded with any of these.
         edges: [..., N - 1] floating, height of the edge between vertices i and i + 1; by default that of the higher
             vertex. A lower edge is raised to that height, since an edge cannot appear before its vertices; NaN or
             infinity cuts the line.
@@ -86,24 +86,19 @@ def _as_jax(name: str, values: ArrayLike, expected: str) -> jax.Array:
 
 @jax.jit
 def _sublevel_diagrams(heights: jax.Array, edges: jax.Array | None) -> Diagrams:
-    heights = _nan_as_infinity(heights)
+    heights = jnp.where(jnp.isfinite(heights), heights, jnp.inf)
     left, right = heights[..., :-1], heights[..., 1:]
     lowest = jnp.where(left >= right, left, right)
     if edges is None:
         edges = lowest
     else:
-        edges = _nan_as_infinity(edges.astype(heights.dtype))
-        edges = jnp.where(edges > lowest, edges, lowest)
+        edges = jnp.where(edges > lowest, edges.astype(heights.dtype), jnp.where(jnp.isnan(edges), jnp.inf, lowest))
     if edges.size == 0:
         return Diagrams(jnp.zeros_like(heights), jnp.zeros_like(heights), jnp.zeros(heights.shape, bool))
     index = jnp.vectorize(_death_edges, signature="(n),(m)->(n)")(*jax.lax.stop_gradient((heights, edges)))
     deaths = jnp.take_along_axis(edges, jnp.maximum(index, 0), axis=-1)
     mask = (index >= 0) & jnp.isfinite(heights) & (deaths > heights)
     return Diagrams(births=jnp.where(mask, heights, 0), deaths=jnp.where(mask, deaths, 0), mask=mask)
-
-
-def _nan_as_infinity(values: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isnan(values), jnp.inf, values)
 
 
 def _death_edges(heights: jax.Array, edges: jax.Array) -> jax.Array:
@@ -183,6 +178,7 @@ def images(
             not a positive number.
     """
     check_types(diagrams=diagrams)
+    diagrams = jax.tree.map(lambda values: _as_jax("diagrams", values, "arrays"), diagrams)
     dtype = getattr(diagrams.births, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         raise InputError(f"diagrams has births {reprlib.repr(diagrams.births)}; expected floating arrays")

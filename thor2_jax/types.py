@@ -188,7 +188,8 @@ def check_batch(clouds: PointClouds) -> None:
     for name, shape in shapes.items():
         array, kind = getattr(clouds, name), "floating " if len(shape) == 3 else ""
         dtype = getattr(array, "dtype", type(array))
-        if np.shape(array) != shape or (kind and not jnp.issubdtype(dtype, jnp.floating)):
+        # JAX would read the bytes of an array of the other byte order in the wrong order.
+        if np.shape(array) != shape or (kind and not (jnp.issubdtype(dtype, jnp.floating) and dtype.isnative)):
             raise InputError(
                 f"clouds.{name} is {getattr(dtype, '__name__', dtype)} {list(np.shape(array))}; expected {kind}"
                 f"{list(shape)}, with at least one cloud and one point; use PointClouds.pack"

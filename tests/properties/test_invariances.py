@@ -8,13 +8,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import instance_clouds
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_clouds, prepare_instance
 
 from .conftest import NETWORK
 
@@ -94,12 +95,31 @@ def test_laws_take_clouds_on_the_host_and_their_rim() -> None:
     laws.assert_company_invariant(describe, clouds, others)
 
 
+def prepared_instances(frame: RGBDFrame) -> list[PreparedInstance]:
+    return [prepare_instance(frame, label, CONFIG.sigma_s) for label in frame.instances]
+
+
 @given(frame=laws.frames(), seed=laws.seeds(), factor=st.sampled_from([1, 300]))
 def test_label_numbers_are_names(frame: RGBDFrame, seed: int, factor: int) -> None:
     labels = frame.label_image.astype(np.int32) * factor
-    laws.assert_labels_are_names(instance_clouds, dataclasses.replace(frame, labels=labels), seed)
+    for clouds_of in (instance_clouds, prepared_instances):
+        laws.assert_labels_are_names(clouds_of, dataclasses.replace(frame, labels=labels), seed)
 
 
 @given(frame=laws.frames())
 def test_units_of_depth(frame: RGBDFrame) -> None:
-    laws.assert_depth_units_agree(instance_clouds, frame)
+    for clouds_of in (instance_clouds, prepared_instances):
+        laws.assert_depth_units_agree(clouds_of, frame)
+
+
+def test_laws_of_frames_compare_occlusion() -> None:
+    labels, depth = np.zeros((60, 60), np.int32), np.full((60, 60), 700, np.uint16)
+    labels[10:50, 10:30], labels[10:50, 30:50], depth[:, 30:] = 1, 2, 600
+    frame = RGBDFrame(np.zeros((60, 60, 3), np.uint8), depth, labels, thor2.Intrinsics(100.0, 100.0, 30.0, 30.0))
+    assert [each.occluded for each in prepared_instances(frame)] == [True, False]
+
+    def by_numbers(frame: RGBDFrame) -> list[PreparedInstance]:
+        return [dataclasses.replace(each, occluded=each.label == 2) for each in prepared_instances(frame)]
+
+    with pytest.raises(AssertionError, match="occluded"):
+        laws.assert_labels_are_names(by_numbers, frame, 0)

@@ -65,6 +65,7 @@ def test_absent_vertices_and_edges() -> None:
         first = persistence.sublevel_diagrams(heights, None if gaps is None else edges)
         assert_as_gudhi(values, gaps)
         jax.tree.map(np.testing.assert_array_equal, first, persistence.sublevel_diagrams(values, gaps))
+    assert_as_gudhi(np.where(np.isinf(expected[0]), -np.inf, heights))  # for superlevel sets
     short = np.where(np.arange(17) < 9, expected[0], np.inf)
     assert_as_gudhi(short)
     assert len(gudhi_pairs(short[0])) == len(gudhi_pairs(expected[0][0, :9]))
@@ -104,7 +105,12 @@ def test_images_against_persim(variance: float, exponent: float) -> None:
     images = persistence.images(persistence.sublevel_diagrams(heights), **IMAGE, variance=variance, exponent=exponent)
     assert images.shape == (3, 8, 6) and images.dtype == np.float32
     for image, line in zip(images, heights, strict=True):
-        np.testing.assert_allclose(image, persim_image(gudhi_pairs(line), variance, exponent), atol=2e-6)
+        pairs = gudhi_pairs(line)
+        np.testing.assert_allclose(image, persim_image(pairs, variance, exponent), atol=2e-6)
+        for dtype in (np.float32, np.float64, ">f4"):  # diagrams of another source
+            other = persistence.Diagrams(*pairs.T.astype(dtype), np.ones(len(pairs), bool))
+            same = persistence.images(other, **IMAGE, variance=variance, exponent=exponent)
+            np.testing.assert_allclose(same, image, atol=2e-6)
 
 
 def test_the_image_of_no_pairs_is_zero_with_zero_gradients() -> None:

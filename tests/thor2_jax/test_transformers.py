@@ -68,6 +68,8 @@ def test_shape_needs_no_colors() -> None:
     np.testing.assert_array_equal(transformer.transform([xyz for xyz, _ in clouds]), expected)
     same_size = np.stack([clouds[0][0]] * 2)
     np.testing.assert_allclose(transformer.transform(same_size), expected[[0, 0]], atol=1e-6)
+    np.testing.assert_array_equal(transformer.transform(tuple(xyz for xyz, _ in clouds[:2])), expected[:2])
+    assert_refused("X is two arrays", transformer.transform, (clouds[0][0], np.random.rand(*clouds[0][0].shape)))
 
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
@@ -100,9 +102,9 @@ INVALID: list[tuple[str, Any, dict[str, Any]]] = [
     ("X[0]: rgb is [2, 3]", [(XYZ, RGB[:2])], {}),
     ("X[1] has 8193 points", [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))], {}),
     ("larger capacity", [(XYZ, RGB)], {"capacity": np.array([2])[0]}),  # as a grid search over an array gives it
-    ("config is 'paper'", [(XYZ, RGB)], {"config": "paper"}),
+    ("config is a str", [(XYZ, RGB)], {"config": "paper"}),
     *((f"capacity is {value!r}", [(XYZ, RGB)], {"capacity": value}) for value in (0, 2.5, True)),
-    ("network is 3", [(XYZ, RGB)], {"network": 3}),
+    ("network is a int", [(XYZ, RGB)], {"network": 3}),
 ]
 
 

@@ -302,18 +302,18 @@ class ObjectGallery:
     def new_views(
         self, name: str, views: Sequence[PreparedInstance], surface: Mapping[str, NDArray[Any]] | None, *, extend: bool
     ) -> CompactClouds:
-        """Return views as a gallery stores them; with `extend`, without those that the object `name` has already.
+        """Return views as a gallery stores them, without repetitions.
 
-        If the object gets its first surface with these views, all of them are new.
+        With `extend`, those that the object `name` has already are left out, unless it gets its first surface.
 
         Raises:
             InputError: a view has no points or is too large.
         """
-        clouds, stored = CompactClouds.of(views), self.gallery.objects.get(name)
-        if not extend or stored is None or (surface is not None and stored.surface is None):
-            return clouds
-        known, pairs = set(_contents(stored.clouds)), zip(views, _contents(clouds), strict=True)
-        return CompactClouds.of([view for view, content in pairs if content not in known])
+        new, stored = dict(zip(_contents(CompactClouds.of(views)), views, strict=True)), self.gallery.objects.get(name)
+        if extend and stored is not None and (surface is None or stored.surface is not None):
+            for content in _contents(stored.clouds):
+                new.pop(content, None)
+        return CompactClouds.of(list(new.values()))
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""

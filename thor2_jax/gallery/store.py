@@ -100,9 +100,10 @@ def check_open_to_changes(directory: Path) -> None:
 
 
 def check_index(directory: Path) -> None:
-    """Raise GalleryError if the path is not a directory, or is a directory with objects but without an index."""
-    if directory.exists() and not directory.is_dir():
-        raise GalleryError(f"gallery: {directory} is no directory; expected that of a gallery; choose another one")
+    """Raise GalleryError if a directory or its objects are no directory, or if it has objects but no index."""
+    for path in (directory, directory / "objects"):
+        if path.exists() and not path.is_dir():
+            raise GalleryError(f"gallery: {path} is no directory; expected that of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
         raise GalleryError(
             f"gallery: {directory} has objects, but no {INDEX_FILE}; restore it from a copy, or rebuild it: "

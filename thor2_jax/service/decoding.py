@@ -221,7 +221,7 @@ def decode_json_clouds(content: bytes) -> CloudArrays:
         raise RequestError(422, field, f"{field}: {first['msg'][:200]}.") from None
     clouds = []
     for k, cloud in enumerate(body.clouds):
-        points, colors = np.array(cloud.points, np.float32), np.array(cloud.colors, np.uint8)
+        points, colors = np.array(cloud.points, np.float32), np.rint(cloud.colors).astype(np.uint8)
         if len(colors) != len(points):
             message = f"clouds.{k} has {len(points)} points and {len(colors)} colors."
             raise RequestError(422, f"clouds.{k}.colors", message)

@@ -19,7 +19,6 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import compile_explanations, explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, ObjectGallery, enrolled_object, views_to_embed
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.model import Model
@@ -286,8 +285,8 @@ class Service:
     async def enroll(self, fields: dict[str, Any], request: AdmittedRequest) -> ObjectGallery:
         """Enroll an object from one instance of a frame, and return the new gallery.
 
-        The view and its augmented copies are embedded in batches, like the instances of frames. The fields are those of
-        `schemas.ENROLLMENT_FORM`.
+        The view and its augmented copies are embedded in batches, like the instances of frames; a view that the object
+        has already is not added. The fields are those of `schemas.ENROLLMENT_FORM`.
 
         Raises:
             RequestError: 409 if the name exists and neither `extend` nor `replace` is true, 422 if both are; also as
@@ -296,17 +295,21 @@ class Service:
         name, flags = fields["name"], {flag: fields.get(flag, False) for flag in ("extend", "replace")}
         if all(flags.values()):
             raise RequestError(422, "replace", "extend and replace are both true; choose one.")
+        objects = self.known_objects()
         with self._gallery_errors(409, "name"):
-            self.known_objects().gallery.name_to_enroll(name, **flags)
+            name = objects.gallery.name_to_enroll(name, **flags)
         prepared = await self._prepare(request, prepare_view, fields, self.engine.model.run.config)
         try:
-            clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
+            view = self.engine.correct(prepared.instances, observe=False)
+            clouds = objects.new_views(name, view, None, extend=flags["extend"])
         except InputError as error:
             message = str(error).replace("views[0]", f"instance {fields['instance']}")
             raise RequestError(422, "instance", f"{message}.") from None
         views = await asyncio.to_thread(views_to_embed, clouds, "frames")
-        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in await self._infer(views, request)])
-        added = {name: enrolled_object(embeddings, clouds, "frames")}
+        results = await self._infer(views, request)
+        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in results])
+        # Also without a new view, this is a change that can be undone.
+        added = {name: enrolled_object(embeddings, clouds, "frames")} if clouds else {}
         return await self.change(lambda objects: objects.add(added, **flags), 409, "name", request)
 
     async def change(

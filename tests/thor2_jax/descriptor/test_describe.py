@@ -70,7 +70,7 @@ def test_fields_that_do_not_fit_a_batch_are_named() -> None:
     packed = thor2.PointClouds.pack(random_clouds(1, [60, 50]))
     fields = {
         "colors": [np.zeros((2, 512, 3), np.uint8), packed.colors[:1]],
-        "points": [packed.points.astype(int), np.zeros((2, 512, 4), np.float32)],
+        "points": [packed.points.astype(int), np.zeros((2, 512, 4), np.float32), np.zeros((2, 512, 3), ">f4")],
         "mask": [packed.mask[:, :1]],
         "camera": [packed.camera[0]],
         "boundary": [None],

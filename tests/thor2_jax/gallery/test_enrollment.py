@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from image_files import frame_of_squares
@@ -36,7 +37,7 @@ CLUTTER = frame_of_squares({1: RED, 2: BLUE, 3: (70, 20, (90, 200, 60))})
 
 def taught(run: TrainedRun, **options: object) -> thor2.Recognizer:
     recognizer = thor2.Recognizer(run, embedding=embedding(), **options)  # type: ignore[arg-type]
-    recognizer.enroll("brick", [BRICK, (CLUTTER, 1)])
+    recognizer.enroll("brick", [BRICK, frame_of_squares({1: (11, 10, RED[2])})])
     recognizer.enroll("book", [BOOK])
     return recognizer
 
@@ -185,6 +186,14 @@ def test_unusable_views_are_refused_and_nothing_changes() -> None:
     assert recognizer.gallery is before
 
 
+def test_a_view_that_is_given_twice_counts_once() -> None:
+    recognizer = taught(run())
+    recognizer.enroll("new", [BRICK, BOOK, (CLUTTER, 1), BRICK])
+    recognizer.enroll("new", [BRICK, (CLUTTER, 3), (CLUTTER, 3)], extend=True)
+    expected = CompactClouds.of([instance_view(CLUTTER, label, 2.5) for label in (1, 2, 3)])
+    jax.tree.map(np.testing.assert_array_equal, vars(recognizer.gallery.objects["new"].clouds), vars(expected))
+
+
 def test_a_first_surface_comes_with_views_that_are_stored() -> None:
     objects, views = taught(untrained_run((), ())).objects, [instance_view(CLUTTER, 1, 2.5)]
     surface = Surfaces.empty().arrays
@@ -192,6 +201,14 @@ def test_a_first_surface_comes_with_views_that_are_stored() -> None:
         objects.enroll("mesh", views, "mesh", given, extend=number > 0)
         enrolled = objects.gallery.objects["mesh"]
         assert enrolled.surface is given and len(enrolled.clouds) == count
+
+
+def test_surfaces_of_objects_are_unknown_to_classifiers_alone() -> None:
+    for answer_by in ("both", "gallery", "classifiers"):
+        recognizer = taught(run(), answer_by=answer_by)
+        recognizer.objects.enroll("mesh", [instance_view(CLUTTER, 1, 2.5)], "mesh", Surfaces.empty().arrays)
+        assert (recognizer.model.surface_of("mesh") is None) == (answer_by == "classifiers")
+        assert recognizer.model.surface_of("brick") is recognizer.model.surface_of("a") is None
 
 
 def test_views_get_augmented_copies() -> None:

@@ -102,6 +102,9 @@ def test_a_file_is_no_gallery(tmp_path: Path) -> None:
     (tmp_path / "gallery").write_text("mine")
     with pytest.raises(GalleryError, match="is no directory"):
         check_index(tmp_path / "gallery")
+    (tmp_path / "objects").write_text("mine")
+    with pytest.raises(GalleryError, match="objects is no directory"):
+        check_index(tmp_path)
 
 
 def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -> None:

@@ -105,6 +105,8 @@ def test_extend_replace_and_undo(http: httpx.Client, files: Files) -> None:
     check_refused(enroll(http, files, "tall", 7), 409, "name", "extend")
     check_refused(enroll(http, files, "tall", 9), 409, "name")  # before the view is prepared
     assert enroll(http, files, "tall", 7, extend="true").json()["views"] == 2
+    again = enroll(http, files, "tall", 7, extend="true").json()
+    assert again["views"] == 2 and undo(http, again["generation"]).status_code == 200 and known(http) == {"tall": 2}
     assert enroll(http, files, "tall", 7, replace="true").json()["views"] == 1
     # A trained class needs one of them, too.
     assert enroll(http, files, "a").status_code == 409

@@ -100,6 +100,8 @@ def test_messages_of_a_view() -> None:
     failed = message()
     assert failed["error"] == "depth is missing" and failed["objects"] == [] and failed["number"] == 1
     assert failed["image"] == one["image"] and failed["fps"] > 0
+    view.show(recorded(3, fail))
+    assert view.first_error == "2.000: depth is missing"
     view.publish_state("ended", "no more")
     assert message()["state"] == "ended" and message()["message"] == "no more" and "image" in message()
 
