@@ -126,7 +126,7 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
 
 def check_writable(directory: Path) -> None:
     """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
-    existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    existing = next(path for path in (directory, *directory.absolute().parents) if os.path.lexists(path))
     with tempfile.TemporaryFile(dir=existing):
         pass
 
