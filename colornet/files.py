@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "PREFIX",
     "atomic_write",
     "check_replaceable",
     "errors_name",
@@ -31,7 +32,9 @@ MAX_ARRAY_BYTES = 2**26
 """Largest total size of the arrays in a file; compressed zeros take only a thousandth of this on disk."""
 
 
-_PREFIX = ".thor2-"
+PREFIX = ".thor2-"
+"""Beginning of the names of temporary directories."""
+
 _MARKER, _MARKER_TEXT = ".thor2", b"Temporary directory of thor2. The next command removes it with all that is in it.\n"
 
 
@@ -85,7 +88,7 @@ def temporary_directory(parent: str | Path) -> Iterator[Path]:
     The directory is identified by its name and by a file in it that is locked during use, see `remove_leftovers`.
     """
     remove_leftovers(Path(parent))
-    directory = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+    directory = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     try:
         with open(directory / _MARKER, "wb", buffering=0) as marker:
             with contextlib.suppress(OSError):  # a file system without locks
@@ -121,7 +124,7 @@ def remove_leftovers(directory: Path) -> None:
 
     Directories in use and all other files stay, whatever their names.
     """
-    for path in directory.glob(f"{_PREFIX}*"):
+    for path in directory.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError):  # owned by another user, or in use
             if not path.is_symlink() and (path / _MARKER).is_file():
                 with open(path / _MARKER, "r+b") as marker:  # network file systems only lock files open for writing

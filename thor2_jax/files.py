@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colornet.files import (
+    PREFIX,
     atomic_write,
     check_replaceable,
     errors_name,
@@ -126,7 +127,7 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
 
 def check_writable(directory: Path) -> None:
     """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
-    existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    existing = next(path for path in (directory, *directory.absolute().parents) if os.path.lexists(path))
     with tempfile.TemporaryFile(dir=existing):
         pass
 
@@ -149,21 +150,23 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
             unfinished = temporary / path.name
             unfinished.mkdir(0o755)
             yield unfinished
-            with errors_name(path):
-                try:
-                    unfinished.rename(path)
-                except OSError as error:
-                    if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                        raise
-                    files = sorted(unfinished.iterdir())
-                    for file in files:
-                        check_replaceable(path / file.name)
-                    for file in files:
-                        file.replace(path / file.name)
-    except BaseException:
+            try:
+                unfinished.rename(path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                files = sorted(unfinished.iterdir())
+                for file in files:
+                    check_replaceable(path / file.name)
+                for file in files:
+                    file.replace(path / file.name)
+    except BaseException as error:
         for parent in created:
             with contextlib.suppress(OSError):
                 parent.rmdir()
+        # A failed write to a full disk names no file, or one in the temporary directory.
+        if isinstance(error, OSError) and error.errno and PREFIX in str(error.filename or PREFIX):
+            raise OSError(error.errno, error.strerror, str(path)) from None
         raise
 
 

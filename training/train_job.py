@@ -11,8 +11,10 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.model.run_record import run_directories
 from thor2_jax.printable import normal_name
 from training.baselines.architectures import crop_size
+from training.baselines.baseline import baseline_file
 from training.baselines.job import check_baselines, train_baselines
 from training.baselines.thor import types_of_views
 from training.fitting.samples import check_classes
@@ -97,10 +99,8 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
     labelled = _read_frames(job)
     if job.sequences is None and not is_finished(job.out):
         check_out(job.out)
-    elif job.sequences is None and job.meshes is not None:
-        _check_finished_views(job, labelled)
-        if not baselines:
-            return {job.out: []}
+    elif job.sequences is None and job.meshes is not None and _is_complete(job, labelled):
+        return {job.out: []}
     shown = numbered(progress, job.stages)
     source, enrolled = _open_views(job, labelled, shown)
     sources = {job.out: source} if job.sequences is None else sequence_sources(source, job.sequences, job.out)
@@ -141,10 +141,13 @@ def _check_batch_size(protocol: Protocol, n_views: int) -> None:
         )
 
 
-def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
-    """Raise InputError if a finished run is of another job; without baselines, remove leftovers of a killed process.
+def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
+    """Return whether a finished run has all baselines of the job; if so, remove leftovers of a killed process.
 
     Only views of this job are removed, since another training may read other views.
+
+    Raises:
+        InputError: the run is of another job.
     """
     record = finished_record(job.out)
     stored = record["dataset"]
@@ -161,13 +164,16 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
         "leave_out": sorted(set(job.leave_out)),
     }
     check_same_job(job.out, trained, requested)
-    if job.baselines:
-        return
-    check_trained(stored["digest"], job.out, job.protocol)
+    files = [baseline_file(run, name) for run in run_directories(job.out) for name in job.baselines]
+    if job.weights is not None or not all(file.is_file() for file in files):
+        return False
+    if not job.baselines:
+        check_trained(stored["digest"], job.out, job.protocol)
     remove_leftovers(job.out)
     with contextlib.suppress(InputError):
         if ViewDataset.open(job.out / VIEWS).job == stored["job"]:
             remove_views(job.out / VIEWS)
+    return True
 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:

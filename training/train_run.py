@@ -179,8 +179,7 @@ def train_run(
         parts = settings.folds
         if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
             each = (samples.view[samples.label == index] for index in range(len(source.classes)))
-            fewest = min(len(np.unique(view)) for view in each)
-            parts = max(2, min(HELD_OUT, fewest))
+            parts = max(2, min(HELD_OUT, *(len(np.unique(view)) for view in each)))
         fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:
@@ -295,19 +294,9 @@ class _Fold(NamedTuple):
         unknown = distractors.held_out_clouds(len(classes))
         samples = distractors.add_fitted(samples, others, len(classes))
         del others  # needs as much memory as the samples
-        embedding = fit_embedding(
-            samples,
-            network,
-            config,
-            distractors.epochs,
-            checkpoints,
-            RUN_SIZES,
-            fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs),
-            classes,
-            networks=distractors.networks,
-            seed=seed,
-        )
-        return embedding, known + unknown
+        epochs, progress = distractors.epochs, fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs)
+        arguments = samples, network, config, epochs, checkpoints, RUN_SIZES, progress, classes
+        return fit_embedding(*arguments, networks=distractors.networks, seed=seed), known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
         """Open the checkpoints of a fit, which log its metrics."""

@@ -80,7 +80,7 @@ def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monk
 
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to(tmp_path / "absent")
-    for name in ("file", "file/below", "link"):
+    for name in ("file", "file/below", "link", "link/below"):
         assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
     monkeypatch.setattr("tempfile.TemporaryFile", fail)
     assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*Read-only", check_output_directory, tmp_path / "new" / "deep")

@@ -8,7 +8,6 @@ embedding if it was fitted on the classes. A colour transform corrects the colou
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, cast, get_args
 
@@ -115,6 +114,7 @@ class Model:
         rule: fusion rule of the classifiers, see `fusion`; the paper's is "max".
         answer_by: source of the answers, see `answers_by`; None for the source in the run's record.
         color_transform: correction of the colours of every instance; None for no correction.
+        calibration: calibration, which turns fused probabilities into confidences; None in runs without one.
     """
 
     run: TrainedRun
@@ -124,6 +124,7 @@ class Model:
     rule: FusionRule = DEFAULT_RULE
     answer_by: AnswerBy | None = None
     color_transform: ColorTransform | None = None
+    calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
         if self.rule not in FUSION_RULES:
@@ -141,10 +142,11 @@ class Model:
         rule: FusionRule = DEFAULT_RULE,
         answer_by: str | None = None,
     ) -> "Model":
-        """Return the model of a run, with the colour transform of its record, and without enrolled objects.
+        """Return the model of a run, with the colour transform and calibration of its record, without enrolled objects.
 
         Raises:
-            InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
+            InputError: `unknown_below` is not between 0 and 1, `rule` or `answer_by` is unknown, or the colour
+                transform or the calibration is damaged.
         """
         wanted: Any = run.record.get("answer_by") if answer_by is None else answer_by
         classifiers: dict[str, Classifier] = {
@@ -153,12 +155,9 @@ class Model:
         if run.embedding_classifier is not None:
             classifiers[EMBEDDING] = run.embedding_classifier
         transform = _stored_value(ColorTransform, "color_transform", run.record, "adapt the run again")
-        return cls(run, classifiers, Gallery("", trained=run.classes), unknown_below, rule, wanted, transform)
-
-    @functools.cached_property
-    def calibration(self) -> Calibration | None:
-        """The calibration, which turns fused probabilities into confidences; None in runs without one."""
-        return _stored_value(Calibration, "calibration", self.run.record, "train the run again")
+        calibration = _stored_value(Calibration, "calibration", run.record, "train the run again")
+        gallery = Gallery("", trained=run.classes)
+        return cls(run, classifiers, gallery, unknown_below, rule, wanted, transform, calibration)
 
     @property
     def names(self) -> tuple[str, ...]:

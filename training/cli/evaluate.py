@@ -134,7 +134,8 @@ def _evaluate(
     # A model may be a directory of folds or sequences; the command is for the first run in it.
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
-    finish(result, "explain wrong answers", "explain", *(given or ["FRAME"]), model=run, out="why")
+    purpose = "explain wrong answers" if report["worst"] else "explain answers"
+    finish(result, purpose, "explain", *(given or ["FRAME"]), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

@@ -4,13 +4,13 @@ The user's cache directory may be deleted at any time. The environment variable 
 `off` disables the cache.
 """
 
+import contextlib
 import itertools
 import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -188,8 +188,9 @@ def _shown(value: Any) -> str:
 LOCK = ".lock"
 
 
-def locked(directory: Path) -> AbstractContextManager[object]:
-    """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Hold an exclusive lock on an output directory, which is created if it is missing and removed if it stays empty.
 
     The operating system releases the lock when the process ends, even if it is killed. The lock file is kept.
 
@@ -197,13 +198,22 @@ def locked(directory: Path) -> AbstractContextManager[object]:
         InputError: another process holds the lock.
         OSError: the directory cannot be written, or its file system does not support locks.
     """
+    is_new = not directory.exists()
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
     try:
-        return filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
+        held = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
     except filelock.Timeout:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
+    with held:
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # the directory was removed
+                if is_new and os.listdir(directory) == [LOCK]:
+                    (directory / LOCK).unlink()
+                    directory.rmdir()
 
 
 MANIFEST = "manifest.json"

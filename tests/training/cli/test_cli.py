@@ -187,7 +187,9 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.usefixtures("small_descriptors", "weights")
-def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
+def test_train_by_folds(
+    meshes: Path, views: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
     arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *STEPS, *options)
     shutil.copytree(views, tmp_path / "run" / "views")
@@ -210,6 +212,11 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     shutil.copytree(views, tmp_path / "run" / "views")
     assert run_thor2(*arguments) == 0
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
+    for fold in ("fold-0", "fold-1"):
+        (tmp_path / "run" / fold / "baselines").mkdir()
+        (tmp_path / "run" / fold / "baselines" / "forest.safetensors").touch()
+    monkeypatch.setattr(train_job, "render_dataset", None)  # no views are rendered if no baseline is missing
+    assert "with its baselines" in printed(*arguments, "--baselines", "forest")
 
 
 @pytest.mark.usefixtures("unfitted")

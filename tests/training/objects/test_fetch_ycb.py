@@ -163,7 +163,8 @@ def test_unknown_objects_and_unreadable_addresses(server: Any, tmp_path: Path, m
         assert_refused("objects", fetch_ycb, names, tmp_path, url=server.url)
     for url in ("ftp://a", "a", "http://", "http://[::1", "http://a:b", "http://a b", "http://a..b", "http://\u2100"):
         assert_refused("expected", fetch_ycb, [NAME], tmp_path, url=url)
-    assert_refused("network", fetch_ycb, [NAME], tmp_path, url=f"http://127.0.0.1:{free_port()}")
+    assert_refused("network", fetch_ycb, [NAME], tmp_path / "new", url=f"http://127.0.0.1:{free_port()}")
+    assert not (tmp_path / "new").exists()
     monkeypatch.setenv("no_proxy", "")
     for proxy in ("socks5://127.0.0.1:1", "ftp://127.0.0.1:1"):
         monkeypatch.setenv("all_proxy", proxy)

@@ -38,8 +38,17 @@ def test_a_directory_begins_with_one_job(tmp_path: Path) -> None:
 def test_a_lock_excludes_others_until_its_end(tmp_path: Path) -> None:
     for _ in range(2):
         with locked(tmp_path):
-            assert_refused(str(tmp_path), locked, tmp_path)
+            assert_refused(str(tmp_path), locked(tmp_path).__enter__)
     with pytest.raises(ZeroDivisionError), locked(tmp_path):
         1 / 0  # noqa: B018
     with locked(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == [LOCK]
+
+
+def test_a_locked_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), locked(tmp_path / "new"):
+        1 / 0  # noqa: B018
+    assert not list(tmp_path.iterdir())
+    with locked(tmp_path / "new"):
+        (tmp_path / "new" / "file").touch()
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [LOCK, "file"]
