@@ -294,9 +294,19 @@ class _Fold(NamedTuple):
         unknown = distractors.held_out_clouds(len(classes))
         samples = distractors.add_fitted(samples, others, len(classes))
         del others  # needs as much memory as the samples
-        epochs, progress = distractors.epochs, fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs)
-        arguments = samples, network, config, epochs, checkpoints, RUN_SIZES, progress, classes
-        return fit_embedding(*arguments, networks=distractors.networks, seed=seed), known + unknown
+        embedding = fit_embedding(
+            samples,
+            network,
+            config,
+            distractors.epochs,
+            checkpoints,
+            RUN_SIZES,
+            fit_progress(self.report, Stage.FIT_NETWORKS, distractors.epochs),
+            classes,
+            networks=distractors.networks,
+            seed=seed,
+        )
+        return embedding, known + unknown
 
     def checkpoints(self, name: str) -> Checkpoints:
         """Open the checkpoints of a fit, which log its metrics."""

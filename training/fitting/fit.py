@@ -242,9 +242,15 @@ def fit(
         predicted = np.concatenate([predicted_labels(context, graph, state, batch) for batch in batches(padded)])
         return float(np.mean(predicted[: len(held_out_rows)] == samples.label[held_out_rows]))
 
-    last = _to_devices(checkpoints.last(initial), PartitionSpec())
-    arguments = context.feature, last, steps, train_epoch, checkpoints
-    state = run_epochs(*arguments, progress=progress, held_out_accuracy=held_out_accuracy)
+    state = run_epochs(
+        context.feature,
+        _to_devices(checkpoints.last(initial), PartitionSpec()),
+        steps,
+        train_epoch,
+        checkpoints,
+        progress=progress,
+        held_out_accuracy=held_out_accuracy,
+    )
     wait_for_all(f"fitted {context.feature}")
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch
