@@ -127,7 +127,7 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
 
 def check_writable(directory: Path) -> None:
     """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
-    existing = next(path for path in (directory, *directory.absolute().parents) if os.path.lexists(path))
+    existing = next(path for path in (directory, *directory.absolute().parents) if path.is_symlink() or path.exists())
     with tempfile.TemporaryFile(dir=existing):
         pass
 
@@ -165,7 +165,8 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 parent.rmdir()
         # A failed write to a full disk names no file, or one in the temporary directory.
-        if isinstance(error, OSError) and error.errno and PREFIX in str(error.filename or PREFIX):
+        full, hidden = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), str(path.parent / PREFIX)
+        if isinstance(error, OSError) and (str(error.filename or "").startswith(hidden) or error.errno in full):
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
 

@@ -110,7 +110,7 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         if len(X) == 0:
             raise InputError("X is empty; expected a list of at least one cloud")
         if isinstance(X, tuple) and len(X) == 2 and getattr(X[0], "shape", 0) == getattr(X[1], "shape", 1):
-            raise InputError("X is two arrays of the same shape, like one pair (xyz, rgb); expected a list of clouds")
+            raise InputError("X is two arrays of one shape; expected a list of clouds: [(xyz, rgb)] or [xyz, xyz]")
         limit = POINT_BUCKETS[-1] if self.capacity is None else self.capacity
         clouds = []
         for i in range(len(X)):

@@ -104,7 +104,7 @@ def enroll_objects(
             given, surface = next(views), next(surfaces)
             new = objects.new_views(each, given, surface, extend=extend)
             if len(new) < len(given):
-                skipped = [*skipped, f"views of {each} that are enrolled already: {len(given) - len(new)}"]
+                skipped = [*skipped, f"views of {each} that are repeated or enrolled already: {len(given) - len(new)}"]
             if new or not given:
                 added[each] = enrolled_views(objects.embedding, new, kind, surface)
         progress("enroll", len(names), len(names), "")

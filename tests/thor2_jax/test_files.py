@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import re
 import shutil
 import signal
 import stat
@@ -82,6 +83,7 @@ def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monk
     (tmp_path / "link").symlink_to(tmp_path / "absent")
     for name in ("file", "file/below", "link", "link/below"):
         assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
+    assert_refused("File name too long", check_output_directory, tmp_path / ("x" * 300), "marker")
     monkeypatch.setattr("tempfile.TemporaryFile", fail)
     assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*Read-only", check_output_directory, tmp_path / "new" / "deep")
 
@@ -95,6 +97,9 @@ def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
     with pytest.raises(KeyError), atomic_directory(target) as unfinished:
         (unfinished / "half").write_text("x")
         raise KeyError
+    for given, named in (((errno.ENOSPC, "full"), target), ((errno.EIO, "failed", "input"), "input")):
+        with pytest.raises(OSError, match=f"'{re.escape(str(named))}'"), atomic_directory(target):
+            raise OSError(*given)
     assert list(tmp_path.iterdir()) == []
     for content in ("first", "second"):
         with atomic_directory(target) as unfinished:

@@ -18,9 +18,6 @@ from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = ["downsample_to_fit", "flying_pixels", "remove_outliers", "voxel_downsample"]
 
-MAX_TABLE = 2**20
-"""Largest number of voxels of a grid whose points are counted without sorting."""
-
 
 def voxel_downsample(
     points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
@@ -65,14 +62,14 @@ def voxel_downsample(
 
 
 def _renumbered(key: NDArray[np.int64], n_keys: int) -> NDArray[np.intp]:
-    """Return the rank [n] of each of `key` [n], all from 0 to `n_keys` - 1, among the different ones."""
-    if n_keys > MAX_TABLE:
+    """Return the position of each key [n], from 0 to `n_keys` - 1, among the sorted different keys."""
+    if n_keys > 64 * len(key):  # sorting is faster, and needs less memory
         return np.unique(key, return_inverse=True)[1]
-    occurs, rank = np.zeros(n_keys, bool), np.empty(n_keys, np.intp)
+    occurs, position = np.zeros(n_keys, bool), np.empty(n_keys, np.intp)
     occurs[key] = True
     different = np.flatnonzero(occurs)
-    rank[different] = np.arange(len(different))
-    return rank[key]
+    position[different] = np.arange(len(different))
+    return position[key]
 
 
 def downsample_to_fit(

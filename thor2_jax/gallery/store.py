@@ -100,7 +100,7 @@ def check_open_to_changes(directory: Path) -> None:
 
 
 def check_index(directory: Path) -> None:
-    """Raise GalleryError if a directory or its objects are no directory, or if it has objects but no index."""
+    """Raise GalleryError if the path, or `objects` in it, is not a directory, or if it has objects but no index."""
     for path in (directory, directory / "objects"):
         if path.exists() and not path.is_dir():
             raise GalleryError(f"gallery: {path} is no directory; expected that of a gallery; choose another one")

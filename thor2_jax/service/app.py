@@ -241,7 +241,9 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         async with service.admit(request, partial(read_form, form=schemas.ENROLLMENT_FORM)) as (admitted, files):
             known = await service.enroll(files, admitted)
         stored_name = find_name(files["name"], known.gallery.names)
-        (enrolled,) = [answer for answer in object_answers(known) if answer.name == stored_name]
+        enrolled = next((answer for answer in object_answers(known) if answer.name == stored_name), None)
+        if enrolled is None:
+            raise RequestError(409, "name", "The object was forgotten meanwhile; enroll it again.")
         return schemas.EnrollmentAnswer(
             **dict(enrolled), generation=known.gallery.generation, timings=admitted.milliseconds()
         )

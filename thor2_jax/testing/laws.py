@@ -335,5 +335,5 @@ def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) 
 
 def _assert_equal_clouds(actual: Sequence[PreparedInstance], expected: Sequence[PreparedInstance]) -> None:
     for first, second in zip(actual, expected, strict=True):
-        for name in vars(first).keys() - {"label"}:
+        for name in sorted(vars(first).keys() - {"label"}):
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)

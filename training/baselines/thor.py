@@ -93,6 +93,10 @@ def _slice_counts(normal: PointClouds, config: DescriptorConfig) -> NDArray[np.i
     return np.clip(np.floor(top / config.sigma_1).astype(np.intp) + 1, 1, config.n_slices)
 
 
+def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+
+
 def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """Build the library from its weights, named `<type>-<slices>/<path>`.
 
@@ -103,7 +107,7 @@ def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     """
     config, size, predict = run.config, run.config.image_size**2, {}
     for name, k in itertools.product(VIEW_TYPES, range(1, config.n_slices + 1)):
-        create = partial(lambda k: MLP(k * size, len(run.classes), rngs=nnx.Rngs(0)), k)
+        create = partial(_create_mlp, k * size, len(run.classes))
         predict[name, k] = compiled_network(model_from_arrays(create, arrays, f"{name}-{k}/"), as_given)
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:

@@ -108,10 +108,10 @@ class _Answers:
         if out is not None and self._several:
             out = out / answer.name
         if frame is None and out is not None:  # answers of an earlier call would look like new ones
-            for file in reversed(RESULT_FILES):
-                (out / file).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # The directory is missing or has other files.
-                out.rmdir()
+            removals = [(out / file).unlink for file in RESULT_FILES] + [out.rmdir] * self._several
+            for remove in removals:
+                with contextlib.suppress(OSError):  # There is none, or the directory has other files.
+                    remove()
         if frame is None and not self._several:
             raise InputError(str(answer.error))
         if self._as_json:

@@ -227,6 +227,17 @@ def test_pages_of_other_sites_do_not_adapt_the_service(
             assert response.status_code == (status if headers else 200)
 
 
+def test_an_object_that_is_forgotten_meanwhile_is_not_enrolled(
+    teaching_run: Path, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = create_app(Settings(teaching_run, teach=True))
+    service, fields = app.state.service, {"name": "gone", "instance": "7"}
+    monkeypatch.setattr(service, "state", "ready")
+    monkeypatch.setattr(service, "enroll", AsyncMock(return_value=service.engine.objects))
+    (answer,) = calls(app, lambda client: client.post("/v1/objects", files=files, data=fields))
+    check_refused(answer, 409, "name", "forgotten")
+
+
 def test_a_list_at_the_end_of_a_message_has_three_dots() -> None:
     with pytest.raises(RequestError) as raised, field_errors():
         raise InputError("instance is 7; expected one of 1, 2, ...")

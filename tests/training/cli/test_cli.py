@@ -212,10 +212,15 @@ def test_train_by_folds(
     shutil.copytree(views, tmp_path / "run" / "views")
     assert run_thor2(*arguments) == 0
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
+
+    def render(*_: object, **__: object) -> None:
+        raise InputError("views are rendered")
+
+    monkeypatch.setattr(train_job, "render_dataset", render)
     for fold in ("fold-0", "fold-1"):
+        assert "views are rendered" in refused(*arguments, "--baselines", "forest")
         (tmp_path / "run" / fold / "baselines").mkdir()
         (tmp_path / "run" / fold / "baselines" / "forest.safetensors").touch()
-    monkeypatch.setattr(train_job, "render_dataset", None)  # no views are rendered if no baseline is missing
     assert "with its baselines" in printed(*arguments, "--baselines", "forest")
 
 

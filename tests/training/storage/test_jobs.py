@@ -52,3 +52,7 @@ def test_a_locked_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
     with locked(tmp_path / "new"):
         (tmp_path / "new" / "file").touch()
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [LOCK, "file"]
+    (tmp_path / "old").mkdir()
+    with locked(tmp_path / "old"):
+        pass
+    assert (tmp_path / "old").is_dir()
