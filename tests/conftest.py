@@ -44,6 +44,7 @@ STRICT = ("descriptor", "golden", "properties")
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # A background job starts with it ignored.
 
 end_descendants_with_this_process()
 
@@ -194,7 +195,7 @@ def refused(texts: Callable[..., tuple[str, str]]) -> Callable[..., str]:
 
 
 @pytest.fixture
-def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
+def messages(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The messages that `thor2 watch` publishes; it is interrupted when it waits for Ctrl-C."""
     from thor2_jax.watch.live import Broadcast
 
@@ -209,9 +210,7 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
 
     monkeypatch.setattr(Broadcast, "publish", record)
     monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job starts with it ignored
-    yield published
-    signal.signal(signal.SIGINT, handler)
+    return published
 
 
 @pytest.fixture(scope="module")

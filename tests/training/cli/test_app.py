@@ -208,12 +208,8 @@ def test_ctrl_c_where_exceptions_are_ignored(interrupted: Any, busy: bool, monke
 
     monkeypatch.setattr("threading.Timer", timer)
     monkeypatch.setattr(sys.modules["training.cli.app"], "app", run)
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run_thor2("demo")
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    with pytest.raises(KeyboardInterrupt):
+        run_thor2("demo")
 
 
 # Progress on a standard error that is not a terminal.
