@@ -21,7 +21,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_stream
 from thor2_jax.errors import InputError, as_array
-from thor2_jax.types import check_capacity, check_cloud, check_types
+from thor2_jax.types import check_capacity, check_cloud
 
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 
@@ -99,10 +99,13 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
 
     def _check_parameters(self) -> tuple[DescriptorConfig, ColorNetwork]:
         config = DescriptorConfig(homology="closed_form") if self.config is None else self.config
-        network = colornet.load_default() if self.network is None else self.network
-        check_types(config=config, network=network)
+        if not isinstance(config, DescriptorConfig):
+            raise InputError(f"config is {config!r}; expected a DescriptorConfig, or None for the default one")
+        network = self.network
+        if not (network is None or isinstance(network, ColorNetwork)):
+            raise InputError(f"network is {network!r}; expected a ColorNetwork, or None for the packaged one")
         check_capacity(self.capacity)
-        return config, network
+        return config, colornet.load_default() if network is None else network
 
     def _clouds(self, X: Sequence[Any]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         if isinstance(X, str | bytes) or not isinstance(X, Sequence | np.ndarray) or getattr(X, "ndim", 1) == 0:

@@ -144,7 +144,7 @@ def _check_batch_size(protocol: Protocol, n_views: int) -> None:
 def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
     """Return whether a finished run has all that the job asks for; if so, remove leftovers of a killed process.
 
-    It does not with `weights`, since the baselines may have been trained with others.
+    With `weights`, the result is False, since the baselines may have been trained with others.
 
     Only views of this job are removed, since another training may read other views.
 

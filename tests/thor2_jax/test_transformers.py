@@ -102,9 +102,9 @@ INVALID: list[tuple[str, Any, dict[str, Any]]] = [
     ("X[0]: rgb is [2, 3]", [(XYZ, RGB[:2])], {}),
     ("X[1] has 8193 points", [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))], {}),
     ("larger capacity", [(XYZ, RGB)], {"capacity": np.array([2])[0]}),  # as a grid search over an array gives it
-    ("config is a str", [(XYZ, RGB)], {"config": "paper"}),
+    ("config is 'paper'", [(XYZ, RGB)], {"config": "paper"}),
     *((f"capacity is {value!r}", [(XYZ, RGB)], {"capacity": value}) for value in (0, 2.5, True)),
-    ("network is a int", [(XYZ, RGB)], {"network": 3}),
+    ("network is 3", [(XYZ, RGB)], {"network": 3}),
 ]
 
 

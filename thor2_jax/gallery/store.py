@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 GALLERY_FORMAT, FORMAT_WITH_SURFACES = 1, 2
-"""Versions of the layout above; the second one, with surfaces, is one that earlier versions cannot read."""
+"""Versions of the layout above; the second one has surfaces, and earlier versions of this software cannot read it."""
 
 GALLERY_DIRECTORY = "gallery"
 """Name of the gallery in a run directory."""

@@ -108,10 +108,11 @@ class _Answers:
         if out is not None and self._several:
             out = out / answer.name
         if frame is None and out is not None:  # answers of an earlier call would look like new ones
-            removals = [(out / file).unlink for file in RESULT_FILES] + [out.rmdir] * self._several
-            for remove in removals:
-                with contextlib.suppress(OSError):  # There is none, or the directory has other files.
-                    remove()
+            with contextlib.suppress(OSError):  # There is none, or the directory has other files.
+                for file in RESULT_FILES:
+                    (out / file).unlink(missing_ok=True)
+                if self._several:
+                    out.rmdir()
         if frame is None and not self._several:
             raise InputError(str(answer.error))
         if self._as_json:
@@ -241,7 +242,8 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
-        name, occluded = escape_characters(r.name or "unrecognized"), "yes" if r.occluded else "no"
+        name = escape_characters(r.name or "unrecognized")
+        occluded = "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:

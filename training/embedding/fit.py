@@ -170,8 +170,14 @@ def fit_embedding(
             states, computed = _step(graphs, optimizer, embedding.network, embedding.config, states, batch, seen, keys)
             yield states, computed
 
-    states, steps = jax.tree.map(jnp.asarray, checkpoints.last(states)), Steps(epochs, n_steps, BATCH_SIZE)
-    states = run_epochs("the embedding", states, steps, train_epoch, checkpoints, progress=progress)
+    states = run_epochs(
+        "the embedding",
+        jax.tree.map(jnp.asarray, checkpoints.last(states)),
+        Steps(epochs, n_steps, BATCH_SIZE),
+        train_epoch,
+        checkpoints,
+        progress=progress,
+    )
     models = [nnx.merge(graph, state.params, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
     fitted = fitted if classes else fitted.without_proxies()

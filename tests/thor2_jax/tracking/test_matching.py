@@ -72,6 +72,7 @@ def test_merged_clouds_coincide_in_space(middle: tuple[float, ...]) -> None:
         views.append((PreparedInstance(1, points, colors, np.zeros(500, bool), rim=rim), pose))
     one, both = merge_views(views[1:], 2.5), merge_views(views, 2.5)
     assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
+    np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)
     for merged in (one, both):
         np.testing.assert_allclose(merged.points.mean(axis=0), views[1][0].points.mean(axis=0), atol=2e-3)
     packed = pack_instances([both, one], 2)  # the rim of the last view is not that of the merged cloud
