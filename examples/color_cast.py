@@ -121,7 +121,7 @@ def draw(
         right.plot([light[channel] for _, light in history], color=color)
         right.axhline(LAMP[channel], color=color, linestyle="--", linewidth=0.8)
     right.set_xlabel("step")
-    right.set_ylabel("red, green and blue light (dashed: the lamp)")
+    right.set_ylabel("R, G, B of the light (dashed: lamp)")
     figure.savefig(path, dpi=120)
 
 
