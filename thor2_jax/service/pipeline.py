@@ -27,12 +27,12 @@ from thor2_jax.service.answers import why_answer
 from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine, recognize
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
-    PreparationPool,
     Prepare,
     PreparedRequest,
     prepare_clouds,
     prepare_frame,
     prepare_view,
+    start_processes,
     timed,
 )
 from thor2_jax.service.problem import RequestError, field_errors
@@ -104,7 +104,7 @@ class Service:
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
         settings = self.settings
-        self._pool = PreparationPool(settings.processes, settings.segmenter)
+        self._pool = start_processes(settings.processes, settings.segmenter)
         self._batcher = Batcher(self._process_batch, settings.max_batch)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
@@ -367,7 +367,11 @@ class Service:
         return self.engine.objects
 
     async def _prepare(self, request: AdmittedRequest, function: Prepare, *arguments: Any) -> PreparedRequest:
-        prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, function, *arguments))
+        call = self._pool.submit(function, *arguments, deadline=request.deadline)
+        try:
+            prepared: PreparedRequest = await asyncio.wrap_future(call)
+        except ChildProcessError:
+            raise RequestError(422, "body", "The body made the process that decoded it crash.") from None
         request.seconds.update(prepared.seconds)
         return prepared
 

@@ -1,21 +1,16 @@
-"""Worker processes that decode images and compute instance clouds.
+"""Decoding of images and computation of instance clouds, in worker processes.
 
-Most of the work on a frame is done here. It holds the interpreter lock, so threads would not run in parallel. A process
-that exceeds its deadline or crashes is replaced.
+Most of the work on a frame is done here. It holds the interpreter lock, so threads would not run in parallel.
 """
 
 import contextlib
 import dataclasses
 import functools
 import multiprocessing
-import queue
+import os
 import signal
-import threading
 import time
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,19 +20,16 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, instance_view, prepare_instance
+from thor2_jax.processes import Processes
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.signals import signals_blocked
 
-__all__ = ["PreparationPool", "Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
+__all__ = ["Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "start_processes", "timed"]
 
 MAX_LABEL_RUNS = 50_000
 """Largest number of runs in the label map of an explained frame."""
-
-MIN_SECONDS = 1.0
-"""Shortest time that a process has for a request, so that only exceptionally slow requests are interrupted."""
 
 
 @contextlib.contextmanager
@@ -105,11 +97,13 @@ def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
     return frame
 
 
-def _warm_up(name: str) -> None:
+def _warm_up(name: str | None) -> None:
     """Load a segmenter and segment a small frame, since a segmenter may load weights at its first frame.
 
     If this fails, requests report the reason.
     """
+    if name is None:
+        return
     blank = RGBDFrame(np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), None, Intrinsics(60, 60, 32, 24))
     with contextlib.suppress(InputError):
         segmented(blank, _segmenter(name))
@@ -148,97 +142,13 @@ def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
     return PreparedRequest(instances, seconds)
 
 
-def _run_process(pipe: Connection, segmenter: str | None) -> None:
-    """Receive functions with their arguments, and send back (result, None) or (None, error)."""
-    if segmenter is not None:
-        _warm_up(segmenter)
-    with contextlib.suppress(EOFError, OSError):  # The service has ended or was killed.
-        pipe.send("ready")
-        while True:
-            function, arguments = pipe.recv()
-            try:
-                pipe.send((function(*arguments), None))
-            except RequestError as error:
-                pipe.send((None, error))
-            except Exception:
-                pipe.send((None, RuntimeError(traceback.format_exc())))
-
-
-class _PreparationProcess:
-    def __init__(self, context: Any, segmenter: str | None) -> None:
-        self._context, self._segmenter = context, segmenter
-        self.start()
-
-    def start(self) -> None:
-        self.pipe, child_pipe = self._context.Pipe()
-        self.process = self._context.Process(target=_run_process, args=(child_pipe, self._segmenter), daemon=True)
-        with signals_blocked(signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; `stop` ends this one.
-            self.process.start()
-        child_pipe.close()
-        self.pipe.recv()
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-
-    def restart(self) -> None:
-        self.stop()
-        self.start()
-
-
-class PreparationPool:
-    """A fixed number of processes, each with a thread that waits for it."""
-
-    def __init__(self, count: int, segmenter: str | None = None) -> None:
-        """Start `count` processes, each of which loads the segmenter of this name."""
-        # The fork server has imported this module and has no threads, so that a replacement process starts at once.
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([__name__])
-        self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")
-        self._idle: queue.SimpleQueue[_PreparationProcess] = queue.SimpleQueue()
-        for _ in range(count):
-            self._idle.put(_PreparationProcess(context, segmenter))
-
-    def submit(self, deadline: float, function: Prepare, *arguments: Any) -> Future[PreparedRequest]:
-        """Call `function` in a process.
-
-        The future raises RequestError: the error of the function, 504 if the call has not returned at `deadline` (a
-        time of `time.monotonic`), 422 if the process crashed.
-        """
-        return self._threads.submit(self._call, deadline, function, arguments)
-
-    def _call(self, deadline: float, function: Prepare, arguments: Sequence[Any]) -> PreparedRequest:
-        process, answer = self._idle.get(), None
-        try:
-            if not process.process.is_alive():
-                process.restart()
-            limit = max(deadline, time.monotonic() + MIN_SECONDS)
-            # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
-            timer = threading.Timer(limit - time.monotonic(), process.process.kill)
-            timer.start()
-            try:
-                process.pipe.send((function, arguments))
-                answer = process.pipe.recv()
-            except (EOFError, OSError):
-                pass  # The process has ended.
-            finally:
-                timer.cancel()
-            if time.monotonic() >= limit:
-                process.restart()
-                raise RequestError(504)
-            if answer is None:
-                process.restart()
-                raise RequestError(422, "body", "The body made the process that decoded it crash.")
-        finally:
-            self._idle.put(process)
-        result, error = answer
-        if error is not None:
-            raise error
-        return result
-
-    def close(self) -> None:
-        """Wait for submitted calls, then stop the processes."""
-        self._threads.shutdown()
-        while not self._idle.empty():
-            self._idle.get().stop()
+def start_processes(count: int, segmenter: str | None = None) -> Processes:
+    """Start `count` processes that can call the functions of this module; each loads the segmenter of this name."""
+    # The fork server has imported this module and has no threads, so that a replacement process starts at once.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    # A terminal signals all processes; `Processes.close` ends these.
+    processes = Processes(count, context, functools.partial(_warm_up, segmenter), signal.SIGINT, signal.SIGTERM)
+    for started in [processes.submit(os.getpid) for _ in range(count)]:
+        started.result()
+    return processes

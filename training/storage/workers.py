@@ -11,21 +11,19 @@ is given to another worker.
 import collections
 import contextlib
 import ctypes
+import functools
 import importlib
 import inspect
 import multiprocessing
 import os
-import queue
 import signal
-import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.signals import ended_by_signals, signals_blocked
+from thor2_jax.processes import Processes
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
 
@@ -72,65 +70,9 @@ def keep_freed_memory() -> None:
 
 
 def _initialize_worker() -> None:
-    """Make this worker exit when its parent ends; otherwise, an idle worker would wait forever."""
     # Otherwise, JAX reserves most of an accelerator's memory for one worker. It reads the variable when it is imported.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    parent = multiprocessing.parent_process()
-    assert parent is not None
     keep_freed_memory()
-
-    def exit_with_parent() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=exit_with_parent, daemon=True).start()
-
-
-class _Processes:
-    """Worker processes that are replaced when they die, with a waiting thread for each.
-
-    There is one ProcessPoolExecutor per process, since an executor with several ends all of them when one dies.
-    """
-
-    def __init__(self, count: int) -> None:
-        # Processes are spawned, since JAX starts threads and a forked child can deadlock on their locks.
-        self._context = multiprocessing.get_context("spawn")
-        self._threads = ThreadPoolExecutor(count)
-        self._idle: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
-        for _ in range(count):
-            self._idle.put(self._start())
-
-    def _start(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=self._context, initializer=_initialize_worker)
-
-    def submit(self, function: Callable[[A], B], item: A) -> Future[B]:
-        return self._threads.submit(self._call, function, item)
-
-    def _call(self, function: Callable[[A], B], item: A) -> B:
-        for _ in range(ATTEMPTS):
-            process = self._idle.get()
-            try:
-                with signals_blocked(signal.SIGINT):  # A process started here ignores Ctrl-C; this process handles it.
-                    future = process.submit(function, item)
-                return future.result()
-            except BrokenProcessPool as error:
-                reason = error
-                process.shutdown()
-                process = self._start()
-            finally:
-                self._idle.put(process)
-        raise ChildProcessError(
-            f"{ATTEMPTS} worker processes died at the same item, possibly because memory ran out ({reason})"
-        ) from reason
-
-    def close(self) -> None:
-        """Wait for running calls, cancel the others, and end the processes; Ctrl-C ends this process meanwhile."""
-        # With an exception here, Python would wait at its end, possibly forever. Only the main thread handles signals.
-        is_main = threading.current_thread() is threading.main_thread()
-        with ended_by_signals() if is_main else contextlib.nullcontext():
-            self._threads.shutdown(cancel_futures=True)
-            while not self._idle.empty():
-                self._idle.get().shutdown()
 
 
 def local_workers(workers: int = 1) -> WorkerPool:
@@ -145,8 +87,10 @@ def local_workers(workers: int = 1) -> WorkerPool:
         if workers == 1:
             yield from map(function, items)
             return
-        with contextlib.closing(_Processes(workers)) as processes:
-            yield from _map_ordered(lambda item: processes.submit(function, item), Future.result, items, workers)
+        processes = Processes(workers, multiprocessing.get_context("spawn"), _initialize_worker, signal.SIGINT)
+        with contextlib.closing(processes):
+            submit = functools.partial(processes.submit, function, attempts=ATTEMPTS)
+            yield from _map_ordered(submit, Future.result, items, workers)
 
     return run
 

@@ -1,14 +1,11 @@
-"""Unit tests of batching, preparation processes, segmenters, request limits and the compilation counter."""
+"""Unit tests of batching, segmenters, request limits and the compilation counter."""
 
 import asyncio
-import math
-import os
 import queue
-import signal
 import tempfile
 import threading
-import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock, Mock
@@ -28,7 +25,7 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.decoding import MAX_BODY
 from thor2_jax.service.engine import Batcher
 from thor2_jax.service.pipeline import Service
-from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_frame
+from thor2_jax.service.preparation import PreparedRequest, prepare_frame
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import Settings
@@ -55,35 +52,6 @@ def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     assert isinstance(failing.exception(0), ArithmeticError)
     batches = [[2, 3, 4, 5], [6, 7, 8, 9], [10], [12, 13, 14, 15], [16]]
     assert [call.args for call in device.mock_calls] == [(batch,) for batch in batches]
-
-
-FAR = time.monotonic() + HANG
-
-
-def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    pool = PreparationPool(1)
-    request.addfinalizer(pool.close)
-    monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
-    for seconds, function, argument, status in ((0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)):
-        replaced = pool.submit(FAR, os.getpid).result(HANG)
-        with pytest.raises(RequestError) as error:
-            pool.submit(time.monotonic() + seconds, function, argument).result(HANG)
-        assert error.value.status == status
-        with pytest.raises(ProcessLookupError):
-            os.kill(replaced, 0)
-    stopped = pool.submit(FAR, os.getpid).result(HANG)
-    os.kill(stopped, signal.SIGSTOP)
-    request.addfinalizer(lambda: Path(f"/proc/{stopped}").exists() and os.kill(stopped, signal.SIGKILL))
-    with pytest.raises(RequestError) as error:  # It does not receive an argument that fills the pipe.
-        pool.submit(time.monotonic(), len, bytes(10**7)).result(HANG)
-    assert error.value.status == 504
-    idle = pool._idle.get()
-    idle.process.kill()
-    idle.process.join()
-    pool._idle.put(idle)  # The pool does not notice the death of an idle process.
-    assert pool.submit(FAR, math.sqrt, 9.0).result(HANG) == 3.0
-    with pytest.raises(RuntimeError, match="math domain error"):
-        pool.submit(FAR, math.sqrt, -1.0).result(HANG)
 
 
 def many(frame: thor2.RGBDFrame) -> np.ndarray:
@@ -212,6 +180,17 @@ def test_full_queue_is_429_and_deadline_504(
     monkeypatch.setattr(asyncio, "timeout", timeout)
     assert calls(app, frame_request(files))[0].status_code == 504
     timeout.assert_called_once_with(HANG)
+
+
+@pytest.mark.parametrize(("error", "status"), [(ChildProcessError, 422), (TimeoutError, 504)])
+def test_a_body_that_ends_its_process_or_takes_too_long(
+    app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch, error: type[Exception], status: int
+) -> None:
+    call = Future[PreparedRequest]()
+    call.set_exception(error())
+    monkeypatch.setattr(app.state.service, "state", "ready")
+    monkeypatch.setattr(app.state.service, "_pool", Mock(**{"submit.return_value": call}), raising=False)
+    assert calls(app, frame_request(files))[0].status_code == status
 
 
 @pytest.mark.parametrize(("adapt", "status"), [(False, 200), (True, 403)])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import uvicorn
 from commands import Command
-from processes import HANG, finish_programs, start_program
+from processes import finish_programs, start_program
 from refusals import assert_refused
 from uvicorn.supervisors import Multiprocess
 from uvicorn.supervisors.multiprocess import Process
@@ -112,9 +112,9 @@ def test_workers_receive_no_ctrl_c_and_own_their_end_of_the_pipe(start: str, mon
 def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
     """A new process, whose fork server is that of the pool. The fork server imports modules for seconds."""
     code = (
-        "import signal, time; from thor2_jax.service.preparation import PreparationPool; pool = PreparationPool(1); "
-        f"call = pool.submit(time.monotonic() + {HANG}, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
-        "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
+        "import signal; from thor2_jax.service.preparation import start_processes; processes = start_processes(1); "
+        "blocked = processes.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(); processes.close(); "
+        "print(*sorted(blocked)); print(signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
     )
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
 

@@ -12,7 +12,6 @@ import pytest
 from processes import HANG, is_running, wait_until
 from refusals import assert_refused
 
-from training.storage import workers as pools
 from training.storage.workers import IN_PROCESS, local_workers, ray_workers
 
 # A worker cannot import functions of a test file; it can import `eval`, whose items contain the work.
@@ -45,18 +44,6 @@ def test_no_items_give_no_results() -> None:
 def test_ctrl_c_is_blocked_from_the_start_of_a_worker() -> None:
     (blocked,) = local_workers(2)(eval, ["__import__('signal').pthread_sigmask(0, ())"])
     assert signal.SIGINT in blocked and signal.SIGTERM not in blocked
-
-
-def test_ctrl_c_again_while_running_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends the process at once, and does not leave one that waits forever."""
-    handlers, before = [], signal.getsignal(signal.SIGINT)
-
-    def shutdown(*_: object, **__: object) -> None:
-        handlers.append(signal.getsignal(signal.SIGINT))
-
-    monkeypatch.setattr(pools.ThreadPoolExecutor, "shutdown", shutdown)
-    assert list(local_workers(2)(eval, [])) == []
-    assert handlers == [signal.SIG_DFL] and signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -1,0 +1,57 @@
+"""Worker processes that are slow, die or are stopped, and signals to the process that has started them."""
+
+import math
+import multiprocessing
+import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from processes import HANG
+
+from thor2_jax import processes
+from thor2_jax.processes import Processes
+
+
+def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    pool = Processes(1, multiprocessing.get_context("spawn"), os.getpid)
+    request.addfinalizer(pool.close)
+    monkeypatch.setattr(processes, "MIN_SECONDS", 0.1)
+    for seconds, function, argument, kind in (
+        (0.1, time.sleep, 10 * HANG, TimeoutError),
+        (HANG, os._exit, 3, ChildProcessError),
+    ):
+        replaced = pool.submit(os.getpid).result(HANG)
+        with pytest.raises(kind):
+            pool.submit(function, argument, deadline=time.monotonic() + seconds).result(HANG)
+        with pytest.raises(ProcessLookupError):
+            os.kill(replaced, 0)
+    stopped = pool.submit(os.getpid).result(HANG)
+    os.kill(stopped, signal.SIGSTOP)
+    request.addfinalizer(lambda: Path(f"/proc/{stopped}").exists() and os.kill(stopped, signal.SIGKILL))
+    with pytest.raises(TimeoutError):  # It does not receive an argument that fills the pipe.
+        pool.submit(len, bytes(10**7), deadline=time.monotonic()).result(HANG)
+    pool.submit(os.getpid).result(HANG)
+    idle = pool._idle.get()
+    assert idle is not None
+    idle.process.kill()
+    idle.process.join()
+    pool._idle.put(idle)  # The pool does not notice the death of an idle process.
+    assert pool.submit(math.sqrt, 9.0).result(HANG) == 3.0
+    with pytest.raises(ValueError, match="math domain error") as error:
+        pool.submit(math.sqrt, -1.0).result(HANG)
+    assert "processes.py" in error.value.__notes__[0]  # the traceback in the process
+
+
+def test_ctrl_c_again_while_running_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends the process at once, and does not leave one that waits forever."""
+    handlers, before = [], signal.getsignal(signal.SIGINT)
+
+    def shutdown(*_: object, **__: object) -> None:
+        handlers.append(signal.getsignal(signal.SIGINT))
+
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", shutdown)
+    Processes(2, multiprocessing.get_context("spawn"), os.getpid).close()
+    assert handlers == [signal.SIG_DFL] and signal.getsignal(signal.SIGINT) is before

@@ -1,0 +1,120 @@
+"""Worker processes, each with a thread that waits for it. A process that dies or takes too long is replaced."""
+
+import contextlib
+import math
+import queue
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+from thor2_jax.signals import ended_by_signals, signals_blocked
+
+__all__ = ["Processes"]
+
+MIN_SECONDS = 1.0
+"""Shortest time that a process has for a call, so that only exceptionally slow calls are interrupted."""
+
+
+def _run(pipe: Connection, initialize: Callable[[], object]) -> None:
+    """Receive functions with their arguments, and send back (result, None) or (None, error)."""
+    initialize()
+    with contextlib.suppress(EOFError, OSError):  # The parent has ended or was killed.
+        pipe.send("ready")
+        while True:
+            function, arguments = pipe.recv()
+            try:
+                pipe.send((function(*arguments), None))
+            except Exception as error:
+                error.add_note(traceback.format_exc())  # The traceback itself cannot be sent.
+                pipe.send((None, error))
+
+
+class _Process(NamedTuple):
+    process: Any
+    pipe: Connection
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+class Processes:
+    """A fixed number of processes, which start when they are first needed.
+
+    Args:
+        count: number of processes.
+        context: of `multiprocessing`. It must not fork this process, since JAX starts threads, and a forked child can
+            deadlock on their locks.
+        initialize: function that each process calls at its start.
+        blocked: signals that the processes do not receive. A Ctrl-C reaches all processes of a terminal.
+    """
+
+    def __init__(self, count: int, context: Any, initialize: Callable[[], object], *blocked: signal.Signals) -> None:
+        self._context, self._initialize, self._blocked = context, initialize, blocked
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
+        for _ in range(count):
+            self._idle.put(None)
+
+    def submit(
+        self, function: Callable[..., Any], *arguments: Any, attempts: int = 1, deadline: float = math.inf
+    ) -> Future[Any]:
+        """Call `function`, which must be picklable like its arguments, in a process.
+
+        The future raises the error of the function, TimeoutError if the call has not returned at `deadline` (a time of
+        `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other.
+        """
+        return self._threads.submit(self._call, function, arguments, attempts, deadline)
+
+    def _start(self) -> _Process:
+        pipe, child_pipe = self._context.Pipe()
+        process = self._context.Process(target=_run, args=(child_pipe, self._initialize), daemon=True)
+        with signals_blocked(*self._blocked):
+            process.start()
+        child_pipe.close()
+        pipe.recv()
+        return _Process(process, pipe)
+
+    def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...], attempts: int, deadline: float) -> Any:
+        for _ in range(attempts):
+            idle, limit = self._idle.get(), math.inf
+            try:
+                if idle is None or not idle.process.is_alive():
+                    idle = self._start()
+                limit = max(deadline, time.monotonic() + MIN_SECONDS)
+                # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
+                timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), idle.process.kill)
+                timer.start()
+                try:
+                    idle.pipe.send((function, arguments))
+                    result, error = idle.pipe.recv()
+                finally:
+                    timer.cancel()
+            except (EOFError, OSError):  # The process has ended.
+                if idle is not None:
+                    idle.stop()
+                if time.monotonic() >= limit:
+                    raise TimeoutError("the deadline of a call was exceeded") from None
+            else:
+                if error is not None:
+                    raise error
+                return result
+            finally:
+                self._idle.put(idle)
+        raise ChildProcessError(f"{attempts} worker processes died at the same item, possibly because memory ran out")
+
+    def close(self) -> None:
+        """Wait for running calls, cancel the others, and end the processes; Ctrl-C ends this process meanwhile."""
+        # With an exception here, Python would wait at its end, possibly forever. Only the main thread handles signals.
+        is_main = threading.current_thread() is threading.main_thread()
+        with ended_by_signals() if is_main else contextlib.nullcontext():
+            self._threads.shutdown(cancel_futures=True)
+            while not self._idle.empty():
+                if (idle := self._idle.get()) is not None:
+                    idle.stop()
