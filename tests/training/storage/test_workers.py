@@ -13,7 +13,7 @@ from processes import HANG, is_running, wait_until
 from refusals import assert_refused
 
 from training.storage import workers as pools
-from training.storage.workers import IN_PROCESS, local_workers, ray_workers
+from training.storage.workers import local_workers, ray_workers
 
 # A worker cannot import functions of a test file; it can import `eval`, whose items contain the work.
 SLOW_FIRST = ["__import__('time').sleep(0.3) or 0", *map(str, range(1, 9))]
@@ -35,10 +35,6 @@ def test_results_keep_the_order_of_lazily_drawn_items(workers: int) -> None:
             ahead.append(len(drawn) - len(values))
     assert values == list(range(9))
     assert max(ahead) == (0 if workers == 1 else workers)
-
-
-def test_no_items_give_no_results() -> None:
-    assert list(IN_PROCESS(eval, [])) == list(local_workers(2)(eval, [])) == []
 
 
 @pytest.mark.slow
