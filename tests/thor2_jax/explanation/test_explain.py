@@ -321,7 +321,9 @@ def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Expla
     recognizer.enroll(own, [(FRAME, 3)], extend=True)  # only its views answer
     by_gallery = dataclasses.replace(recognizer.model, answer_by="gallery")
     assert not list(surface_fits(by_gallery, instance, names))
-    compared = dataclasses.replace(explanation, instance=instance, surfaces=tuple(fits))
+    left = dataclasses.replace(explanation.left_out, slices=np.array([np.nan, 0.5]))
+    compared = dataclasses.replace(explanation, instance=instance, surfaces=tuple(fits), left_out=left)
+    assert compared.as_json()["slices"] == [{"slice": 1, "loss": 0.5}]  # JSON has no NaN
     assert compared.as_json()["surfaces"][0] == {
         "name": own, "distance": first.distance, "chroma": first.chroma, "lightness": first.lightness, "free_space": 0.0
     }  # fmt: skip

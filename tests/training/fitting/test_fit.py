@@ -62,7 +62,9 @@ def answers(model: MLP, samples: Samples) -> np.ndarray:
     return np.asarray(jax.jit(model)(descriptors(samples)).argmax(axis=1))
 
 
-def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
+def test_separable_classes_are_learned(separable: Samples, fitted: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the first of three steps, an epoch takes 2 s."""
+    monkeypatch.setattr("training.fitting.loop.time.perf_counter", (2.0 * k for k in range(99)).__next__)
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
     model, best = fitted(log=curve.append, progress=lambda done, total, row: steps.append((done, total, row.epoch)))
@@ -71,6 +73,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     assert curve[-1].loss < curve[0].loss / 2 and curve[-1].accuracy > 0.8
     assert best == min(curve, key=lambda metrics: metrics.loss).epoch
     assert all(math.isfinite(metrics.loss) and metrics.held_out_accuracy is None for metrics in curve)
+    assert {metrics.samples_per_second for metrics in curve} == {2 * 16 / 2}
     assert steps == [(3 * epoch, 24, epoch) for epoch in range(1, 9)]
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import Command
-from dataset_files import TWO, K, band, images, write_bop
+from dataset_files import TWO, K, band, images, update, write_bop
 from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
@@ -31,12 +31,7 @@ def test_a_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(item.frame.labels, TWO[8] * 1 + TWO[14] * 2)
     camera = item.frame.intrinsics
     assert (camera.fx, camera.cx, camera.fy, camera.cy) == (K[0], K[2], K[4], K[5])
-
-
-def test_the_lens_distortion_of_a_scene(tmp_path: Path) -> None:
-    path = write_bop(tmp_path / "000048") / "scene_camera.json"
-    entries = json.loads(path.read_text())
-    path.write_text(json.dumps({image: {**entry, "distortion": [0.1, 0, 0, 0]} for image, entry in entries.items()}))
+    update(scene / "scene_camera.json", 1, {"cam_K": K, "depth_scale": 0.1, "distortion": [0.1, 0, 0, 0]})
     assert BOP(tmp_path)[0].frame.intrinsics.distortion == (0.1, 0, 0, 0)
 
 

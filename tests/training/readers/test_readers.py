@@ -51,7 +51,6 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
         assert item.frame.intrinsics == Intrinsics(*camera, 1000)
     listed = {"environment": "lounge", "category": "food", "occlusion": "high", "light": "2"}
     assert [item.attributes for item in items] == [listed, listed, {"environment": "lounge"}]
-    assert [item.identifier for item in dataset] == dataset.identifiers  # iterates again from the start
 
 
 def test_uwis_attributes() -> None:
