@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, as_array
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
@@ -320,8 +320,7 @@ def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, i
     if labels is not None:
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read("labels", labels)
     if not isinstance(intrinsics, File):
-        values = dataclasses.asdict(Intrinsics.of(intrinsics))
-        intrinsics = json.dumps(values, default=np.generic.item).encode()
+        intrinsics = json.dumps(dataclasses.asdict(Intrinsics.of(intrinsics)), default=np.generic.item).encode()
     files["intrinsics"] = _read("intrinsics", intrinsics)
     return files
 
@@ -333,6 +332,7 @@ def _read(name: str, file: File) -> bytes:
 
 
 def _encode_labels(labels: NDArray[Any]) -> bytes:
+    labels = as_array(labels, "labels", "integers [H, W]")
     is_image = labels.ndim == 2 and labels.size and labels.dtype.kind in "ui"
     if not is_image or not 0 <= labels.min() <= labels.max() < 2**16:
         raise InputError(

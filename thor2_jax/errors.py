@@ -27,7 +27,9 @@ class InputError(ValueError):
 
 
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
-    """Return `values` as an array; rows of different lengths raise InputError."""
+    """Return `values` as an array; rows of different lengths, and masked values, raise InputError."""
+    if np.ma.is_masked(values):
+        raise InputError(f"{name} is an array with masked values; expected {expected} without a mask; fill them")
     try:
         return np.asarray(values)
     except ValueError:

@@ -148,8 +148,7 @@ def attribute_points(scores: ClassScores, looks: PointClouds, instance: Prepared
     rng = np.random.default_rng(0)
     tenths += [rng.choice(n, tenth_of(n), replace=False) for _ in range(RANDOM_TENTHS)]
     rests = [select_points(instance, np.delete(np.arange(n), tenth)) for tenth in tenths]
-    exact = scores.of_instances([instance, *rests])
-    margins = np.asarray(scores.margin(jnp.asarray(exact), index))
+    margins = np.asarray(scores.margin(jnp.asarray(scores.of_instances([instance, *rests])), index))
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
@@ -201,5 +200,4 @@ def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions:
     predicted[cells] = [attributions[cell_of == k].sum() for k in cells]
     varies = len(cells) > 2 and np.ptp(predicted[cells]) > 0 and np.ptp(strips[cells]) > 0
     agreement = float(spearmanr(predicted[cells], strips[cells]).statistic) if varies else None
-    grid = config.n_slices, config.n_strips
-    return LeftOut(slices, strips.reshape(grid), predicted.reshape(grid), agreement)
+    return LeftOut(slices, strips.reshape(len(slices), -1), predicted.reshape(len(slices), -1), agreement)

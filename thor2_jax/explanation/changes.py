@@ -1,10 +1,11 @@
 """Smallest changes of the colour or the side lengths of an object that lead to another answer.
 
-Steps along the gradient of the relaxed descriptor give directions of change. Along each direction, the smallest change
-with another answer is searched for with the exact descriptor, whose frames are recomputed for every change.
+Steps along the gradient of the class scores of the relaxed descriptor give directions of change. Along each direction,
+the smallest change with another answer is searched for: each changed cloud is recognized, with surfaces and gallery.
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
@@ -26,6 +27,9 @@ __all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "sma
 Kind = Literal["color", "extent"]
 CHANGES: tuple[Kind, ...] = ("color", "extent")
 """Kinds of changes."""
+
+Recognize = Callable[[Sequence[PreparedInstance]], Sequence[str]]
+"""A function that returns the most probable name of each instance."""
 
 RELAXATION = Relaxation(slice=0.01, strip=0.0025, extremum=0.005, color=4.0)
 """Temperatures at which gradients reflect borders of slices, strips and colour regions at some distance."""
@@ -52,14 +56,12 @@ class Change:
         values: the shift of red, green and blue in units of 255, or the factors of the sides, longest first.
         size: length of the shift, in units of 255, or the largest relative change of a side.
         answer: the other answer.
-        margin: margin of the first answer after the change.
     """
 
     kind: Kind
     values: tuple[float, float, float]
     size: float
     answer: str
-    margin: float
 
 
 @partial(jax.jit, static_argnums=1)
@@ -69,11 +71,10 @@ def _axes(clouds: PointClouds, config: DescriptorConfig) -> jax.Array:
     return normalization_of(cloud, np.float32(config.sigma_s)).rotation
 
 
-def _changed(clouds: PointClouds, axes: jax.Array, parameters: jax.Array, kind: Kind) -> PointClouds:
+def _changed(clouds: PointClouds, axes: NDArray[np.float32], parameters: jax.Array, kind: Kind) -> PointClouds:
     if kind == "color":
         return dataclasses.replace(clouds, colors=jnp.clip(clouds.colors + parameters, 0, 1))
-    count = jnp.maximum(clouds.mask.sum(axis=1), 1)[:, None, None]
-    centre = jnp.where(clouds.mask[..., None], clouds.points, 0).sum(axis=1, keepdims=True) / count
+    centre = clouds.points.mean(axis=1, keepdims=True, where=clouds.mask[..., None])
     stretch = matmul(axes.T, jnp.exp(parameters)[:, None] * axes)
     moved = centre + matmul(clouds.points - centre, stretch.T)
     return dataclasses.replace(clouds, points=jnp.where(clouds.mask[..., None], moved, 0))
@@ -107,7 +108,7 @@ def apply_change(instance: PreparedInstance, change: Change, config: DescriptorC
 
 
 def _gradient_directions(
-    scores: ClassScores, clouds: PointClouds, axes: jax.Array, index: int, kind: Kind
+    scores: ClassScores, clouds: PointClouds, axes: NDArray[np.float32], index: int, kind: Kind
 ) -> NDArray[np.float64]:
     """Return directions [d, 3] of unit length that lead towards another answer."""
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
@@ -132,12 +133,15 @@ def _gradient_directions(
     return np.array([step / np.linalg.norm(step) for step in chosen if step.any()]).reshape(-1, 3)
 
 
-def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int, kind: Kind) -> Change | None:
+def smallest_change(
+    scores: ClassScores, recognize: Recognize, instance: PreparedInstance, index: int, kind: Kind
+) -> Change | None:
     """Return the smallest change of a kind that gives another answer than the name `index`.
 
     Args:
-        scores: class scores.
-        instance: an instance for which the name has the best score.
+        scores: class scores, whose gradients give the directions.
+        recognize: function of the whole model, since class scores alone need not determine the answer.
+        instance: an instance whose most probable name is `index`.
         index: number of the name in `scores.names`.
         kind: kind of the change.
 
@@ -148,25 +152,22 @@ def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int,
     if len(scores.names) < 2:
         return None
     clouds = packed(instance)
-    axes = _axes(clouds, scores.config)
+    axes = np.asarray(_axes(clouds, scores.config))
     directions = _gradient_directions(scores, clouds, axes, index, kind)
     lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES
-    frame = np.asarray(axes, np.float64)
 
-    def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float32]] | None:
-        values = scores.of_instances([changed_instance(instance, kind, parameters, frame) for parameters in tried])
-        other = np.flatnonzero(values.argmax(axis=1) != index)
-        return (tried[other[0]], values[other[0]]) if len(other) else None
+    def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], str] | None:
+        answers = recognize([changed_instance(instance, kind, parameters, axes) for parameters in tried])
+        pairs = zip(tried, answers, strict=True)
+        return next((pair for pair in pairs if pair[1] != scores.names[index]), None)
 
     changed = first_change((lengths[:, None, None] * directions).reshape(-1, 3))
     if changed is None:
         return None
     # Refine the length between the last one with the same answer and the first one with another answer.
     step = lengths[0] / np.linalg.norm(changed[0])
-    finer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
-    parameters, values = finer or changed
+    parameters, answer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None]) or changed
     shown = 255 * parameters if kind == "color" else np.exp(parameters)
     size = np.linalg.norm(shown) if kind == "color" else np.abs(shown - 1).max()
     first, second, third = (float(value) for value in shown)
-    margin = float(scores.margin(jnp.asarray(values)[None], index)[0])
-    return Change(kind, (first, second, third), float(size), scores.names[int(values.argmax())], margin)
+    return Change(kind, (first, second, third), float(size), answer)

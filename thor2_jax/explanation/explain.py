@@ -20,15 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_points, leave_out
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
-from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
+from thor2_jax.explanation.class_scores import ROWS, ClassScores, classifier_scores, gallery_scores, packed
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view, pack_instances
 from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
@@ -200,8 +201,7 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
 
 def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
     """Explain the answer for a usable instance; see `explain`."""
-    recognition, probabilities = _answer(model, instance)
-    ranked = np.argsort(-probabilities, kind="stable")
+    (recognition,), (ranked,) = _recognized(model, [instance])
     scores, names = _scores(model, explained_by_classifiers(model)[ranked[0]]), [model.names[k] for k in ranked]
     parts = dict(_parts(model, scores, instance, names))
     return Explanation(recognition=recognition, name=names[0], scores=scores, instance=instance, **parts)
@@ -225,9 +225,11 @@ def _parts(
     attributions = attribute_points(scores, looks, instance, index)
     yield "attributions", attributions
     yield "left_out", leave_out(scores, looks, index, attributions.values)
-    # If surfaces or classifiers and gallery together decide, another name than the answer may have the best score.
-    kinds = CHANGES if scored.argmax() == index else ()
-    changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
+
+    def recognize(instances: Sequence[PreparedInstance]) -> list[str]:
+        return [model.names[best] for best in _recognized(model, instances)[1][:, 0]]
+
+    changes = [smallest_change(scores, recognize, instance, index, kind) for kind in CHANGES]
     yield "changes", tuple(change for change in changes if change is not None)
     yield "described", _described(scores, looks, len(instance.points))
     yield "surfaces", tuple(surface_fits(model, instance, names))
@@ -248,7 +250,7 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     rng = np.random.default_rng(0)
     points = rng.uniform(0, (0.12, 0.08, 0.05), (n_points, 3)).astype(np.float32)
     instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
-    _answer(model, instance)
+    _recognized(model, [instance])
     scores = _scores(model, by_classifiers)
     best_first = np.argsort(-scores.of_instances([instance])[0], kind="stable")
     parts = _parts(model, scores, instance, [scores.names[k] for k in best_first])
@@ -265,13 +267,16 @@ def _scores(model: Model, by_classifiers: bool) -> ClassScores:
     return classifier_scores(model) if by_classifiers else gallery_scores(model)
 
 
-def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, NDArray[np.floating[Any]]]:
-    """Return the answer of the model and the probabilities of all names."""
+def _recognized(model: Model, instances: Sequence[PreparedInstance]) -> tuple[list[Recognition], NDArray[np.intp]]:
+    """Return the answers for instances, described `ROWS` at a time, and their ranked names [B, n], the best first."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    inference = jax.tree.map(np.asarray, infer_clouds(model, packed(instance)))
-    (recognition,) = answers(model, [instance], inference)
-    return recognition, model.combined(inference.probabilities, object_scores(model, inference))[0]
+    capacity = batch_points(len(instance.points) for instance in instances)
+    starts = range(0, max(len(instances), 1), ROWS)
+    rows = [infer_clouds(model, pack_instances(instances[k : k + ROWS], ROWS, capacity)) for k in starts]
+    inference = jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(instances)], *rows)
+    probabilities = model.combined(inference.probabilities, object_scores(model, inference))
+    return answers(model, instances, inference), np.argsort(-probabilities, kind="stable")
 
 
 def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlices:

@@ -169,7 +169,7 @@ def loss_text(explanation: Explanation, loss: float) -> str:
 def change_text(change: Change) -> str:
     """Return a change in words.
 
-    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", -0.1))
+    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl"))
     'longest side -10 %, middle side +0 %, shortest side +25 %'
     """
     if change.kind == "color":

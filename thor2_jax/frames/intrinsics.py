@@ -72,14 +72,14 @@ def _is_number(value: Any) -> bool:
     return is_real and bool(abs(value) <= LARGEST_INTRINSIC)
 
 
-def _checked_number(name: str, value: Any, least: float = 1 / LARGEST_INTRINSIC) -> Any:
-    """Return a number; raise InputError with its name if it is out of range.
+def _checked_number(name: str, value: Any, least: float = 1 / LARGEST_INTRINSIC) -> float:
+    """Return a number as a float, since sums of small NumPy integers overflow; raise InputError if it is out of range.
 
     Focal lengths and depth scales below the default of `least` would make points infinite.
     """
     if not _is_number(value) or value < least:
         raise InputError(f"{name} is {value!r}; expected a number from {least:.0e} to {LARGEST_INTRINSIC:.0e}")
-    return value
+    return float(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for name in (*_PINHOLE, "depth_scale"):
             least = -LARGEST_INTRINSIC if name in ("cx", "cy") else 1 / LARGEST_INTRINSIC
-            _checked_number(f"intrinsics.{name}", getattr(self, name), least)
+            object.__setattr__(self, name, _checked_number(f"intrinsics.{name}", getattr(self, name), least))
         for name in ("width", "height"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, Integral) or isinstance(value, bool) or value <= 0):
@@ -361,7 +361,9 @@ def _parse(content: bytes) -> Any:
             return parse_json(content)
     is_npy = content.startswith(b"\x93NUMPY")
     if not is_npy:
-        content = _first_document(content)
+        # `ros2 topic echo` ends each message with a line ---.
+        documents = re.split(rb"(?m)^---[ \t\r]*$", content)
+        content = next((each for each in documents if re.search(rb"(?m)^(?![#%])[ \t]*\S", each)), content)
     if len(content) > MAX_TEXT_BYTES:
         raise InputError(f"intrinsics has {len(content)} bytes; expected at most {MAX_TEXT_BYTES}")
     if is_npy:
@@ -380,12 +382,6 @@ def _parse(content: bytes) -> Any:
             if isinstance(values, str):
                 raise ValueError(f"it begins with {content.decode(errors='replace')[:30]!r}") from None
             return values
-
-
-def _first_document(content: bytes) -> bytes:
-    """Return the text before the line --- that ends each message of `ros2 topic echo`."""
-    documents = re.split(rb"(?m)^---[ \t\r]*$", content)
-    return next((each for each in documents if re.search(rb"(?m)^(?![#%])[ \t]*\S", each)), content)
 
 
 def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:

@@ -104,7 +104,8 @@ def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) 
     for label, place in enumerate(ndimage.find_objects(labels), start=1):
         if place is None:
             continue
-        mask = _largest_part(labels[place] == label)
+        numbers, sizes = components(labels[place] == label, connectivity=8)
+        mask = numbers == sizes.argmax()
         if _is_thing(mask, depth.z[place], depth, region[place], labels.size):
             count += 1
             free = (labels[place] == label) | (labels[place] == 0)
@@ -119,11 +120,6 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
     z = z[mask & (z > 0)]
     distance = float(np.quantile(z, 0.5, method="higher")) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
-
-
-def _largest_part(mask: Mask) -> Mask:
-    numbers, sizes = components(mask, connectivity=8)
-    return numbers == sizes.argmax() if len(sizes) > 2 else mask
 
 
 def _without_holes(mask: Mask) -> Mask:

@@ -95,7 +95,7 @@ OCCLUDED_WEIGHT = 0.5
 """Weight of a point of an occluded instance; other points have weight 1."""
 
 HALF_LIFE = 30
-"""Number of views of an object after which the weight of an older view has halved, so that the answer can change."""
+"""Number of described clouds (with poses, two for each frame) after which the weight of an older one has halved."""
 
 
 def view_weight(instance: PreparedInstance) -> float:

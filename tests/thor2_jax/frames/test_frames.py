@@ -54,6 +54,7 @@ def test_intrinsics_are_a_mapping_of_numbers_of_any_kind() -> None:
     """The principal point may lie outside the image."""
     values = {"fx": np.int64(500), "fy": np.float32(501), "cx": -20, "cy": 2.5, "depth_scale": 5, "name": "left"}
     assert Intrinsics.of(values) == Intrinsics(500, 501, -20, 2.5, 5)
+    assert sum(dataclasses.astuple(Intrinsics(*np.full(4, 200, np.uint8)))[:4]) == 800
     matrix, lens = jnp.array([[500, 0, 3], [0, 501, 2.5], [0, 0, 1]]), jnp.array([0.5, 0, 0, 0])
     assert Intrinsics.of(matrix) == Intrinsics.of({"K": matrix}) == Intrinsics(500, 501, 3, 2.5)
     assert Intrinsics(500, 501, 3, 2.5, distortion=lens).distortion == (0.5, 0, 0, 0)
@@ -82,6 +83,7 @@ BAD_FIELDS: dict[str, list[Any]] = {
     ],
     r"labels has type \w+; expected integers$": [np.ones((5, 7), kind) for kind in (np.float32, bool, object)],
     **{rf"{name} has rows of different lengths; .*\[H, W": [[[1], [1, 2]]] for name in ("color", "depth", "labels")},
+    **{f"{name} .* masked": [np.ma.masked_less(arrays()[name], 400)] for name in ("color", "depth", "labels")},
     r"labels has the value -3": [np.where(np.eye(5, 7), -3, 0)],
     r"labels has the value 9223372036854775808;": [np.full((5, 7), 2**63, np.uint64)],
 }
