@@ -148,7 +148,8 @@ def attribute_points(scores: ClassScores, looks: PointClouds, instance: Prepared
     rng = np.random.default_rng(0)
     tenths += [rng.choice(n, tenth_of(n), replace=False) for _ in range(RANDOM_TENTHS)]
     rests = [select_points(instance, np.delete(np.arange(n), tenth)) for tenth in tenths]
-    margins = np.asarray(scores.margin(jnp.asarray(scores.of_instances([instance, *rests])), index))
+    exact = scores.of_instances([instance, *rests])
+    margins = np.asarray(scores.margin(jnp.asarray(exact), index))
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
