@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import filelock
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +30,7 @@ from colornet.files import (
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
 
 __all__ = [
+    "LOCK",
     "as_path",
     "atomic_directory",
     "atomic_write",
@@ -40,6 +42,8 @@ __all__ = [
     "file_digest",
     "has_json",
     "json_digest",
+    "locked",
+    "new_directory",
     "open_file",
     "pack_arrays",
     "parse_json",
@@ -133,6 +137,54 @@ def check_writable(directory: Path) -> None:
 
 
 @contextlib.contextmanager
+def new_directory(directory: Path) -> Iterator[None]:
+    """Create a directory and its parents; at the end, remove those of them that were missing and are empty."""
+    missing = [path for path in (directory, *directory.parents) if not path.exists()]
+    directory.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the directory has files
+            for path in missing:
+                path.rmdir()
+
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def locked(directory: Path, busy: Exception | None = None, seconds: float = 0.0) -> Iterator[None]:
+    """Hold an exclusive lock on a directory, which is created as a `new_directory` if it is missing.
+
+    The operating system releases the lock when the process ends, even if it is killed. The lock file is kept, except in
+    a new directory without other files if `seconds` is 0.
+
+    Args:
+        directory: the directory.
+        busy: error that is raised if another process or thread holds the lock. Default: one of an output directory.
+        seconds: time to wait for it.
+
+    Raises:
+        InputError: `busy` is None, and another process holds the lock.
+        OSError: the directory cannot be written, or its file system does not support locks.
+    """
+    is_new = not (seconds or directory.exists())  # one that waits for the lock needs the directory
+    advice = "wait until it ends, or choose another directory"
+    with new_directory(directory):
+        # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
+        try:
+            held = filelock.FileLock(directory / LOCK, timeout=seconds, fallback_to_soft=False).acquire()
+        except filelock.Timeout:
+            raise busy or InputError(f"out: another process is writing to {directory}; {advice}") from None
+        with held:
+            try:
+                yield
+            finally:
+                if is_new and list(directory.glob("*")) == [directory / LOCK]:  # the directory may have been removed
+                    (directory / LOCK).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
 def atomic_directory(path: str | Path) -> Iterator[Path]:
     """Yield a temporary directory that takes the place of `path` if the block ends without an error.
 
@@ -143,30 +195,23 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
         path: the directory; its parents are created.
     """
     path = Path(path).resolve()
-    created = [parent for parent in path.parents if not parent.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with temporary_directory(path.parent) as temporary:
+        with new_directory(path.parent), temporary_directory(path.parent) as temporary:
             unfinished = temporary / path.name
             unfinished.mkdir(0o755)
             yield unfinished
-            try:
+            if not path.is_dir() or not any(path.iterdir()):
                 unfinished.rename(path)
-            except OSError as error:
-                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                    raise
+            else:
                 files = sorted(unfinished.iterdir())
                 for file in files:
                     check_replaceable(path / file.name)
                 for file in files:
                     file.replace(path / file.name)
-    except BaseException as error:
-        for parent in created:
-            with contextlib.suppress(OSError):
-                parent.rmdir()
+    except OSError as error:
         # A failed write to a full disk names no file, or one in the temporary directory.
         full, hidden = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), str(path.parent / PREFIX)
-        if isinstance(error, OSError) and (str(error.filename or "").startswith(hidden) or error.errno in full):
+        if str(error.filename or "").startswith(hidden) or error.errno in full:
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
 

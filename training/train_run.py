@@ -29,7 +29,7 @@ from scipy.sparse import csr_array
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import check_output_directory, errors_name, remove_written, write_text
+from thor2_jax.files import check_output_directory, errors_name, locked, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
@@ -55,7 +55,7 @@ from training.fitting.loop import (
 from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
 from training.protocol import Protocol, Stage
 from training.reports.plots import draw_curves
-from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
+from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, of_stage
 from training.views.normalized_views import ViewSource, fold_of_views
 
 __all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "read_metrics", "train_run"]

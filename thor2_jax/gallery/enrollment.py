@@ -89,6 +89,12 @@ def _contents(clouds: CompactClouds) -> list[bytes]:
     return [view.points.tobytes() + view.colors.tobytes() + view.boundary.tobytes() for view in clouds.views()]
 
 
+def _new_views(clouds: CompactClouds, surface: object, stored: GalleryObject | None) -> dict[bytes, int]:
+    """Return the content and the number of each view that an object lacks; all, if it gets its first surface."""
+    known = [] if stored is None or (surface is not None and stored.surface is None) else _contents(stored.clouds)
+    return {content: number for number, content in enumerate(_contents(clouds)) if content not in known}
+
+
 MAX_COPIES = 8
 """Largest number of copies of all views from frames together."""
 
@@ -161,7 +167,9 @@ FEW = 10
 
 
 _CHANGE = threading.Lock()
-"""Held during every change, so that no thread loses the change of another one. An attribute could not be pickled."""
+"""Held during changes in memory, so that no thread loses the change of another one, as the lock on disk is.
+
+An attribute could not be pickled."""
 
 
 class ObjectGallery:
@@ -173,7 +181,7 @@ class ObjectGallery:
     Attributes:
         gallery: the gallery.
         directory: directory of the gallery; None if it is in memory. `open` sets it.
-        lock_seconds: time that a change waits for another process that writes to the gallery.
+        lock_seconds: time that a change waits for other processes and threads that write to the gallery on disk.
     """
 
     def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
@@ -251,13 +259,14 @@ class ObjectGallery:
             return self._of_run(change(self._of_run(stored)))
 
         embedding = None if rebuild else self.embedding.fingerprint
-        with _CHANGE:
-            if self.directory is None:
+        if self.directory is None:
+            with _CHANGE:
                 self.gallery = change_stored(self.gallery)
-            else:
-                self.gallery = store.update_gallery(
-                    self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
-                )
+        else:
+            self.gallery = store.update_gallery(
+                self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
+            )
+            self.refresh()  # Another thread may have changed it since, and may have set the attribute before.
 
     def _of_run(self, gallery: Gallery) -> Gallery:
         """Return a gallery with the values of the run and the options; it has references only if it has objects."""
@@ -309,18 +318,17 @@ class ObjectGallery:
         Raises:
             InputError: a view has no points or is too large.
         """
-        new, stored = dict(zip(_contents(CompactClouds.of(views)), views, strict=True)), self.gallery.objects.get(name)
-        if extend and stored is not None and (surface is None or stored.surface is not None):
-            for content in _contents(stored.clouds):
-                new.pop(content, None)
-        return CompactClouds.of(list(new.values()))
+        new = _new_views(CompactClouds.of(views), surface, self.gallery.objects.get(name) if extend else None)
+        return CompactClouds.of([views[number] for number in new.values()])
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
 
         def change(gallery: Gallery) -> Gallery:
             for name, views in objects.items():
-                gallery = gallery.with_object(name, views, extend=extend, replace=replace)
+                # Another change may have added the same views since `new_views`.
+                if _new_views(views.clouds, views.surface, gallery.objects.get(name) if extend else None):
+                    gallery = gallery.with_object(name, views, extend=extend, replace=replace)
             return gallery
 
         self._change(change)

@@ -20,7 +20,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
@@ -28,6 +27,8 @@ from thor2_jax.files import (
     atomic_write,
     check_writable,
     content_digest,
+    locked,
+    new_directory,
     pack_arrays,
     read_file,
     remove_leftovers,
@@ -75,7 +76,7 @@ class GalleryError(InputError):
 
 
 class GalleryBusyError(GalleryError):
-    """Error of a gallery to which another process is writing."""
+    """Error of a gallery to which another process or thread is writing."""
 
 
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
@@ -219,18 +220,6 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 
-def _lock(directory: Path, seconds: float) -> contextlib.AbstractContextManager[object]:
-    """Return a context in which the gallery of a directory is locked; create the directory if it is missing."""
-    directory.mkdir(parents=True, exist_ok=True)
-    try:
-        # A soft lock would outlive a killed process.
-        return filelock.FileLock(directory / ".lock", timeout=seconds, fallback_to_soft=False).acquire()
-    except filelock.Timeout:
-        raise GalleryBusyError(
-            f"gallery: another process has been writing to {directory} for {seconds:.2g} s; try again when it ends"
-        ) from None
-
-
 def update_gallery(
     directory: Path,
     change: Callable[[Gallery], Gallery],
@@ -254,14 +243,15 @@ def update_gallery(
 
     Raises:
         GalleryError: the gallery cannot be read.
-        GalleryBusyError: another process holds the lock.
+        GalleryBusyError: another process or thread holds the lock.
         OSError: a file cannot be written; the gallery is unchanged.
     """
-    with _lock(directory, lock_seconds):
+    busy = f"another process or thread has been writing to {directory} for {lock_seconds:.2g} s; try again when it ends"
+    lock = locked(directory, GalleryBusyError(f"gallery: {busy}"), lock_seconds)
+    with lock, new_directory(directory / "objects"):
         is_lost = rebuild and gallery_stamp(directory) is None
         before = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
-        (directory / "objects").mkdir(exist_ok=True)
         _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
         objects = dict(changed.objects)
         written: list[Path] = []

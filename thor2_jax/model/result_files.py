@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import has_json, write_text
+from thor2_jax.files import has_json, new_directory, write_text
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.recognition import Detection, Recognition
@@ -61,10 +61,10 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
     Raises:
         OSError: a file cannot be written.
     """
-    out.mkdir(parents=True, exist_ok=True)
     instances = [dataclasses.asdict(recognition) for recognition in recognitions]
-    write_text(out / RESULT_FILES[0], json.dumps(instances, indent=1) + "\n")
-    draw_overlay(frame, recognitions, out / RESULT_FILES[1])
+    with new_directory(out):
+        write_text(out / RESULT_FILES[0], json.dumps(instances, indent=1) + "\n")
+        draw_overlay(frame, recognitions, out / RESULT_FILES[1])
 
 
 def image_numbers(names: Sequence[str]) -> list[tuple[int, int]]:
@@ -182,5 +182,5 @@ class ResultTables:
         contents = {coco: json.dumps(self._coco), bop: "\n".join([BOP_HEADER, *self._bop])}
         for path, content in contents.items():
             if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_text(path, content + "\n")
+                with new_directory(path.parent):
+                    write_text(path, content + "\n")

@@ -80,7 +80,7 @@ def ocid(
     ],
     runs: MoreModels = None,
     per_sequence: Annotated[
-        bool, typer.Option(help="RUN holds one run per sequence, as written by `train --sequences`.")
+        bool, typer.Option("--per-sequence", help="RUN holds one run per sequence (`train --sequences`).")
     ] = False,
 ) -> None:
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""

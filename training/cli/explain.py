@@ -17,7 +17,7 @@ from training.cli.app import app, console, finish, print_note
 def explain(
     model: options.ModelOption,
     given: options.FrameOptions,
-    out: Annotated[Path, typer.Option(help="Directory; each page is OUT/<frame>/<instance>/explanation.html.")],
+    out: Annotated[Path, typer.Option(help="Directory; a page is <frame>/<instance>/explanation.html in it.")],
     instance: Annotated[
         list[int] | None, typer.Option(help="Label number of an object; repeatable. Default: all.")
     ] = None,

@@ -107,7 +107,7 @@ def train(
         list[Path] | None,
         typer.Option(metavar="DIR...", help="Folders of labelled frames; their instances are used as views, too."),
     ] = None,
-    paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
+    paper: Annotated[bool, typer.Option("--paper", help="Use the paper's protocol.")] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Train in three quarters of the time, with fewer distractors and networks.")
     ] = False,

@@ -17,13 +17,13 @@ import typer
 import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.files import check_output_file, remove_written
+from thor2_jax.files import check_output_file, locked, remove_written
 from thor2_jax.networks.embedding import Embedding
 from training.embedding.distractors import ObjectSource, sample_objects, samples_record
 from training.embedding.fit import fit_embedding
 from training.fitting.loop import Checkpoints, fit_progress
 from training.objects.meshes import find_meshes
-from training.storage.jobs import begin_job, locked, of_stage
+from training.storage.jobs import begin_job, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding"]

@@ -205,9 +205,9 @@ class Distractors:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        count = self.procedural + len(self.meshes)
-        if count < ONE_HELD_OUT_OF:
-            raise InputError(f"distractors: there are {count} objects; expected at least {ONE_HELD_OUT_OF}; give more")
+        if (count := self.procedural + len(self.meshes)) < ONE_HELD_OUT_OF:
+            few = f"there are {count} objects as distractors, {self.procedural} of them procedural"
+            raise InputError(f"embedding: {few}; expected at least {ONE_HELD_OUT_OF}; give more")
 
     @property
     def sources(self) -> list[ObjectSource]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax import DESCRIPTOR_VERSION, InputError, RGBDFrame
-from thor2_jax.files import check_output_directory, file_digest, write_text
+from thor2_jax.files import check_output_directory, file_digest, locked, write_text
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
@@ -27,7 +27,7 @@ from training.evaluation.page import write_report_page
 from training.evaluation.results import check_known, compute_results
 from training.evaluation.runs import Run, all_predictors, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.jobs import Progress, locked
+from training.storage.jobs import Progress
 from training.storage.workers import WorkerPool
 
 __all__ = ["answer_frames", "answer_frames_in_pool", "evaluate_dataset", "load_runs"]

@@ -15,9 +15,9 @@ from pathlib import Path, PurePosixPath
 import httpx
 
 from thor2_jax.errors import InputError, reason_of
-from thor2_jax.files import atomic_directory, check_output_directory
+from thor2_jax.files import atomic_directory, check_output_directory, locked
 from training.objects.meshes import load_mesh
-from training.storage.jobs import Progress, locked
+from training.storage.jobs import Progress
 
 __all__ = ["LICENCE", "YCB_URL", "fetch_ycb"]
 

@@ -1,20 +1,18 @@
-"""Long jobs: records and locks of their output directories, stored arrays for resuming, progress, and the cache.
+"""Long jobs: records of their output directories, stored arrays for resuming, progress, and the cache.
 
 The user's cache directory may be deleted at any time. The environment variable THOR2_CACHE sets another directory, or
 `off` disables the cache.
 """
 
-import contextlib
 import itertools
 import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 import platformdirs
 from numpy.typing import NDArray
@@ -32,7 +30,6 @@ __all__ = [
     "check_same_job",
     "intact_content",
     "load_arrays",
-    "locked",
     "numbered",
     "of_stage",
     "processor",
@@ -183,37 +180,6 @@ def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any
 def _shown(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
-
-
-LOCK = ".lock"
-
-
-@contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Hold an exclusive lock on an output directory, which is created if it is missing and removed if it stays empty.
-
-    The operating system releases the lock when the process ends, even if it is killed. The lock file is kept.
-
-    Raises:
-        InputError: another process holds the lock.
-        OSError: the directory cannot be written, or its file system does not support locks.
-    """
-    is_new = not directory.exists()
-    # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
-    try:
-        held = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
-    except filelock.Timeout:
-        raise InputError(
-            f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
-        ) from None
-    with held:
-        try:
-            yield
-        finally:
-            with contextlib.suppress(OSError):  # the directory was removed
-                if is_new and os.listdir(directory) == [LOCK]:
-                    (directory / LOCK).unlink()
-                    directory.rmdir()
 
 
 MANIFEST = "manifest.json"

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import check_output_directory, write_text
+from thor2_jax.files import check_output_directory, locked, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from training.storage.jobs import MANIFEST, check_same_job, intact_content, locked, write_checked
+from training.storage.jobs import MANIFEST, check_same_job, intact_content, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import RenderJob, ViewTask, all_views
 

@@ -49,11 +49,11 @@ import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, refusing_os_errors, with_context
-from thor2_jax.files import check_output_directory, content_digest, read_file, remove_written, write_text
+from thor2_jax.files import check_output_directory, content_digest, locked, read_file, remove_written, write_text
 from thor2_jax.surfaces.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
-from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, locked, write_checked
+from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.crops import CROPS, ViewCrops, crop_file, read_crop_manifest
 from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task

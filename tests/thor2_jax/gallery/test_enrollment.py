@@ -12,11 +12,14 @@ import jax
 import numpy as np
 import pytest
 from image_files import frame_of_squares
+from processes import HANG
 from refusals import assert_refused
 from small_runs import small_embedding, untrained_run
+from written_files import files_of
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import instance_view
+from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery, views_to_embed
 from thor2_jax.gallery.gallery import Gallery
@@ -174,6 +177,16 @@ def test_threads_do_not_lose_changes_of_others(monkeypatch: pytest.MonkeyPatch) 
     assert set(objects.gallery.names) == {"brick", "book", *"defg"}
 
 
+def test_a_change_waits_for_other_threads_only_so_long(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    objects = ObjectGallery((), embedding())
+    objects.open(tmp_path / "new" / "gallery")
+    objects.lock_seconds = 0.1
+    with ThreadPoolExecutor(1) as threads:
+        monkeypatch.setattr(store, "previous_gallery", lambda *_: threads.submit(objects.undo, 1).result(HANG))
+        assert_refused("another process", objects.undo, 1)
+    assert files_of(tmp_path) == {}
+
+
 def test_unusable_views_are_refused_and_nothing_changes() -> None:
     recognizer = taught(run())
     before = recognizer.gallery
@@ -190,6 +203,7 @@ def test_a_view_that_is_given_twice_counts_once() -> None:
     recognizer = taught(run())
     recognizer.enroll("new", [BRICK, BOOK, (CLUTTER, 1), BRICK])
     recognizer.enroll("new", [BRICK, (CLUTTER, 3), (CLUTTER, 3)], extend=True)
+    recognizer.objects.add({"new": recognizer.gallery.objects["new"]}, extend=True)
     expected = CompactClouds.of([instance_view(CLUTTER, label, 2.5) for label in (1, 2, 3)])
     jax.tree.map(np.testing.assert_array_equal, vars(recognizer.gallery.objects["new"].clouds), vars(expected))
 

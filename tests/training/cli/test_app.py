@@ -21,9 +21,10 @@ from processes import HANG
 from refusals import assert_refused
 from rich.progress import Progress
 from small_runs import save_untrained_run
+from typer.main import get_command
 
 import thor2_jax as thor2
-from training.cli.app import enable_compilation_cache, finish, show_progress
+from training.cli.app import app, enable_compilation_cache, finish, show_progress
 from training.cli.options import FrameOptions
 from training.storage.jobs import numbered
 
@@ -88,10 +89,13 @@ def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
         assert str(tmp_path / "a") in refused(*command, tmp_path / "a")
 
 
-def test_version_and_help(printed: Command) -> None:
+def test_version_and_help(printed: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     assert printed("--version") == f"thor2 {thor2.__version__}\n"
-    for arguments in ((), ("-h",), ("evaluate",), ("train", "-h")):
-        assert "Usage:" in printed(*arguments)
+    names = vars(get_command(app))["commands"]
+    for arguments in ((), ("-h",), ("evaluate",), ("evaluate", "ocid", "-h"), *((name, "-h") for name in names)):
+        text = printed(*arguments)
+        assert "Usage:" in text and "…" not in text, arguments
     assert "--install-completion" in printed("--help")
     assert "{" not in printed("train", "--help")  # values of the protocols are filled in
 

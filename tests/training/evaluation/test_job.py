@@ -19,14 +19,13 @@ from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
 from written_files import ParsedPage, files_of
 
 import thor2_jax as thor2
-from thor2_jax.files import temporary_directory
+from thor2_jax.files import LOCK, locked, temporary_directory
 from thor2_jax.frames.overlay import Annotation
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
 from training.evaluation.runs import Run
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.jobs import LOCK, locked
 
 CLASSES = ("bowl", "can", "mug")
 

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from refusals import assert_refused
 
-from training.storage.jobs import LOCK, begin_job, check_same_job, locked
+from thor2_jax.files import LOCK, locked
+from training.storage.jobs import begin_job, check_same_job
 
 JOB: dict[str, Any] = {"seed": 0, "steps": [5.0, 15.0], "camera": {"width": 800}, "variations": None}
 
@@ -39,19 +40,17 @@ def test_a_lock_excludes_others_until_its_end(tmp_path: Path) -> None:
     for _ in range(2):
         with locked(tmp_path):
             assert_refused(str(tmp_path), locked(tmp_path).__enter__)
-    with pytest.raises(ZeroDivisionError), locked(tmp_path):
-        1 / 0  # noqa: B018
     with locked(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == [LOCK]
 
 
 def test_a_locked_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), locked(tmp_path / "new"):
+    with pytest.raises(ZeroDivisionError), locked(tmp_path / "new" / "deep"):
         1 / 0  # noqa: B018
     assert not list(tmp_path.iterdir())
-    with locked(tmp_path / "new"):
-        (tmp_path / "new" / "file").touch()
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [LOCK, "file"]
+    with locked(tmp_path / "new" / "deep"):
+        (tmp_path / "new" / "deep" / "file").touch()
+    assert sorted(path.name for path in (tmp_path / "new" / "deep").iterdir()) == [LOCK, "file"]
     (tmp_path / "old").mkdir()
     with locked(tmp_path / "old"):
         pass

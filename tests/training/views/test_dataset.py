@@ -23,13 +23,14 @@ from written_files import files_of
 
 import thor2_jax
 from thor2_jax.errors import InputError
+from thor2_jax.files import locked
 from thor2_jax.surfaces.surfaces import SURFACES_FILE
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
-from training.storage.jobs import MANIFEST, locked, write_checked
+from training.storage.jobs import MANIFEST, write_checked
 from training.storage.workers import local_workers
 from training.views import mesh_views, normalized_views
 from training.views.dataset import Shard, ViewDataset, encode, remove_views, render_dataset
