@@ -29,13 +29,11 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.gallery.gallery import GAMMA, Gallery
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import ColorTransform, Model
-from thor2_jax.networks.embedding import Embedding
-from thor2_jax.networks.networks import EMBEDDING, Classifier
-from thor2_jax.types import PointClouds, matmul
+from thor2_jax.networks.networks import EMBEDDING
+from thor2_jax.types import PointClouds
 
 __all__ = ["Adaptation", "OnlineAdaptation", "adaptation_criterion", "camera_instances", "estimate_transform"]
 
@@ -126,9 +124,6 @@ MIN_INSTANCES = 10
 MAX_INSTANCES = 40
 """Largest number of instances in use; more take longer and change little."""
 
-MAX_VIEWS = 1024
-"""Largest number of views of a gallery in use, evenly spread, since the regression is solved for all views at once."""
-
 EVIDENCE = 0.5
 """Weight of an instance's uncertainty, since instances of a few objects are not independent. Chosen on real frames."""
 
@@ -175,20 +170,26 @@ def adaptation_criterion(model: Model) -> Criterion:
     """Return the function from clouds to probabilities that an estimate makes more certain.
 
     It returns the class probabilities of the embedding, which allow for unknown objects; in runs without an embedding,
-    those of the classifiers, fused by the model's rule; and if the gallery answers alone, its scores.
+    those of the classifiers, fused by the model's rule; and if the gallery answers alone, its scores, divided by their
+    sum if it exceeds 1.
 
     Raises:
         InputError: the model has neither classes nor enrolled objects.
     """
+    # Reference views are not used, since the colours shall make the scores certain, whether or not objects are known.
+    gallery = dataclasses.replace(model.gallery, references=None)
 
     def fused(oriented: LookDescriptors) -> jax.Array:
         return fused_probabilities(infer(model, oriented).probabilities, model.rule)
 
+    def of_gallery(oriented: LookDescriptors) -> jax.Array:
+        scores = gallery.scores(model.embedding.embed_oriented(oriented))
+        return jnp.asarray(scores / np.maximum(scores.sum(axis=1, keepdims=True), 1))
+
     if model.answers_by() != "gallery":
         network, config, classify = model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)
     elif model.gallery.objects:
-        network, config = model.embedding.network, model.embedding.config
-        classify = gallery_classifier(model.gallery, model.embedding)
+        network, config, classify = model.embedding.network, model.embedding.config, of_gallery
     else:
         raise InputError("model has neither classes nor enrolled objects; enroll some first")
     config = dataclasses.replace(config, homology="closed_form", relaxation=None)
@@ -202,32 +203,6 @@ def adaptation_criterion(model: Model) -> Criterion:
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
     """Return up to `most` evenly spread numbers from 0 to count - 1."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.intp))
-
-
-def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
-    """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
-
-    Reference views are not used, since the colours shall make the scores certain, whether or not objects are known.
-
-    Args:
-        gallery: a gallery with at least one object.
-        embedding: the embedding of the gallery's views.
-    """
-    views, owner, ridge = dataclasses.replace(gallery, references=None).regression
-    kept = evenly_spread(len(owner), MAX_VIEWS)
-    views = views[kept].astype(np.float64)
-    kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge[kept])
-    duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(gallery.objects))[owner[kept]]), jnp.float32)
-    fixed = jnp.asarray(views, jnp.float32)
-
-    def classify(oriented: LookDescriptors) -> jax.Array:
-        # `adaptation_criterion` has already added the balanced colours.
-        embedded = embedding.embed_oriented(oriented)
-        scores = jnp.clip(matmul(jnp.exp(GAMMA * (matmul(embedded, fixed.T) - 1)), duals), 0, 1)
-        mean = scores.mean(axis=1)
-        return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
-
-    return classify
 
 
 def estimate_transform(
