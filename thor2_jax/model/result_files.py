@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pycocotools import mask as coco_mask  # type: ignore[import-untyped]
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import has_json, new_directory, write_text
@@ -98,19 +99,9 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
     }
 
 
-def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the compressed run-length encoding of a mask [H, W], as COCO defines it."""
-    borders = np.flatnonzero(np.diff(mask.ravel(order="F"), prepend=False))
-    counts = np.diff(borders, prepend=0, append=mask.size).tolist()
-    text = bytearray()
-    for position, count in enumerate(counts):
-        value = count - counts[position - 2] if position > 2 else count
-        more = True
-        while more:
-            digit, value = value & 0x1F, value >> 5
-            more = value != (-1 if digit & 0x10 else 0)
-            text.append(48 + digit + (0x20 if more else 0))
-    return {"size": list(mask.shape), "counts": text.decode("ascii")}
+def _encoded(mask: NDArray[np.bool_]) -> dict[str, Any]:
+    encoded = coco_mask.encode(np.asfortranarray(mask, np.uint8))
+    return {**encoded, "counts": encoded["counts"].decode("ascii")}
 
 
 class ResultTables:
@@ -164,7 +155,7 @@ class ResultTables:
                     "category_id": category,
                     "bbox": list(detection.box),
                     "score": answer.confidence,
-                    "segmentation": run_length_encoding(frame.label_image == answer.label),
+                    "segmentation": _encoded(frame.label_image == answer.label),
                     "frame": name,
                     "category_name": answer.name,
                 }

@@ -9,12 +9,7 @@ from pycocotools.coco import COCO
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.model.recognition import Recognition, detections_of
-from thor2_jax.model.result_files import (
-    ResultTables,
-    category_numbers,
-    image_numbers,
-    run_length_encoding,
-)
+from thor2_jax.model.result_files import ResultTables, category_numbers, image_numbers
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools
 
@@ -30,26 +25,6 @@ def frame() -> RGBDFrame:
 
 
 ANSWERS = [Recognition(1, "mug", 0.75), Recognition(2, "bowl", 0.5), Recognition(3, None, 0.125, reason="unknown")]
-
-MASKS = {
-    "empty": np.zeros((5, 7), bool),
-    "full": np.ones((5, 7), bool),
-    "first pixel": np.arange(35).reshape(5, 7) == 0,
-    "last pixel": np.arange(35).reshape(5, 7) == 34,
-    "random": RNG.random((31, 17)) < 0.5,
-    "rare": RNG.random((300, 400)) < 0.0005,
-    "frequent": RNG.random((300, 400)) < 0.9995,
-    "large runs": np.arange(480 * 640).reshape(480, 640) < 200_000,
-}
-
-
-@pytest.mark.parametrize("name", MASKS)
-def test_run_lengths_are_those_of_pycocotools(name: str) -> None:
-    mask = MASKS[name]
-    expected = coco_mask.encode(np.asfortranarray(mask.astype(np.uint8)))
-    encoded = run_length_encoding(mask)
-    assert encoded == {"size": expected["size"], "counts": expected["counts"].decode()}
-    np.testing.assert_array_equal(coco_mask.decode(encoded).astype(bool), mask)
 
 
 def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
