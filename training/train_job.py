@@ -17,6 +17,7 @@ from training.baselines.architectures import crop_size
 from training.baselines.baseline import baseline_file
 from training.baselines.job import check_baselines, train_baselines
 from training.baselines.thor import types_of_views
+from training.fitting.loop import wait_for_all
 from training.fitting.samples import check_classes
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
@@ -113,6 +114,7 @@ def run_train_job(job: TrainJob, progress: Progress) -> dict[Path, list[TrainedR
         runs[directory] = [] if is_finished(directory) else train_run(views, directory, job.protocol, shown, enrolled)
         if baselines and jax.process_index() == 0:
             train_baselines(directory, views, baselines, shown, weights=job.weights)
+        wait_for_all("finished")  # JAX lets no process end more than five minutes before the others
     if job.meshes is not None and jax.process_index() == 0:
         remove_views(job.out / VIEWS)
     return runs

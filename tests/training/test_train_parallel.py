@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_lines
-from processes import finish_programs, free_port, start_program
+from processes import HANG, finish_programs, free_port, start_program
 
 _PROGRAM = """
 import sys
@@ -56,3 +56,32 @@ def test_two_processes_reach_the_weights_of_one(tmp_path: Path) -> None:
     for fold in (0, 1):
         for rank in (0, 1):
             assert weights(tmp_path / "pair", rank, fold) == weights(tmp_path / "one", 0, fold)
+
+
+_FAILING = """
+import sys
+from training import train_job
+from training.cli import main
+from training.fitting.loop import wait_for_all
+rank, port = sys.argv[1:]
+
+def fail_alone(*_):
+    wait_for_all("begun")
+    if rank == "0":
+        raise OSError("the disk is full")
+    wait_for_all("finished")
+
+train_job.run_train_job = fail_alone
+sys.argv[1:] = ["train", "--dataset", "views", "--out", "run", "--coordinator", f"localhost:{port}"]
+sys.argv += ["--processes", "2", "--process", rank]
+main()
+"""
+
+
+@pytest.mark.slow
+def test_an_error_in_one_process_ends_both() -> None:
+    port = free_port()
+    first, second = (start_program(_FAILING, rank, port) for rank in (0, 1))
+    assert "error: the disk is full" in first.communicate(timeout=HANG)[1] and first.returncode == 2
+    message = second.communicate(timeout=HANG)[1]
+    assert "error: --coordinator: another process has ended" in message or "another task died" in message
