@@ -48,7 +48,7 @@ import numpy as np
 import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError, refusing_os_errors, with_context
+from thor2_jax.errors import InputError, decoding, refusing_os_errors, with_context
 from thor2_jax.files import check_output_directory, content_digest, locked, read_file, remove_written, write_text
 from thor2_jax.surfaces.surfaces import SURFACES_FILE, Surfaces
 from thor2_jax.types import Cloud
@@ -157,7 +157,7 @@ class ViewDataset:
         """
         path = directory / MANIFEST
         content = read_file(path)
-        try:
+        with decoding(f"dataset: {path} is damaged", advice="render it again"):
             table = json.loads(content)
             if table["format"] == MANIFEST_FORMAT:
                 checksum = table.pop("sha256")
@@ -165,8 +165,6 @@ class ViewDataset:
                     raise ValueError("its checksum differs")
                 shards = tuple(Shard(**shard) for shard in table["shards"])
                 return cls(directory, table["job"], shards, table.get("surfaces"))
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
 
     @functools.cached_property
