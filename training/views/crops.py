@@ -186,10 +186,8 @@ class ViewCrops:
 def stacked(crops: Sequence[Crop], size: int) -> ViewCrops:
     """Return crops of `size` pixels, possibly none, as one record."""
     shape = (len(crops), size, size, 3)
-    record = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
-    for row, (color, normals) in enumerate(crops):
-        record.color[row], record.normals[row] = color, normals
-    return record
+    color, normals = (np.reshape([crop[k] for crop in crops], shape) for k in (0, 1))
+    return ViewCrops(color.astype(np.uint8), normals.astype(np.int8))
 
 
 CROPS = "crops"
