@@ -132,20 +132,19 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
 def check_writable(directory: Path) -> None:
     """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
     existing = next(path for path in (directory, *directory.absolute().parents) if path.is_symlink() or path.exists())
-    with tempfile.TemporaryFile(dir=existing):
-        pass
+    tempfile.TemporaryFile(dir=existing).close()
 
 
 @contextlib.contextmanager
 def new_directory(directory: Path) -> Iterator[None]:
     """Create a directory and its parents; at the end, remove those of them that were missing and are empty."""
     missing = [path for path in (directory, *directory.parents) if not path.exists()]
-    directory.mkdir(parents=True, exist_ok=True)
     try:
+        directory.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        with contextlib.suppress(OSError):  # the directory has files
-            for path in missing:
+        for path in missing:
+            with contextlib.suppress(OSError):  # it has files, or does not exist
                 path.rmdir()
 
 
@@ -169,13 +168,12 @@ def locked(directory: Path, busy: Exception | None = None, seconds: float = 0.0)
         OSError: the directory cannot be written, or its file system does not support locks.
     """
     is_new = not (seconds or directory.exists())  # one that waits for the lock needs the directory
-    advice = "wait until it ends, or choose another directory"
     with new_directory(directory):
         # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
         try:
             held = filelock.FileLock(directory / LOCK, timeout=seconds, fallback_to_soft=False).acquire()
         except filelock.Timeout:
-            raise busy or InputError(f"out: another process is writing to {directory}; {advice}") from None
+            raise busy or InputError(f"out: another process is writing to {directory}; wait or use another") from None
         with held:
             try:
                 yield

@@ -7,12 +7,12 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import Any
 
-from thor2_jax.signals import ended_by_signals, signals_blocked
+from thor2_jax.signals import end_with_parent, ended_by_signals, signals_blocked
 
 __all__ = ["Processes"]
 
@@ -22,6 +22,7 @@ MIN_SECONDS = 1.0
 
 def _run(pipe: Connection, initialize: Callable[[], object]) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
+    end_with_parent(signal.SIGKILL)  # a call can take minutes
     initialize()
     with contextlib.suppress(EOFError, OSError):  # The parent has ended or was killed.
         pipe.send("ready")
@@ -31,12 +32,20 @@ def _run(pipe: Connection, initialize: Callable[[], object]) -> None:
                 pipe.send((function(*arguments), None))
             except Exception as error:
                 error.add_note(traceback.format_exc())  # The traceback itself cannot be sent.
-                pipe.send((None, error))
+                try:
+                    pipe.send((None, error))
+                except Exception:  # The error cannot be pickled.
+                    pipe.send((None, RuntimeError(traceback.format_exc())))
 
 
-class _Process(NamedTuple):
-    process: Any
-    pipe: Connection
+class _Process:
+    def __init__(self, context: Any, initialize: Callable[[], object], blocked: Sequence[signal.Signals]) -> None:
+        self.pipe, child_pipe = context.Pipe()
+        self.process = context.Process(target=_run, args=(child_pipe, initialize), daemon=True)
+        with signals_blocked(*blocked):
+            self.process.start()
+        child_pipe.close()
+        self.pipe.recv()
 
     def stop(self) -> None:
         self.process.kill()
@@ -56,7 +65,7 @@ class Processes:
     """
 
     def __init__(self, count: int, context: Any, initialize: Callable[[], object], *blocked: signal.Signals) -> None:
-        self._context, self._initialize, self._blocked = context, initialize, blocked
+        self._start = lambda: _Process(context, initialize, blocked)
         self._threads = ThreadPoolExecutor(count)
         self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
         for _ in range(count):
@@ -71,15 +80,6 @@ class Processes:
         `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other.
         """
         return self._threads.submit(self._call, function, arguments, attempts, deadline)
-
-    def _start(self) -> _Process:
-        pipe, child_pipe = self._context.Pipe()
-        process = self._context.Process(target=_run, args=(child_pipe, self._initialize), daemon=True)
-        with signals_blocked(*self._blocked):
-            process.start()
-        child_pipe.close()
-        pipe.recv()
-        return _Process(process, pipe)
 
     def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...], attempts: int, deadline: float) -> Any:
         for _ in range(attempts):
@@ -96,7 +96,9 @@ class Processes:
                     result, error = idle.pipe.recv()
                 finally:
                     timer.cancel()
-            except (EOFError, OSError):  # The process has ended.
+                if time.monotonic() >= limit:  # The timer may have ended the process after its answer.
+                    raise TimeoutError
+            except (EOFError, OSError):  # The process has ended, or will.
                 if idle is not None:
                     idle.stop()
                 if time.monotonic() >= limit:

@@ -1,11 +1,14 @@
-"""Handling of Ctrl-C and SIGTERM, also during the start of service processes and worker pools."""
+"""Handling of Ctrl-C and SIGTERM, also during the start of processes, and processes that end with their parent."""
 
 import contextlib
+import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Iterator
 from multiprocessing import resource_tracker
 
-__all__ = ["ended_by_signals", "signals_blocked"]
+__all__ = ["end_with_parent", "ended_by_signals", "signals_blocked"]
 
 
 @contextlib.contextmanager
@@ -37,3 +40,14 @@ def signals_blocked(*numbers: signal.Signals) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+
+
+def end_with_parent(number: signal.Signals) -> None:
+    """Send a signal to this process when its parent has ended, even by SIGKILL; a main process has no parent."""
+    if (parent := multiprocessing.parent_process()) is not None:
+
+        def send() -> None:
+            parent.join()
+            os.kill(os.getpid(), number)
+
+        threading.Thread(target=send, name="parent-watch", daemon=True).start()

@@ -36,22 +36,24 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
     pool.submit(os.getpid).result(HANG)
     idle = pool._idle.get()
     assert idle is not None
-    idle.process.kill()
-    idle.process.join()
+    idle.stop()
     pool._idle.put(idle)  # The pool does not notice the death of an idle process.
     assert pool.submit(math.sqrt, 9.0).result(HANG) == 3.0
     with pytest.raises(ValueError, match="math domain error") as error:
         pool.submit(math.sqrt, -1.0).result(HANG)
     assert "processes.py" in error.value.__notes__[0]  # the traceback in the process
+    with pytest.raises(RuntimeError, match="Local: a reason"):  # an error that cannot be pickled
+        pool.submit(eval, "(_ for _ in ()).throw(type('Local', (Exception,), {})('a reason'))").result(HANG)
+    monkeypatch.setattr(processes.threading.Timer, "start", lambda timer: None)
+    with pytest.raises(TimeoutError):  # The answer comes at the moment at which the timer ends the process.
+        pool.submit(time.sleep, 0.2, deadline=0).result(HANG)
 
 
 def test_ctrl_c_again_while_running_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends the process at once, and does not leave one that waits forever."""
     handlers, before = [], signal.getsignal(signal.SIGINT)
-
-    def shutdown(*_: object, **__: object) -> None:
-        handlers.append(signal.getsignal(signal.SIGINT))
-
-    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", shutdown)
+    monkeypatch.setattr(
+        ThreadPoolExecutor, "shutdown", lambda *_, **__: handlers.append(signal.getsignal(signal.SIGINT))
+    )
     Processes(2, multiprocessing.get_context("spawn"), os.getpid).close()
     assert handlers == [signal.SIG_DFL] and signal.getsignal(signal.SIGINT) is before

@@ -102,11 +102,9 @@ def _warm_up(name: str | None) -> None:
 
     If this fails, requests report the reason.
     """
-    if name is None:
-        return
     blank = RGBDFrame(np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), None, Intrinsics(60, 60, 32, 24))
-    with contextlib.suppress(InputError):
-        segmented(blank, _segmenter(name))
+    with contextlib.suppress(RequestError):  # also if there is no segmenter
+        _segmented(blank, name)
 
 
 def prepare_view(fields: dict[str, Any], config: DescriptorConfig) -> PreparedRequest:

@@ -8,12 +8,9 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import multiprocessing
 import os
 import signal
 import tempfile
-import threading
-from multiprocessing.process import BaseProcess
 
 import uvicorn
 from fastapi import FastAPI
@@ -26,7 +23,7 @@ from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.hosts import listening, page_headers
 from thor2_jax.service.settings import Settings
-from thor2_jax.signals import ended_by_signals, signals_blocked
+from thor2_jax.signals import end_with_parent, ended_by_signals, signals_blocked
 
 __all__ = ["TimedConnection", "serve"]
 
@@ -120,18 +117,10 @@ class _Supervisor(Multiprocess):
 
 
 def _create_worker(settings: Settings, workers: int) -> FastAPI:
-    """Create the application of one process; a worker is terminated when its parent has ended, even by SIGKILL."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
+    """Create the application of one process; a worker finishes the accepted requests when its parent has ended."""
+    end_with_parent(signal.SIGTERM)
     with ended_by_signals():  # uvicorn's handler would wait for the compilation.
         return create_app(settings, workers)
-
-
-def _terminate_after(parent: BaseProcess) -> None:
-    """Send SIGTERM to this process when its parent has ended; it finishes the accepted requests."""
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 class TimedConnection(HttpToolsProtocol):

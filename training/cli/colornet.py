@@ -15,14 +15,14 @@ def colornet(
     """Build the colour network from scratch and draw it."""
     import colornet as colornet_package
     from colornet.draw import draw_network, draw_similarity
-    from thor2_jax.files import check_output_directory
+    from thor2_jax.files import atomic_directory, check_output_directory
 
     check_output_directory(out)
     network = colornet_package.build()
-    out.mkdir(parents=True, exist_ok=True)
-    network.save(out / "network.npz")
-    draw_network(network, out / "network.png")
-    draw_similarity(network, out / "similarity.png")
+    with atomic_directory(out) as directory:
+        network.save(directory / "network.npz")
+        draw_network(network, directory / "network.png")
+        draw_similarity(network, directory / "similarity.png")
     same = network.fingerprint == colornet_package.load_default().fingerprint
     console.print(
         f"{network.n_raw_nodes} raw nodes, {network.n_regions} regions, {len(network.edges)} edges; "

@@ -45,8 +45,9 @@ def test_a_lock_excludes_others_until_its_end(tmp_path: Path) -> None:
 
 
 def test_a_locked_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), locked(tmp_path / "new" / "deep"):
-        1 / 0  # noqa: B018
+    for name, error in (("deep", ZeroDivisionError), (300 * "a" + "/deep", OSError)):
+        with pytest.raises(error), locked(tmp_path / "new" / name):
+            1 / 0  # noqa: B018
     assert not list(tmp_path.iterdir())
     with locked(tmp_path / "new" / "deep"):
         (tmp_path / "new" / "deep" / "file").touch()

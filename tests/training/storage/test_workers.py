@@ -83,10 +83,10 @@ def test_an_item_at_which_every_worker_dies_is_an_error() -> None:
 def test_workers_end_with_a_parent_that_is_killed() -> None:
     program = """
 from training.storage.workers import local_workers
-import time
-results = local_workers(2)(eval, ["__import__('time').sleep(0.5) or __import__('os').getpid()"] * 9)
+number, long = "__import__('time').sleep(0.5) or __import__('os').getpid()", "__import__('time').sleep(10_000)"
+results = local_workers(2)(eval, [number, number, long, long])
 print(next(results), next(results), flush=True)
-time.sleep(10_000)
+next(results)
 """
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
