@@ -168,12 +168,13 @@ def locked(directory: Path, busy: Exception | None = None, seconds: float = 0.0)
         OSError: the directory cannot be written, or its file system does not support locks.
     """
     is_new = not (seconds or directory.exists())  # one that waits for the lock needs the directory
+    advice = "wait until it ends, or choose another directory"
     with new_directory(directory):
         # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
         try:
             held = filelock.FileLock(directory / LOCK, timeout=seconds, fallback_to_soft=False).acquire()
         except filelock.Timeout:
-            raise busy or InputError(f"out: another process is writing to {directory}; wait or use another") from None
+            raise busy or InputError(f"out: another process is writing to {directory}; {advice}") from None
         with held:
             try:
                 yield
