@@ -1,10 +1,9 @@
-"""Borders and nearest pixels, compared with NumPy and SciPy; scenes on a table test the other operations on pixels."""
+"""Floods and nearest pixels, compared with NumPy and SciPy; scenes on a table test the other operations on pixels."""
 
 import numpy as np
-import pytest
 from scipy import ndimage
 
-from thor2_jax.segmentation.pixels import label_borders, nearest_known, watershed
+from thor2_jax.segmentation.pixels import nearest_known, watershed
 
 MASK = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(60, 90)), 2) > 0
 
@@ -15,13 +14,6 @@ def test_the_nearest_known_pixel_is_nearest() -> None:
     exact = ndimage.distance_transform_edt(~MASK)
     assert np.all(distance[MASK] == 0) and exact.max() > 5
     assert np.all(distance <= 1.1 * exact)  # OpenCV adds up steps to the neighbours of a pixel
-
-
-@pytest.mark.parametrize("largest", [5, 300])
-def test_borders_have_two_labels_around(largest: int) -> None:
-    labels = np.where(MASK, largest, 1).astype(np.int32)
-    low, high = (f(labels, size=3, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    assert np.array_equal(label_borders(labels, 3), low != high)
 
 
 def test_a_flood_ends_at_the_edge_of_two_colors() -> None:
