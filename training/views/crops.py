@@ -187,7 +187,7 @@ def stacked(crops: Sequence[Crop], size: int) -> ViewCrops:
     """Return crops of `size` pixels, possibly none, as one record."""
     shape = (len(crops), size, size, 3)
     color, normals = (np.reshape([crop[k] for crop in crops], shape) for k in (0, 1))
-    return ViewCrops(color.astype(np.uint8), normals.astype(np.int8))
+    return ViewCrops(color.astype(np.uint8, copy=False), normals.astype(np.int8, copy=False))
 
 
 CROPS = "crops"
