@@ -1,7 +1,6 @@
 """The benchmark of simulated cameras: its frames, its metrics by hand, and the command with an untrained run."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +85,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         save_untrained_run(tmp_path / f"run{seed}", CLASSES, ("tops",), seed=seed)
     out, picture = tmp_path / "out.json", tmp_path / "cameras.jpg"
     arguments = f"--model {tmp_path}/run0 {tmp_path}/run1 --frames {tmp_path}/video --out {out} --picture {picture}"
-    monkeypatch.setattr(sys, "argv", ["cameras", *arguments.split()])
+    monkeypatch.setattr("sys.argv", ["cameras", *arguments.split()])
     cameras.main()
     report = json.loads(out.read_text())
     results = report["results"]

@@ -1,7 +1,6 @@
 """The table of levers: its rows, its groups, and a tiny table of built-in objects that is interrupted and resumes."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ def test_rows_of_the_table_differ() -> None:
 
 
 def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
-    monkeypatch.setattr(sys, "argv", ["levers", *map(str, arguments)])
+    monkeypatch.setattr("sys.argv", ["levers", *map(str, arguments)])
     levers.main()
 
 

@@ -1,6 +1,5 @@
 """Summaries of the benchmarks against values by hand, their bad arguments, and the benchmark of `thor2 doctor`."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +81,7 @@ def test_bad_arguments_write_nothing(
         (paper, "--meshes . --out out --frames absent", "absent"),
         (paper, "--meshes . --out out --frames . --baselines tree", "baselines is tree"),
     ):
-        monkeypatch.setattr(sys, "argv", ["benchmark", *arguments.split()])
+        monkeypatch.setattr("sys.argv", ["benchmark", *arguments.split()])
         with pytest.raises(SystemExit) as caught:
             benchmark.main()
         error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"

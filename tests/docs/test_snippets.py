@@ -24,7 +24,6 @@ from small_clouds import random_clouds
 from small_runs import save_untrained_run, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax import capacity
 from thor2_jax import recognizer as recognizer_module
 from thor2_jax.client import Client
 from thor2_jax.frames.frames import backproject
@@ -111,7 +110,7 @@ def test_landing_page_and_first_tutorial(run: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.slow
 def test_explanation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     recognizer = thor2.Recognizer(untrained_run(("bowl", "mug")))
     names = run_blocks("docs/explain.md", 0, recognizer=recognizer, frame=FRAME)
     assert {names["explanation"].name, names["explanation"].runner_up} == {"bowl", "mug"}

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import jax
 import numpy as np
 import pytest
 from failures import Interrupted, full_disk, stop_when
@@ -20,7 +19,6 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.networks.networks import model_arrays
 from training import train_run as module
 from training.evaluation.runs import load_runs
-from training.fitting import loop
 from training.fitting.calibration import fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext
 from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
@@ -61,7 +59,7 @@ def logged_rows(path: Path) -> list[tuple[Any, ...]]:
 @pytest.fixture(scope="module", autouse=True)
 def every_step_is_reported(module_patch: pytest.MonkeyPatch) -> None:
     """Report each step, so that a training can be interrupted at any of them."""
-    module_patch.setattr(loop, "STEPS_PER_REPORT", 1)
+    module_patch.setattr("training.fitting.loop.STEPS_PER_REPORT", 1)
 
 
 @pytest.mark.usefixtures("drawn_pictures")
@@ -94,7 +92,7 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     (tmp_path / "run" / "kept").write_text("x")
     assert_refused(f"out: {tmp_path / 'run'} already contains kept", train, tmp_path / "run")
     assert_refused(r"classifiers is \('shape',\)", train, tmp_path / "new", ("shape",))
-    monkeypatch.setattr(jax, "device_count", lambda: 3)
+    monkeypatch.setattr("jax.device_count", lambda: 3)
     assert_refused("batch_size is 8; .*multiple of the 3 devices", train, tmp_path / "new")
     assert [p.name for p in tmp_path.rglob("*")] == ["run", "kept"]
 

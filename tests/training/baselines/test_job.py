@@ -16,7 +16,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.types import Cloud
-from training.baselines import cloud_baselines, job, thor
+from training.baselines import job, thor
 from training.baselines.baseline import (
     FitTask,
     StoredBaseline,
@@ -63,7 +63,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with the forest, whose training compiles least."""
     folder = write_run(tmp_path_factory.mktemp("baselines") / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cloud_baselines, "TREES", 20)
+        patch.setattr("training.baselines.cloud_baselines.TREES", 20)
         train_baselines(folder, SOURCE, ["forest"])
     return folder
 

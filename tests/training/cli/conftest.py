@@ -13,7 +13,6 @@ from thor2_jax.model import model as models
 from thor2_jax.networks import embedding
 from training import protocol
 from training.protocol import DEFAULT, PAPER
-from training.views import mesh_views
 
 COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
 """A small descriptor whose grid covers the objects: if it overflowed, nothing would have a name."""
@@ -46,4 +45,4 @@ def small_embedding(module_patch: pytest.MonkeyPatch) -> None:
     small = embedding_of_tests()
     for module in (embedding, enrollment, models):
         module_patch.setattr(module, "load_default", lambda: small)
-    module_patch.setattr(mesh_views, "MESH_VIEWS", 1)
+    module_patch.setattr("training.views.mesh_views.MESH_VIEWS", 1)

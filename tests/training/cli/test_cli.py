@@ -20,7 +20,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import temporary_directory
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.networks.networks import FEATURES
-from training import protocol, train_job
 from training.protocol import DEFAULT, PAPER, QUICK
 from training.readers.frames import frame_files
 from training.train_job import TrainJob
@@ -142,9 +141,9 @@ def test_a_default_training_recognizes_and_is_evaluated(
 
 def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs: list[TrainJob] = []
-    monkeypatch.setattr(protocol, "DEFAULT", DEFAULT)
-    monkeypatch.setattr(protocol, "PAPER", PAPER)
-    monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: jobs.append(job) or {})
+    monkeypatch.setattr("training.protocol.DEFAULT", DEFAULT)
+    monkeypatch.setattr("training.protocol.PAPER", PAPER)
+    monkeypatch.setattr("training.train_job.run_train_job", lambda job, progress: jobs.append(job) or {})
 
     def job(*options: object) -> TrainJob:
         assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / "run", *options) == 0
@@ -172,14 +171,14 @@ def test_options_of_protocols(meshes: Path, tmp_path: Path, refused: Command, mo
 
 
 def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command) -> None:
-    monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: []})
+    monkeypatch.setattr("training.train_job.run_train_job", lambda job, progress: {job.out: []})
     command = ("train", "--dataset", tmp_path, "--out", tmp_path / "run")
     assert "nothing was trained" in printed(*command)
     assert "nothing was trained" not in printed(*command, "--baselines", "forest")
     for surfaces in (None, object()):
         record = {"dataset": {}, "held_out_accuracy": {}}
         trained = SimpleNamespace(record=record, embedding=object(), surfaces=surfaces, classes=())
-        monkeypatch.setattr(train_job, "run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
+        monkeypatch.setattr("training.train_job.run_train_job", lambda job, progress: {job.out: [trained]})  # noqa: B023
         assert ("no surfaces" in printed(*command)) == (surfaces is None)
     enrolled = SimpleNamespace(objects={"mug": SimpleNamespace(clouds=[1, 2])})
     monkeypatch.setattr("thor2_jax.gallery.store.load_gallery", lambda _: enrolled)
@@ -216,7 +215,7 @@ def test_train_by_folds(
     def render(*_: object, **__: object) -> None:
         raise InputError("views are rendered")
 
-    monkeypatch.setattr(train_job, "render_dataset", render)
+    monkeypatch.setattr("training.train_job.render_dataset", render)
     for fold in ("fold-0", "fold-1"):
         assert "views are rendered" in refused(*arguments, "--baselines", "forest")
         (tmp_path / "run" / fold / "baselines").mkdir()
@@ -269,7 +268,7 @@ def test_rendered_views_stay(meshes: Path, tmp_path: Path, refused: Command, mon
     assert "--batch-size is 100000" in refused(*command, "--batch-size", 100_000, at_once=False)
     assert not out.exists()  # no view was rendered
     with monkeypatch.context() as patch:
-        patch.setattr(train_job, "train_run", mock.Mock(side_effect=InputError("stopped")))
+        patch.setattr("training.train_job.train_run", mock.Mock(side_effect=InputError("stopped")))
         assert "stopped" in refused(*command, at_once=False)
     assert [p.name for p in out.iterdir()] == ["views"]
     last = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--embedding", 0)

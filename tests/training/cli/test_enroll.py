@@ -18,10 +18,8 @@ from refusals import assert_refused
 from rendered_objects import write_box
 from written_files import files_of
 
-from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
-from training.cli import evaluate
 from training.enrollment import enroll_objects
 from training.readers.frames import FrameFolder, find_frames
 
@@ -91,7 +89,7 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
 
 def test_runs_and_files_of_a_frame_are_told_apart(model: Path, frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
-    monkeypatch.setattr(evaluate, "_evaluate", lambda *arguments, **_: calls.append(arguments))
+    monkeypatch.setattr("training.cli.evaluate._evaluate", lambda *arguments, **_: calls.append(arguments))
     one = frame_options(frames / "000")
     for given, dataset in (([frames], frames), (one, frames / "000" / "color.png")):
         assert run_thor2("evaluate", "frames", "--model", model, model, *given) == 0
@@ -282,7 +280,7 @@ def test_a_full_disk_leaves_no_run(frames: Path, tmp_path: Path, monkeypatch: py
         for before in ([], [tmp_path / step / "run"]):  # the directory is new, or there and empty
             (tmp_path / step / "run" if before else tmp_path / step).mkdir()
             with monkeypatch.context() as patch:
-                patch.setattr(store, step, full_disk)
+                patch.setattr(f"thor2_jax.gallery.store.{step}", full_disk)
                 _, err = texts("enroll", "--frames", frames, "--model", tmp_path / step / "run", status=2)
             assert "No space left" in err
             assert list((tmp_path / step).rglob("*")) == before

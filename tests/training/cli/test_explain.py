@@ -13,7 +13,6 @@ from image_files import write_frame
 from small_runs import with_surfaces
 from written_files import ParsedPage
 
-from thor2_jax import capacity
 from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import load_run, save_run
@@ -25,7 +24,7 @@ from training.reports import explanation_page
 
 @pytest.fixture(autouse=True)
 def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
 
 
 @pytest.fixture

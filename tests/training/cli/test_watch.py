@@ -12,7 +12,6 @@ from image_files import write_frame_files
 from recording_files import table_frame, write_recording
 
 from thor2_jax.segmentation.table import segment_table
-from thor2_jax.watch.live import LiveView
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 
@@ -52,7 +51,7 @@ def test_only_frames_without_labels_need_opencv(
 
 
 def test_ctrl_c(model: Path, folder: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LiveView, "show", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("thor2_jax.watch.live.LiveView.show", lambda *_: signal.raise_signal(signal.SIGINT))
     handler = signal.getsignal(signal.SIGINT)
     assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0
     assert [one["state"] for one in messages] == ["waiting"]

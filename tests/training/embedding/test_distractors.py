@@ -14,7 +14,6 @@ from small_runs import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
-import training
 from training.embedding import distractors as module
 from training.embedding.distractors import Distractors, samples_record
 from training.fitting.samples import Samples
@@ -66,7 +65,7 @@ def test_samples_are_built_once(
         assert [counted(), counted()] == [1, 0]
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
-    monkeypatch.setattr(training, "__file__", str(code.parent / "__init__.py"))
+    monkeypatch.setattr("training.__file__", str(code.parent / "__init__.py"))
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
     assert [counted(), counted()] == [1, 0] and stored(tmp_path / "elsewhere") and len(stored(cache)) == 3
     monkeypatch.delenv("THOR2_CACHE")

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import runpy
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -165,7 +164,7 @@ def test_a_file_of_the_user_is_not_replaced(tmp_path: Path, monkeypatch: pytest.
     assert_refused("embedding.safetensors", build_embedding, tmp_path / "embedding.safetensors")
     assert (tmp_path / "embedding.safetensors").read_text() == "a user's"
     (tmp_path / "new.checkpoints").touch()
-    monkeypatch.setattr(sys, "argv", ["build", "--out", str(tmp_path / "new")])
+    monkeypatch.setattr("sys.argv", ["build", "--out", str(tmp_path / "new")])
     with pytest.raises(SystemExit, match="^error: .*new.checkpoints"):
         runpy.run_path(build.__file__, run_name="__main__")
 

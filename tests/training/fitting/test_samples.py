@@ -14,7 +14,6 @@ from small_clouds import random_clouds as views
 import colornet
 import thor2_jax as thor2
 from training.fitting.samples import PAPER_MIRRORS, Form, describe_batch, sample_views
-from training.views import normalized_views
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
 NETWORK = colornet.load_default()
@@ -26,7 +25,7 @@ RELAXED = thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxa
 
 @pytest.mark.parametrize("config", [CONFIG, *slow(thor2.DescriptorConfig.released(homology="closed_form"), RELAXED)])
 def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
+    monkeypatch.setattr("training.views.normalized_views.CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []
     samples, kept = sample_views(source, NETWORK, config, Form(PAPER_MIRRORS), progress=lambda *n: progress.append(n))

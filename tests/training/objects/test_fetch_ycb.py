@@ -17,7 +17,6 @@ from refusals import assert_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
-from training.objects import fetch_ycb as fetch_ycb_module
 from training.objects.fetch_ycb import fetch_ycb
 from training.objects.meshes import find_meshes
 
@@ -128,7 +127,7 @@ def test_damaged_archives_leave_nothing(server: Any, tmp_path: Path, damage: str
 @pytest.mark.parametrize("size", [5000, 20_000])
 def test_archives_that_would_fill_the_disk(server: Any, tmp_path: Path, size: int, monkeypatch: Any) -> None:
     """The archive has 12 kB, and its files 25 kB."""
-    monkeypatch.setattr(fetch_ycb_module, "MAX_BYTES", size)
+    monkeypatch.setattr("training.objects.fetch_ycb.MAX_BYTES", size)
     server.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files() | {f"{NAME}/zeros": bytes(13_000)})}
     assert_refused(f"{NAME}.*more than {size:,} bytes", fetch_ycb, [NAME], tmp_path, url=server.url)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]

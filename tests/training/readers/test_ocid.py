@@ -15,8 +15,6 @@ from refusals import assert_refused
 from toy_recognizers import NamesInOrder
 
 from thor2_jax.frames.frames import backproject
-from training.evaluation import job
-from training.evaluation import runs as evaluated_runs
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers.ocid import OCID, fit_intrinsics, read_organized_points
 
@@ -127,7 +125,7 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     table = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
     classes = {"seq36": ("mug", "bowl"), "seq08": ("banana", "apple")}
     runs = {name: [EvaluatedRun(name, name, NamesInOrder(each))] for name, each in classes.items()}
-    monkeypatch.setattr(evaluated_runs, "load_runs", lambda paths: runs[paths[0].name])
+    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: runs[paths[0].name])
     models = tmp_path / "runs"
     names = write_names(tmp_path, table)
     command = ("evaluate", "ocid", tmp_path, "--model", models, "--names", names)
@@ -143,7 +141,7 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
     assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
     assert "2 models are given" in refused(*command, "--per-sequence", tmp_path)
-    monkeypatch.setattr(job, "load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
+    monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
     output = printed(*command)  # one run for all sequences
     assert "instances scored: " in output and "Published table 3" in output and "Published table 1" not in output
     names.unlink()

@@ -32,7 +32,6 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.storage.jobs import MANIFEST, write_checked
 from training.storage.workers import local_workers
-from training.views import mesh_views, normalized_views
 from training.views.dataset import Shard, ViewDataset, encode, remove_views, render_dataset
 from training.views.mesh_views import COORDINATE_STEP, MAX_VIEW_LENGTH, RenderJob, render_views
 from training.views.normalized_views import NormalizedViews, normalize_views, padded_batches
@@ -48,7 +47,7 @@ CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 def small_shards_on_a_cpu() -> Iterator[None]:
     """An accelerator may swap nearly equal sides of a cloud that it normalizes in a batch instead of alone."""
     with jax.default_device(jax.devices("cpu")[0]), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh_views, "CLOUDS_PER_SHARD", 4)
+        patch.setattr("training.views.mesh_views.CLOUDS_PER_SHARD", 4)
         yield
 
 
@@ -175,7 +174,7 @@ def test_another_job_is_refused(copied: Path) -> None:
 
 
 def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 8)
+    monkeypatch.setattr("training.views.mesh_views.CLOUDS_PER_SHARD", 8)
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
     job = RenderJob({"ball": resized(1)}, 90, 90, light, 1)
     dataset = render_dataset(job, out)
@@ -192,7 +191,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One shard keeps none of its views; objects may have any name."""
-    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 2)
+    monkeypatch.setattr("training.views.mesh_views.CLOUDS_PER_SHARD", 2)
     sheet, name = resized(1), "../a b/ü"
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
     dataset = render_dataset(RenderJob({name: sheet}, 180, 90), tmp_path / "views")
@@ -249,7 +248,7 @@ def test_only_what_was_rendered_is_removed(copied: Path) -> None:
 
 def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Coordinates differ from those of `view_normalize`, cloud by cloud, by at most half a step."""
-    monkeypatch.setattr(mesh_views, "CLOUDS_PER_SHARD", 30)
+    monkeypatch.setattr("training.views.mesh_views.CLOUDS_PER_SHARD", 30)
     dataset = render_dataset(RenderJob(OBJECTS, 60, 45), tmp_path)
     assert dataset.classes == NAMES and [(shard.label, shard.views) for shard in dataset.shards] == [(0, 30), (1, 30)]
     for index, (name, clouds) in enumerate(render_views(OBJECTS, 60, 45).items()):
@@ -283,7 +282,7 @@ def test_empty_views_and_views_beyond_the_range() -> None:
 
 
 def test_padded_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(normalized_views, "CLOUDS_PER_BATCH", 2)
+    monkeypatch.setattr("training.views.normalized_views.CLOUDS_PER_BATCH", 2)
     clouds = random_clouds(0, (3, 2100, 5))
     batches = list(padded_batches(clouds))
     assert [count for count, _ in batches] == [2, 1]

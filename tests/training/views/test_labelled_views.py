@@ -13,7 +13,6 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
-from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
 from training.views.mesh_views import COORDINATE_STEP
 from training.views.normalized_views import MemoryViews, WithoutClasses
@@ -72,7 +71,7 @@ def test_surfaces_need_a_mesh_of_every_class() -> None:
 
 def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clouds with an occlusion boundary may take another half turn than the same points without one."""
-    monkeypatch.setattr(labelled_views, "CLOUDS", 12)
+    monkeypatch.setattr("training.views.labelled_views.CLOUDS", 12)
     views = [instance(seed, 40 + seed) for seed in range(6)]
     source = WithLabelledViews(LabelledInstances({"mug": views}), CONFIG)
     assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [12]
