@@ -36,14 +36,6 @@ def test_a_directory_begins_with_one_job(tmp_path: Path) -> None:
     assert json.loads((out / "job.json").read_bytes()) == JOB
 
 
-def test_a_lock_excludes_others_until_its_end(tmp_path: Path) -> None:
-    for _ in range(2):
-        with locked(tmp_path):
-            assert_refused(str(tmp_path), locked(tmp_path).__enter__)
-    with locked(tmp_path):
-        assert [path.name for path in tmp_path.iterdir()] == [LOCK]
-
-
 def test_a_locked_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
     for name, error in (("deep", ZeroDivisionError), (300 * "a" + "/deep", OSError)):
         with pytest.raises(error), locked(tmp_path / "new" / name):
