@@ -35,15 +35,13 @@ def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int
 
 
 def png_of_zeros(width: int, height: int, bits: int = 8) -> bytes:
-    """Return an RGB image of zeros as a PNG; its pixels end after 64 MiB, so that a larger image is damaged."""
+    """Return an RGB image of zeros as a PNG; its pixels end after 64 MiB, so that a larger image is damaged.
+
+    Pillow cannot write one of 16 bits for each channel.
+    """
     header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     rows = zlib.compress(bytes(min((width * 3 * bits // 8 + 1) * height, 2**26)), 1)
     return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
-
-
-def deep_png(height: int, width: int) -> bytes:
-    """Return a PNG of 16 bits per channel, which Pillow cannot write: an RGB image of zeros."""
-    return png_of_zeros(width, height, 16)
 
 
 def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:

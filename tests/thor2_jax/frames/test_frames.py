@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from image_files import deep_png, write_frame_files
+from image_files import png_of_zeros, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 
@@ -196,7 +196,7 @@ def test_lossy_labels_are_refused(tmp_path: Path) -> None:
 
 
 def test_color_files_with_an_alpha_channel_of_16_bit_and_jpeg(tmp_path: Path) -> None:
-    (tmp_path / "c.png").write_bytes(deep_png(12, 16))
+    (tmp_path / "c.png").write_bytes(png_of_zeros(16, 12, 16))
     assert_refused("^color: .*;16", read_color, tmp_path / "c.png")
     rgba = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
     Image.fromarray(rgba).save(tmp_path / "c.png")

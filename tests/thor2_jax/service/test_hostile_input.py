@@ -16,7 +16,7 @@ import httpx
 import numpy as np
 import pytest
 from failures import Pickled
-from image_files import deep_png, encode_npy, png_of_zeros
+from image_files import encode_npy, png_of_zeros
 from processes import HANG, wait_until
 from service_requests import check_refused
 
@@ -54,7 +54,7 @@ def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame
     for field, others in {"color": ("labels", "gif"), "depth": ("color", "labels"), "labels": ("color", "gif")}.items():
         for other in others:
             check_refused(post(http, files, **{field: contents[other]}), 422, field)
-    check_refused(post(http, files, color=deep_png(240, 320)), 422, "color", "16", "8")
+    check_refused(post(http, files, color=png_of_zeros(320, 240, 16)), 422, "color", "16", "8")
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode_image(np.ones((120, 160), kind))
         check_refused(post(http, files, **{field: small}), 422, field, "(120, 160)", "(240, 320)")

@@ -59,12 +59,11 @@ def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(module_patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with the forest, whose training compiles least."""
     folder = write_run(tmp_path_factory.mktemp("baselines") / "run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("training.baselines.cloud_baselines.TREES", 20)
-        train_baselines(folder, SOURCE, ["forest"])
+    module_patch.setattr("training.baselines.cloud_baselines.TREES", 20)
+    train_baselines(folder, SOURCE, ["forest"])
     return folder
 
 

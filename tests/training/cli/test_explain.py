@@ -22,11 +22,6 @@ from training.frame_recognition import RecognizerArguments
 from training.reports import explanation_page
 
 
-@pytest.fixture(autouse=True)
-def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
-
-
 @pytest.fixture
 def frame(tmp_path: Path) -> Path:
     return write_frame(tmp_path / "table", {1: "brick", 4: "book"})
@@ -38,6 +33,7 @@ def test_a_page_for_every_instance(
     model: Path, frame: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is left after an error."""
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     out, compared = tmp_path / "out", tmp_path / "compared"
     save_run(with_surfaces(load_run(model)), compared)
     *pages, last = printed("explain", "--model", compared, frame, "--out", out).splitlines()

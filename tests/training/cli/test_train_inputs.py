@@ -72,26 +72,21 @@ def test_frames_join_meshes(meshes: Path, frames: Path, tmp_path: Path, printed:
         assert "with frames " in refused("train", "--meshes", meshes, *other, "--out", run, *STEPS, *TINY)
 
 
-@pytest.fixture(scope="module")
-def invalid(meshes: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory of valid and invalid inputs."""
-    folder = tmp_path_factory.mktemp("invalid")
-    (folder / "meshes").symlink_to(meshes)
-    (folder / "frames").symlink_to(frames)
-    (folder / "full").mkdir()
-    write_frame(folder / "one" / "a", {1: "brick"})
-    write_frame(folder / "one" / "b", {1: "brick"}, 1)
+def test_invalid_inputs(
+    meshes: Path, frames: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("meshes").symlink_to(meshes)
+    Path("frames").symlink_to(frames)
+    Path("full").mkdir()
+    write_frame(Path("one/a"), {1: "brick"})
+    write_frame(Path("one/b"), {1: "brick"}, 1)
     for name, labels in (("case", {"1": "Brick", "2": "BRICK"}), ("unlabelled", {})):
-        frame = write_frame(folder / name / "a", {1: "brick", 2: "book"})
+        frame = write_frame(Path(name, "a"), {1: "brick", 2: "book"})
         (frame / "labels.json").write_text(json.dumps({"labels": labels}))
-    (folder / "full" / "file").touch()
-    (folder / "names.json").write_text(json.dumps({"mug": "no_such_scan"}))
-    (folder / "case.json").write_text(json.dumps({"Box": "box", "box": "brick"}))
-    return folder
-
-
-def test_invalid_inputs(invalid: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(invalid)
+    Path("full/file").touch()
+    Path("names.json").write_text(json.dumps({"mug": "no_such_scan"}))
+    Path("case.json").write_text(json.dumps({"Box": "box", "box": "brick"}))
     for arguments, expected in (
         ("", "give one of --meshes and --dataset, --frames, or both"),
         ("--meshes absent", "absent: no such folder"),

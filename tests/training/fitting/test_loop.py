@@ -1,6 +1,7 @@
 """Checkpoints and run directories: which epochs are kept, what they restore, and what remains after a failure."""
 
 import errno
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,7 @@ def state(seed: int, size: int = 100) -> dict[str, Any]:
 
 
 def assert_equal(a: Any, b: Any) -> None:
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
+    jax.tree.map(functools.partial(np.testing.assert_array_equal, strict=True), a, b)
 
 
 def epochs(folder: Path) -> set[str]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import run_thor2
+from commands import Command
 from processes import free_port
 from refusals import assert_refused
 
@@ -170,6 +170,6 @@ def test_unknown_objects_and_unreadable_addresses(server: Any, tmp_path: Path, m
         assert_refused("url: .*proxy", fetch_ycb, [NAME], tmp_path, url=server.url)
 
 
-def test_command_shows_the_licence(server: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("fetch", "ycb", "--objects", NAME, "--out", tmp_path, "--url", server.url, "--quiet") == 0
-    assert "CC BY 4.0" in capsys.readouterr().out and (tmp_path / NAME / "textured.obj").is_file()
+def test_command_shows_the_licence(server: Any, tmp_path: Path, printed: Command) -> None:
+    out = printed("fetch", "ycb", "--objects", NAME, "--out", tmp_path, "--url", server.url, "--quiet")
+    assert "CC BY 4.0" in out and (tmp_path / NAME / "textured.obj").is_file()

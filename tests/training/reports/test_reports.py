@@ -3,13 +3,13 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from commands import run_thor2
 from failures import Interrupted, stop_when
 from PIL import Image
+from playwright.sync_api import Browser
 from refusals import assert_refused
 from small_runs import SMALL_CONFIG
 from written_files import ParsedPage
@@ -21,9 +21,6 @@ from training.fitting.loop import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports import plots
 from training.reports.html import Picture, Section, write_page
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.usefixtures("drawn_pictures")
 
@@ -40,7 +37,7 @@ def test_page_escapes_its_content(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
 
 
-def test_long_names_fit_a_narrow_page(tmp_path: Path, browser: "Browser") -> None:
+def test_long_names_fit_a_narrow_page(tmp_path: Path, browser: Browser) -> None:
     write_page(tmp_path / "page.html", title="002_master_chef_can_of_coffee", lead="l" * 50, sections=[])
     page = browser.new_page(viewport={"width": 300, "height": 600})
     page.goto((tmp_path / "page.html").as_uri())
