@@ -26,8 +26,7 @@ from training.readers.frames import FrameFolder, find_frames
 from training.storage.jobs import Progress, add_prefix, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
-from training.views.crops import render_crops
-from training.views.dataset import ViewDataset, remove_views, render_dataset
+from training.views.dataset import ViewDataset, remove_views, render_crops, render_dataset
 from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
 from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 

@@ -19,8 +19,8 @@ if all frames of a track have the same probabilities, the track has the confiden
 import dataclasses
 import itertools
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol, Self
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame, check_frame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, object_scores
+from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.viewpoints import (
     NextView,
@@ -41,9 +42,6 @@ from thor2_jax.tracking.viewpoints import (
     next_view,
     transform,
 )
-
-if TYPE_CHECKING:
-    from thor2_jax.recognizer import Recognizer
 
 __all__ = ["FusedEvidence", "TrackedRecognition", "Tracker", "view_weight"]
 
@@ -206,6 +204,15 @@ class _Track:
         self.evidence = FusedEvidence()
 
 
+class FrameInference(Protocol):
+    """The part of a `Recognizer` that a tracker uses."""
+
+    @property
+    def model(self) -> Model: ...
+    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]: ...
+    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]: ...
+
+
 class Tracker:
     """The objects of a sequence of frames of one camera.
 
@@ -213,7 +220,7 @@ class Tracker:
     With poses, each view of an object is described twice: alone, and merged with the earlier views.
     """
 
-    def __init__(self, recognizer: "Recognizer") -> None:
+    def __init__(self, recognizer: FrameInference) -> None:
         """Create a tracker without tracks, as `Recognizer.track` does."""
         self._recognizer = recognizer
         self._tracks: list[_Track] = []

@@ -27,7 +27,7 @@ from training.fitting.calibration import fit_temperature
 from training.fitting.fit import FitState, network_step
 from training.fitting.loop import Checkpoints, FitOptions, Steps, fit_progress, run_epochs
 from training.storage.jobs import Progress
-from training.views.crops import ViewCrops, rgbd_crop, stacked
+from training.views.crops import ViewCrops, rgbd_crop
 from training.views.normalized_views import NormalizedViews, ViewSource, fold_of_views
 
 __all__ = [
@@ -78,7 +78,7 @@ def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: 
 
     @functools.cache
     def crops(size: int) -> ViewCrops:
-        return stacked([rgbd_crop(frame, view.label, size) for view in described.usable], size)
+        return ViewCrops.stacked([rgbd_crop(frame, view.label, size) for view in described.usable], size)
 
     return BaselineInputs(view_normalize(described.packed, config), np.asarray(described.descriptors.tops), crops)
 

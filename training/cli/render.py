@@ -54,8 +54,7 @@ def render(
     from training.objects.meshes import find_meshes, scaled_meshes
     from training.storage.jobs import of_stage
     from training.storage.workers import IN_PROCESS
-    from training.views.crops import render_crops
-    from training.views.dataset import render_dataset
+    from training.views.dataset import render_crops, render_dataset
     from training.views.mesh_views import RenderJob
 
     pool = processes.pool() or IN_PROCESS

@@ -2,38 +2,26 @@
 
     color, normals = rgbd_crop(frame, label)         # [224, 224, 3] each
 
-A rendered view is cropped alike (`rgbd_crop(view.frame, 1)`). Image networks are trained on the crops of the views of a
-dataset, which are rendered once more for them:
-
-    render_crops(job, dataset, size=96, pool=local_workers(2))
-
-The dataset and its digest do not change: crops may be added to views that runs were trained on.
+A rendered view is cropped alike (`rgbd_crop(view.frame, 1)`).
 """
 
-import contextlib
 import dataclasses
-import functools
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import check_output_directory, locked, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from training.storage.jobs import MANIFEST, check_same_job, intact_content, write_checked
-from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.mesh_views import RenderJob, ViewTask, all_views
+from training.storage.jobs import MANIFEST
+from training.views.mesh_views import ViewTask, all_views
 
-if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
-    from training.views.dataset import ViewDataset
-
-__all__ = ["CROPS", "Crop", "ViewCrops", "crop_file", "read_crop_manifest", "render_crops", "rgbd_crop", "stacked"]
+__all__ = ["CROPS", "CROPS_FORMAT", "CROP_SIZE", "Crop", "ViewCrops", "crops_of", "read_crop_manifest", "rgbd_crop"]
 
 CROP_SIZE = 224
 """Side of a crop, pixels."""
@@ -167,8 +155,22 @@ class ViewCrops:
     color: NDArray[np.uint8]
     normals: NDArray[np.int8]
 
+    @staticmethod
+    def stacked(crops: Sequence[Crop], size: int) -> "ViewCrops":
+        """Return crops of `size` pixels, possibly none, as one record."""
+        shape = (len(crops), size, size, 3)
+        color, normals = (np.reshape([crop[k] for crop in crops], shape) for k in (0, 1))
+        return ViewCrops(color.astype(np.uint8, copy=False), normals.astype(np.int8, copy=False))
+
     def __len__(self) -> int:
         return len(self.color)
+
+    @property
+    def content(self) -> bytes:
+        """Bytes of a file of crops."""
+        stream = io.BytesIO()
+        np.savez_compressed(stream, color=self.color, normals=self.normals)
+        return stream.getvalue()
 
     def reduced(self, size: int) -> "ViewCrops":
         """Return the crops area-filtered to sides of `size` pixels; the same record if they already have this size."""
@@ -180,27 +182,13 @@ class ViewCrops:
 
         shifted = smaller((self.normals.astype(np.int16) + 127).astype(np.uint8))
         normals = [(each.astype(np.int16) - 127).astype(np.int8) for each in shifted]
-        return stacked(list(zip(smaller(self.color), normals, strict=True)), size)
-
-
-def stacked(crops: Sequence[Crop], size: int) -> ViewCrops:
-    """Return crops of `size` pixels, possibly none, as one record."""
-    shape = (len(crops), size, size, 3)
-    color, normals = (np.reshape([crop[k] for crop in crops], shape) for k in (0, 1))
-    return ViewCrops(color.astype(np.uint8, copy=False), normals.astype(np.int8, copy=False))
+        return ViewCrops.stacked(list(zip(smaller(self.color), normals, strict=True)), size)
 
 
 CROPS = "crops"
 """Directory of the crops in the directory of a dataset."""
 
 CROPS_FORMAT = 1
-
-
-def _encode(crops: ViewCrops) -> bytes:
-    """Return the bytes of a file of crops."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, color=crops.color, normals=crops.normals)
-    return stream.getvalue()
 
 
 def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]:
@@ -222,56 +210,8 @@ def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]
         return {"crops": int(content["size"]), "dataset": str(content["dataset"])}, dict(content["files"])
 
 
-def crop_file(shard: str) -> str:
-    """Return the file name of a shard's crops, given the file name of the shard."""
-    return Path(shard).with_suffix(".npz").name
-
-
-def _crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
+def crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
     """Return (number of the view, number of the copy) -> crop for the views of a task that are not empty."""
     return {
         (number, copy): rgbd_crop(view.frame, 1, size) for number, copy, view in all_views(task) if view.depth.any()
     }
-
-
-def render_crops(
-    job: RenderJob,
-    dataset: "ViewDataset",
-    size: int = CROP_SIZE,
-    pool: WorkerPool = IN_PROCESS,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-) -> None:
-    """Render the crops of all views of a dataset; an interrupted rendering resumes.
-
-    Args:
-        job: the job of the dataset.
-        dataset: the dataset.
-        size: side of the crops, pixels, at least 1.
-        pool: worker processes that render; does not affect the result.
-        progress: called with (crops done, total crops) at the start and after each shard.
-
-    Raises:
-        InputError: the directory of the crops has crops of another size or of other views, or files of the user.
-        OSError: a file cannot be written; the rendering can be resumed.
-    """
-    directory, done = dataset.directory / CROPS, dict[str, str]()  # file name -> checksum
-    with locked(directory):
-        check_output_directory(directory, MANIFEST)
-        if (directory / MANIFEST).is_file():
-            stored, files = read_crop_manifest(directory)
-            check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
-            done = {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
-        missing = [index for index, shard in enumerate(dataset.shards) if crop_file(shard.file) not in done]
-        n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
-        progress(n_done, len(dataset))
-        tasks = job.tasks(dataset.shards[index].file for index in missing)
-        with contextlib.closing(pool(functools.partial(_crops_of, size=size), tasks)) as results:
-            for index, rendered in zip(missing, results, strict=True):
-                views, name = dataset.read(index), crop_file(dataset.shards[index].file)
-                of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
-                done[name] = write_checked(directory / name, _encode(stacked(of_shard, size)))
-                files = dict(sorted(done.items()))
-                content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset.digest, "files": files}
-                write_text(directory / MANIFEST, json.dumps(content) + "\n")
-                n_done += len(views)
-                progress(n_done, len(dataset))

@@ -27,8 +27,10 @@ with their checksums. It contains no time stamps, so the same job always gives t
 Worker processes render the views. This process normalizes and writes the shards one by one, in a fixed order.
 Therefore, the bytes do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
 
-Image networks are trained on crops of the same views, which `render_crops` adds:
+Image networks are trained on crops of the same views, for which they are rendered once more. The dataset and its digest
+do not change: crops may be added to views that runs were trained on.
 
+    render_crops(job, dataset, size=96, pool=local_workers(2))
     crops = dataset.read_crops(index, 96)          # one crop for each cloud of `read(index)`
 
     DATASET/crops/manifest.json     size of the crops, digest of the dataset, checksums of the files
@@ -40,7 +42,7 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +57,11 @@ from thor2_jax.types import Cloud
 from training.objects.surfaces import surfaces_of
 from training.storage.jobs import MANIFEST, Progress, check_same_job, intact_content, write_checked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import CROPS, ViewCrops, crop_file, read_crop_manifest
+from training.views.crops import CROPS, CROPS_FORMAT, ViewCrops, crops_of, read_crop_manifest
 from training.views.mesh_views import COORDINATE_STEP, RenderJob, render_task
 from training.views.normalized_views import NormalizedViews, normalize_views
 
-__all__ = ["Shard", "ViewDataset", "encode", "remove_views", "render_dataset"]
+__all__ = ["Shard", "ViewDataset", "encode", "remove_views", "render_crops", "render_dataset"]
 
 MANIFEST_FORMAT = 2
 
@@ -98,6 +100,11 @@ class Shard:
     views: int
     left_out: int
     points: int
+
+    @property
+    def crops(self) -> str:
+        """File name of its crops, in their directory."""
+        return Path(self.file).with_suffix(".npz").name
 
 
 def _dump(table: Mapping[str, Any]) -> str:
@@ -242,7 +249,7 @@ class ViewDataset:
         Raises:
             InputError: the dataset has no crops or smaller ones, or a file is missing or damaged.
         """
-        directory, name = self.directory / CROPS, crop_file(self.shards[index].file)
+        directory, name = self.directory / CROPS, self.shards[index].crops
         stored, files = read_crop_manifest(directory)
         if stored["dataset"] != self.digest:
             raise InputError(f"dataset: {directory} has crops of other views; delete it and render the crops again")
@@ -333,3 +340,46 @@ def render_dataset(
                 write_text(out / MANIFEST, dataset.manifest)
                 progress("render", len(dataset) + dataset.left_out, total, "")
     return dataset
+
+
+def render_crops(
+    job: RenderJob,
+    dataset: ViewDataset,
+    size: int,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> None:
+    """Render the crops of all views of a dataset; an interrupted rendering resumes.
+
+    Args:
+        job: the job of the dataset.
+        dataset: the dataset.
+        size: side of the crops, pixels, at least 1.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (crops done, total crops) at the start and after each shard.
+
+    Raises:
+        InputError: the directory of the crops has crops of another size or of other views, or files of the user.
+        OSError: a file cannot be written; the rendering can be resumed.
+    """
+    directory, done = dataset.directory / CROPS, dict[str, str]()  # file name -> checksum
+    with locked(directory):
+        check_output_directory(directory, MANIFEST)
+        if (directory / MANIFEST).is_file():
+            stored, files = read_crop_manifest(directory)
+            check_same_job(directory, stored, {"crops": size, "dataset": dataset.digest})
+            done = {name: sha for name, sha in files.items() if intact_content(directory, name, sha) is not None}
+        missing = [index for index, shard in enumerate(dataset.shards) if shard.crops not in done]
+        n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
+        progress(n_done, len(dataset))
+        tasks = job.tasks(dataset.shards[index].file for index in missing)
+        with contextlib.closing(pool(functools.partial(crops_of, size=size), tasks)) as results:
+            for index, rendered in zip(missing, results, strict=True):
+                views, name = dataset.read(index), dataset.shards[index].crops
+                of_shard = [rendered[key] for key in zip(views.view.tolist(), views.copy.tolist(), strict=True)]
+                done[name] = write_checked(directory / name, ViewCrops.stacked(of_shard, size).content)
+                files = dict(sorted(done.items()))
+                content = {"format": CROPS_FORMAT, "size": size, "dataset": dataset.digest, "files": files}
+                write_text(directory / MANIFEST, json.dumps(content) + "\n")
+                n_done += len(views)
+                progress(n_done, len(dataset))

@@ -19,7 +19,7 @@ from thor2_jax.gallery.enrollment import augmented_view
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.surfaces.surfaces import Surfaces
 from training.readers.frames import FrameFolder
-from training.views.crops import Crop, ViewCrops, rgbd_crop, stacked
+from training.views.crops import Crop, ViewCrops, rgbd_crop
 from training.views.normalized_views import MemoryViews, NormalizedViews, SourceShard, ViewSource, normalize_views
 
 __all__ = ["MAX_COPIES", "LabelledInstances", "WithLabelledViews", "read_instances"]
@@ -193,5 +193,5 @@ class WithLabelledViews:
         assert self._instances.crops is not None
         name = self.classes[self.shards[index].label]
         crops, times = self._instances.crops[name], 1 + self._copies[name]
-        reduced = stacked(crops, len(crops[0][0])).reduced(size)
+        reduced = ViewCrops.stacked(crops, len(crops[0][0])).reduced(size)
         return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

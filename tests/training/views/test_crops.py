@@ -18,9 +18,8 @@ from training.objects.meshes import find_meshes, load_mesh
 from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
 from training.train_job import TrainJob, run_train_job
-from training.views import crops as crops_module
-from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, render_crops, rgbd_crop, stacked, surface_normals
-from training.views.dataset import ViewDataset, render_dataset
+from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, rgbd_crop, surface_normals
+from training.views.dataset import ViewDataset, render_crops, render_dataset
 from training.views.mesh_views import RenderJob
 from training.views.normalized_views import WithoutClasses
 
@@ -149,17 +148,16 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
     np.testing.assert_array_equal(box.color, dataset.read_crops(1 - index, SIZE).color)
 
 
-def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset) -> None:
     """The damaged file alone is written again; the dataset keeps its digest."""
     directory = dataset.directory / "crops"
     before, first = files_of(directory), min(directory.glob("*.npz"))
     first.write_bytes(first.read_bytes()[:-1])
     assert_refused("is missing or damaged", dataset.read_crops, 0, SIZE)
-    encode = mock.Mock(wraps=crops_module._encode)
-    monkeypatch.setattr(crops_module, "_encode", encode)
     again = render_command(meshes, dataset.directory)
-    assert run_thor2(*again, SIZE) == 0
-    assert encode.call_count == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
+    with mock.patch.object(ViewCrops, "stacked", wraps=ViewCrops.stacked) as rendered:
+        assert run_thor2(*again, SIZE) == 0
+    assert rendered.call_count == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
     assert files_of(directory) == before
     assert run_thor2(*again, 0) == 2 and run_thor2(*again, 2 * SIZE) == 2
 
@@ -194,4 +192,4 @@ def test_reduced_crops_are_means_of_areas() -> None:
     for values, reduced in ((crops.color, crops.reduced(4).color), (crops.normals, crops.reduced(4).normals)):
         means = values.reshape(2, 4, 2, 4, 2, 3).mean(axis=(2, 4))
         assert reduced.dtype == values.dtype and np.abs(reduced - means).max() <= 1
-    assert len(stacked([], 5)) == 0 and stacked([], 5).color.shape[1] == 5
+    assert len(ViewCrops.stacked([], 5)) == 0 and ViewCrops.stacked([], 5).color.shape[1] == 5
