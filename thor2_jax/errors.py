@@ -26,12 +26,12 @@ class InputError(ValueError):
         super().__init__(message)
 
 
-def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]") -> NDArray[Any]:
+def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]", dtype: Any = None) -> NDArray[Any]:
     """Return `values` as an array; rows of different lengths, and masked values, raise InputError."""
     if np.ma.is_masked(values):
         raise InputError(f"{name} is an array with masked values; expected {expected} without a mask; fill them")
     try:
-        return np.asarray(values)
+        return np.asarray(values, dtype)
     except ValueError:
         raise InputError(f"{name} has rows of different lengths; expected {expected}") from None
 

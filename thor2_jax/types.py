@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from colornet import ColorNetwork
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError, as_array
+from thor2_jax.errors import InputError, as_array, decoding
 
 __all__ = [
     "HIGHEST",
@@ -152,10 +152,9 @@ def _padded_size(sizes: list[int], capacity: int | None) -> int:
 
 
 def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
-    try:
-        position = _as_float32(np.asarray(camera, np.float64))
-    except (TypeError, ValueError):
-        raise InputError(f"camera is {camera!r}; expected numbers, [3] or [{n_clouds}, 3]") from None
+    given = as_array(camera, "camera", f"[3] or [{n_clouds}, 3]")
+    with decoding(f"camera is {given.tolist()}", f"numbers, [3] or [{n_clouds}, 3]"):
+        position = _as_float32(given.astype(np.float64))
     if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
         raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{n_clouds}, 3]")
     return np.broadcast_to(position, (n_clouds, 3))

@@ -91,6 +91,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"camera": [0, 0, np.inf]}, ["camera", "inf"]),
         ({"camera": np.zeros((2, 3))}, ["camera", "[1, 3]"]),
         ({"camera": "here"}, ["camera", "here"]),
+        ({"camera": np.ma.masked_less([0.0, 1, 2], 1)}, ["camera", "masked"]),
         ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
         ({"boundary": [[[True], [True, False]]]}, ["boundary[0]", "different lengths"]),

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError, decoding, with_context
+from thor2_jax.errors import InputError, as_array, decoding, with_context
 from thor2_jax.files import as_path, parse_json, parse_yaml, read_file, read_npy
 
 __all__ = [
@@ -165,7 +165,7 @@ class Intrinsics:
             InputError: `matrix` is not of the form fx, 0, cx, 0, fy, cy, 0, 0, 1, or a value is invalid.
         """
         try:
-            fx, skew, cx, a, fy, cy, b, c, one = np.asarray(matrix, dtype=object).ravel().tolist()
+            fx, skew, cx, a, fy, cy, b, c, one = as_array(matrix, "intrinsics", dtype=object).ravel().tolist()
         except (TypeError, ValueError):
             skew = None
         if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
@@ -179,7 +179,7 @@ def _coefficients(distortion: Any) -> tuple[float, ...]:
     is_sequence = isinstance(distortion, Sequence) and not isinstance(distortion, (str, bytes))
     if not (is_sequence or hasattr(distortion, "__array__")):
         raise InputError(f"intrinsics.distortion is {distortion!r}; expected a list of coefficients")
-    values = np.asarray(distortion, dtype=object).ravel().tolist()
+    values = as_array(distortion, "intrinsics.distortion", "coefficients", object).ravel().tolist()
     for value in values:
         if not _is_number(value):
             raise InputError(f"intrinsics.distortion has the coefficient {value!r}; expected finite numbers")

@@ -167,7 +167,7 @@ FEW = 10
 
 
 _CHANGE = threading.Lock()
-"""Held during changes in memory, so that no thread loses the change of another one, as the lock on disk is.
+"""Held during changes and reads into memory, so that no thread loses the change of another one, as that on disk is.
 
 An attribute could not be pickled."""
 
@@ -242,10 +242,11 @@ class ObjectGallery:
         Raises:
             InputError: the gallery cannot be read, or has another embedding; the gallery in memory is unchanged.
         """
-        if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
-            return False
-        self.gallery = self._of_run(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
-        return True
+        with _CHANGE:
+            if self.directory is None or store.gallery_stamp(self.directory) == self.gallery.stamp:
+                return False
+            self.gallery = self._of_run(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
+            return True
 
     def _reembedded(self, gallery: Gallery) -> Gallery:
         objects = {}

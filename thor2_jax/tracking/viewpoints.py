@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thor2_jax.errors import InputError, decoding
+from thor2_jax.errors import InputError, as_array, decoding
 from thor2_jax.files import as_path, read_file
 from thor2_jax.frames.outliers import downsample_to_fit
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
@@ -51,13 +51,12 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
     Raises:
         InputError: the pose is not a finite [4, 4] matrix, or not a rigid motion (a rotation and a translation).
     """
-    try:
-        matrix = np.array(pose, np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
+    given = as_array(pose, argument, "a matrix [4, 4]")
+    with decoding(f"{argument} is not numeric", "a matrix [4, 4], from camera to world"):
+        matrix = given.astype(np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        given = "NaN or infinity" if matrix.shape == (4, 4) else f"shape {matrix.shape}"
-        raise InputError(f"{argument} has {given}; expected a matrix [4, 4] of finite numbers, from camera to world")
+        fault = "NaN or infinity" if matrix.shape == (4, 4) else f"shape {matrix.shape}"
+        raise InputError(f"{argument} has {fault}; expected a matrix [4, 4] of finite numbers, from camera to world")
     rotation = matrix[:3, :3]
     deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max())
     if deviation > MAX_DEVIATION or np.linalg.det(rotation) < 0:
@@ -172,18 +171,20 @@ def next_view(
         table: training views.
 
     Raises:
-        InputError: there is no candidate, a pose is not a rigid motion, or the table has other classes.
+        InputError: there is no candidate, a pose is not a rigid motion, a number is not finite, or the table has other
+            classes.
     """
-    p = np.asarray(probabilities, np.float64)
+    p, middle = np.asarray(probabilities, np.float64), np.asarray(centre, np.float64)
     if not len(candidates):
         raise InputError("candidates is empty; expected at least one camera pose")
-    if p.shape != table.probabilities.shape[1:]:
-        raise InputError(f"probabilities has shape {p.shape}; expected {table.probabilities.shape[1:]}, as the table")
+    for name, values, shape in (("probabilities", p, table.probabilities.shape[1:]), ("centre", middle, (3,))):
+        if values.shape != shape or not np.isfinite(values).all():
+            raise InputError(f"{name} is {values.tolist()}; expected {list(shape)} finite numbers")
     now = check_pose(pose)
     poses = [check_pose(each, f"candidates[{k}]") for k, each in enumerate(candidates)]
     p = np.maximum(p, TINY) / np.maximum(p, TINY).sum()
     # Directions from the object to the candidates, in the axes of the current camera.
-    towards = (np.array([each[:3, 3] for each in poses]) - np.asarray(centre, np.float64)) @ now[:3, :3]
+    towards = (np.array([each[:3, 3] for each in poses]) - middle) @ now[:3, :3]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), TINY)
     expected, total = np.zeros(len(poses)), 0.0
     for index in np.flatnonzero(p >= MIN_PROBABILITY):

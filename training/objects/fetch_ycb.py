@@ -145,8 +145,8 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
             load_mesh(folder / MESH_FILE)
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None
-    except InputError as error:
-        reason = str(error).replace(f"{folder.parent}/", "")
+    except (InputError, FileExistsError) as error:
+        reason = reason_of(error).replace(f"{folder.parent}/", "")
         raise InputError(
             f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
         ) from None

@@ -222,6 +222,10 @@ def test_points_of_pixels_project_to_them(distortion: tuple[float, ...]) -> None
     assert pixel_rays(some[:0], 64, camera).shape == (0, 3)
 
 
+def test_masked_intrinsics_are_refused() -> None:
+    assert_refused("^intrinsics is .*--", Intrinsics.of, np.ma.masked_equal(MATRIX, 1))
+
+
 def test_zero_coefficients_are_no_distortion() -> None:
     assert Intrinsics(**PINHOLE, distortion=[0.0] * 14).distortion == ()
     longer = [*DISTORTIONS["rational_polynomial"], 0, 0, 0, 0]

@@ -53,8 +53,10 @@ def test_the_expected_entropy_is_a_mean_over_classes() -> None:
 
 
 def test_bad_input_of_next_view() -> None:
-    views = table(np.array([0.3, 0.3, 0.4]))
-    assert_refused("candidates is empty", next_view, [0.5, 0.3, 0.2], CENTRE, np.eye(4), [], views)
-    poses = [np.eye(4), 2 * np.eye(4)]
-    assert_refused(r"candidates\[1\] is not a rigid motion", next_view, [0.5, 0.3, 0.2], CENTRE, poses[0], poses, views)
-    assert_refused("probabilities", next_view, [0.5, 0.5], CENTRE, np.eye(4), [np.eye(4)], views)
+    views, p, here = table(np.array([0.3, 0.3, 0.4])), [0.5, 0.3, 0.2], np.eye(4)
+    assert_refused("candidates is empty", next_view, p, CENTRE, here, [], views)
+    assert_refused(r"candidates\[1\] is not a rigid motion", next_view, p, CENTRE, here, [here, 2 * here], views)
+    assert_refused("pose .* masked", next_view, p, CENTRE, np.ma.masked_equal(here, 1), [here], views)
+    for wrong in ([0.5, 0.5], [np.nan, 0.3, 0.2]):
+        assert_refused("probabilities", next_view, wrong, CENTRE, here, [here], views)
+    assert_refused("centre is .*nan", next_view, p, CENTRE * np.nan, here, [here], views)

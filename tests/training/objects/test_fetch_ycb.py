@@ -99,18 +99,13 @@ def test_broken_download_resumes(server: Any, tmp_path: Path, ranges: bool) -> N
     assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
 
 
-def test_complete_archive_is_not_sent_again(server: Any, tmp_path: Path) -> None:
-    (tmp_path / f".{NAME}.tgz").write_bytes(server.files[f"/google/{NAME}_google_16k.tgz"])
-    fetch_ycb([NAME], tmp_path, url=server.url)
-    assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
-
-
 DAMAGED = {
     "half": archive(mesh_files())[:5000],
     "without the end": archive(mesh_files())[:-4],
     "other checksum": archive(mesh_files())[:-8] + bytes(8),
     "a page": b"<html>a page</html>",
     "no mesh": archive({f"{NAME}/google_16k/nontextured.ply": b"ply"}),
+    "two meshes": archive(mesh_files() | mesh_files("google_16k/")),
     "damaged mesh": archive(mesh_files() | {f"{NAME}/google_16k/textured.obj": b"v nonsense"}),
 }
 
@@ -170,6 +165,8 @@ def test_unknown_objects_and_unreadable_addresses(server: Any, tmp_path: Path, m
         assert_refused("url: .*proxy", fetch_ycb, [NAME], tmp_path, url=server.url)
 
 
-def test_command_shows_the_licence(server: Any, tmp_path: Path, printed: Command) -> None:
+def test_command_shows_the_licence_of_a_complete_archive(server: Any, tmp_path: Path, printed: Command) -> None:
+    """A complete archive, which an earlier command has downloaded, is not sent again."""
+    (tmp_path / f".{NAME}.tgz").write_bytes(server.files[f"/google/{NAME}_google_16k.tgz"])
     out = printed("fetch", "ycb", "--objects", NAME, "--out", tmp_path, "--url", server.url, "--quiet")
-    assert "CC BY 4.0" in out and (tmp_path / NAME / "textured.obj").is_file()
+    assert "CC BY 4.0" in out and (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
