@@ -1,7 +1,6 @@
 """Recordings that tests write: ROS 1 bags, ROS 2 bags and MCAP files of RGB-D frames."""
 
 import contextlib
-import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -52,15 +51,13 @@ def compressed(content: bytes, described: str, stamp: int = START) -> Any:
 
 def compressed_depth(depth: np.ndarray, stamp: int = START) -> Any:
     """Return depth as compressed_depth_image_transport writes it: a header of 12 bytes, then a PNG."""
-    content = struct.pack("<iff", 0, 0.0, 0.0) + encode_image(depth, "PNG")
-    return compressed(content, "16UC1; compressedDepth png", stamp)
+    return compressed(bytes(12) + encode_image(depth), "16UC1; compressedDepth png", stamp)
 
 
 def camera_info(camera: thor2.Intrinsics, size: tuple[int, int], stamp: int = START) -> Any:
     """Return a CameraInfo, whose arrays have the names of ROS 1 and of ROS 2."""
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    projection = np.pad(matrix, ((0, 0), (0, 1)))
-    arrays = {"d": np.zeros(5), "k": matrix.ravel(), "r": np.eye(3).ravel(), "p": projection.ravel()}
+    matrix = np.array([[camera.fx, 0, camera.cx, 0], [0, camera.fy, camera.cy, 0], [0, 0, 1.0, 0]])
+    arrays = {"d": np.zeros(5), "k": matrix[:, :3].ravel(), "r": np.eye(3).ravel(), "p": matrix.ravel()}
     return SimpleNamespace(
         __msgtype__="sensor_msgs/msg/CameraInfo",
         header=header(stamp),

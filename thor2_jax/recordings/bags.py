@@ -98,8 +98,8 @@ class Bag:
         """Open the recording, choose its topics and read the camera.
 
         Raises:
-            InputError: the package rosbags is missing, the recording is damaged or of another format, or it lacks a
-                topic.
+            InputError: the package rosbags is missing, the recording is damaged or of another format, it lacks a topic,
+                or a part of its messages is in a write-ahead log.
             OSError: the recording cannot be opened.
         """
         with needs_extra(f"bag is {self.path}, which", "rosbags", "bags"):
@@ -111,6 +111,12 @@ class Bag:
         for file in [self.path, *self.path.glob("*")]:
             if not file.is_dir():
                 open_file(file).close()  # raises OSError for a pipe, which rosbags would read forever
+        for log in [Path(f"{self.path}-wal"), *self.path.glob("*-wal")]:  # rosbags would ignore it
+            if log.is_file() and log.stat().st_size:
+                raise InputError(
+                    f"bag: {self.path}: messages of an interrupted recording are in {log.name}; expected them in the "
+                    f"database; repair it: sqlite3 {shlex.quote(str(log)[:-4])} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+                )
         with self._damage_named():
             if self.path.is_dir():
                 if not (self.path / "metadata.yaml").is_file():
@@ -236,12 +242,11 @@ class Bag:
         except (OSError, InputError):
             raise
         except Exception as error:
-            reason = reason_of(error).rstrip(".")
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
             suffix = ".db3" if self.path.is_dir() else self.path.suffix
             raise InputError(
-                f"bag: {self.path} is damaged or of another format{after} ({reason}); expected a ROS 1 bag (.bag), a "
-                f"ROS 2 bag (directory, .db3) or MCAP of ROS 2"
+                f"bag: {self.path} is damaged or of another format{after} ({reason_of(error).rstrip('.')}); expected a "
+                "ROS 1 bag (.bag), a ROS 2 bag (directory, .db3) or MCAP of ROS 2"
                 + (f"; repair it: {self._repair(suffix)}" if suffix in _REPAIR else "")
             ) from None
 

@@ -48,21 +48,21 @@ _JPEG_QUALITY = 85
 
 
 def _check_folder(path: Path) -> None:
-    """Raise OSError if a file cannot be created in the folder of `path`."""
-    with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
-        pass
+    """Raise OSError if a file cannot be written in the folder of `path`; Rerun would wait forever on a full disk."""
+    with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent) as file:
+        file.write(bytes(1000))
 
 
 @contextlib.contextmanager
-def _bag_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the files and the database of a bag into an OSError that names `path`."""
+def _file_errors(path: Path) -> Iterator[None]:
+    """Turn errors of files, of the database of a bag and of Rerun's writer into an OSError that names `path`."""
     import sqlite3
 
     with errors_name(path):
         try:
             yield
-        except sqlite3.Error as error:
-            raise OSError(None, str(error)) from None
+        except (sqlite3.Error, RuntimeError) as error:
+            raise OSError(None, f"{error}; check the free space of the disk") from None
 
 
 def detection_types() -> Any:
@@ -116,7 +116,7 @@ class MessageBag:
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         plugin = StoragePlugin.MCAP if self._path.suffix == ".mcap" else StoragePlugin.SQLITE3
-        with _bag_errors(self._path), contextlib.ExitStack() as stack:
+        with _file_errors(self._path), contextlib.ExitStack() as stack:
             folder = stack.enter_context(temporary_directory(self._path.absolute().parent))
             # ROS 2 names the files of a bag after its directory.
             self._bag = folder / self._path.stem
@@ -131,7 +131,7 @@ class MessageBag:
 
     def __exit__(self, *_: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
-        with self._stack, _bag_errors(self._path):
+        with self._stack, _file_errors(self._path):
             self._writer.close()
             if self._n_messages:
                 is_file = self._path.suffix == ".mcap"
@@ -148,9 +148,8 @@ class MessageBag:
                 f"{self.argument}: a frame has the time {stamp // 10**9} s; expected {-(2**31)} to {2**31 - 1} s, the "
                 f"range of ROS 2; correct the clock of the recording, or leave out {self.argument}"
             )
-        kind = self._topics[topic]
-        content = self._types.serialize_cdr(ros_message(fields), kind)
-        with _bag_errors(self._path):
+        content = self._types.serialize_cdr(ros_message(fields), self._topics[topic])
+        with _file_errors(self._path):
             self._writer.write(self._connections[topic], max(stamp, 0), content)
         self._n_messages += 1
 
@@ -239,9 +238,10 @@ class RerunFile:
 
     def __exit__(self, *_: object) -> None:
         """Close the file and move it to `path`, or remove it if it is empty."""
-        with self._folder, errors_name(self.path):
+        with self._folder, _file_errors(self.path):
             self._recording.flush()
             self._recording.disconnect()
+            _check_folder(self.path)  # If the disk is full, Rerun leaves out the end of the file without an error.
             if self.n_frames:
                 self._temporary.chmod(0o644)
                 self._temporary.replace(self.path)
@@ -261,10 +261,9 @@ class RerunFile:
         self._recording.set_time("frame", sequence=self.n_frames)
         if stamp is not None:
             self._recording.set_time("time", timestamp=np.datetime64(stamp, "ns"))
-        camera = frame.intrinsics
-        height, width = frame.depth.shape
+        k = frame.intrinsics
         pinhole = rerun.Pinhole(
-            focal_length=(camera.fx, camera.fy), principal_point=(camera.cx, camera.cy), width=width, height=height
+            focal_length=(k.fx, k.fy), principal_point=(k.cx, k.cy), resolution=frame.depth.shape[::-1]
         )
         log("camera", pinhole)
         log("camera/name", rerun.TextDocument(name))

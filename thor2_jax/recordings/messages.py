@@ -185,10 +185,9 @@ def _detection_fields(detection: Detection) -> dict[str, Any]:
     pose = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
     hypothesis = {"class_id": answer.name or "", "score": float(answer.confidence or 0.0)}
     middle = {"x": box.left + (box.width - 1) / 2, "y": box.top + (box.height - 1) / 2}
-    center = {"position": middle, "theta": 0.0}
     number = getattr(answer, "track", answer.label)
     return {
         "results": [{"hypothesis": hypothesis, "pose": {"pose": pose, "covariance": [0.0] * 36}}],
-        "bbox": {"center": center, "size_x": float(box.width), "size_y": float(box.height)},
+        "bbox": {"center": {"position": middle, "theta": 0.0}, "size_x": float(box.width), "size_y": float(box.height)},
         "id": "" if number is None else str(number),
     }

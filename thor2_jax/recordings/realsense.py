@@ -7,6 +7,7 @@ with RealSenseCamera() as camera:
 
 import contextlib
 import functools
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -75,17 +76,14 @@ class RealSenseCamera:
         Raises:
             InputError: no frame arrives in time.
         """
-        n_frames = 0
-        while True:
+        for n_frames in itertools.count():
             try:
                 color, depth = self._next()
             except RuntimeError as error:
-                reason = reason_of(error).rstrip(".")
                 raise InputError(
-                    f"realsense: no frame for {self._timeout:g} s ({reason}; frames before: {n_frames}); the camera "
-                    "was unplugged or has stopped; check the cable"
+                    f"realsense: no frame for {self._timeout:g} s ({reason_of(error).rstrip('.')}; frames before: "
+                    f"{n_frames}); the camera was unplugged or has stopped; check the cable"
                 ) from None
-            n_frames += 1
             stamp = round(color.get_timestamp() * 1e6)
             gap = round(depth.get_timestamp() * 1e6) - stamp
             # The camera reuses the memory of its images.
@@ -97,9 +95,8 @@ class RealSenseCamera:
 
     def _next(self) -> tuple[Any, Any]:
         """Return the next colour frame and the depth frame aligned to it; raise RuntimeError if none arrives."""
-        milliseconds = int(1000 * self._timeout)
         for _ in range(max(int(self._timeout * RATE), 10)):
-            frames = self._source.wait_for_frames(milliseconds)
+            frames = self._source.wait_for_frames(int(1000 * self._timeout))
             if frames.get_color_frame() and frames.get_depth_frame():
                 aligned = self._align.process(frames)
                 return aligned.get_color_frame(), aligned.get_depth_frame()

@@ -135,6 +135,13 @@ def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
         Bag(tmp_path / name.partition("/")[0]).__enter__()
 
 
+def test_messages_in_a_write_ahead_log_are_not_lost(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    (path / "folder.db3-wal").write_bytes(b"messages")
+    for recording in (path, path / "folder.db3"):
+        assert_refused(r"sqlite3 .*folder\.db3 'PRAGMA", Bag(recording).__enter__)
+
+
 @pytest.mark.parametrize(
     ("name", "compression"),
     [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.mcap", "storage"), ("folder", "message"), ("folder", "file")],

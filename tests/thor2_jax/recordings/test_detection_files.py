@@ -20,8 +20,7 @@ ANSWERS = [Recognition(1, "mug", 0.9), Recognition(2, reason="unknown: 0.1", con
 @pytest.fixture
 def reader() -> Any:
     """Return the reader of the package rerun-sdk, which is too large for the tests' own environment."""
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
-    return pytest.importorskip("rerun.chunk", reason="this version of rerun-sdk has no reader").RrdReader
+    return pytest.importorskip("rerun.chunk", reason="rerun-sdk with a reader is not installed (660 MB)").RrdReader
 
 
 def read(reader: Any, path: Path) -> dict[str, dict[str, list[Any]]]:
@@ -80,3 +79,9 @@ def test_a_database_on_a_full_disk_is_named(tmp_path: Path, size: int) -> None:
         for stamp in range(20):
             bag.write(frame, detections_of(frame, ANSWERS), stamp=stamp)
     assert caught.value.filename == str(path) and list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_noticed_before_rerun_waits_for_it(reader: Any, tmp_path: Path) -> None:
+    with small_disk(500), pytest.raises(OSError, match="large") as caught:
+        RerunFile(tmp_path / "a.rrd")
+    assert caught.value.filename == str(tmp_path / "a.rrd") and list(tmp_path.iterdir()) == []

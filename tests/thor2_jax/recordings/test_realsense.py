@@ -1,6 +1,5 @@
 """RealSense cameras: the library's own software device, and sources that fail."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -61,23 +60,13 @@ class SoftwareCamera:
             sensor.on_video_frame(frame)
 
 
-@pytest.fixture
-def camera(rs: Any) -> Iterator[SoftwareCamera]:
-    made = SoftwareCamera(rs)
-    yield made
-    for sensor, _, _ in made.sensors.values():
-        sensor.stop()
-        sensor.close()
-
-
-def test_frames_of_the_software_device(camera: SoftwareCamera) -> None:
-    rng = np.random.default_rng(0)
+def test_frames_of_the_software_device(rs: Any) -> None:
+    rng, camera = np.random.default_rng(0), SoftwareCamera(rs)
     colors = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(8)]
     for k, color in enumerate(colors):
         camera.give(k, Depth=np.full((HEIGHT, WIDTH), 4000 + k, np.uint16), Color=color)
     with RealSenseCamera(camera, timeout=HANG) as opened:
-        frames = opened.frames()
-        recorded = next(frames)
+        recorded = next(opened.frames())
         frame = recorded.read()
         number = round((recorded.stamp / 1e6 - 1000) / 33)
         np.testing.assert_array_equal(frame.color, colors[number])
@@ -87,8 +76,11 @@ def test_frames_of_the_software_device(camera: SoftwareCamera) -> None:
         camera_of = frame.intrinsics
         assert (camera_of.fx, camera_of.fy, camera_of.cx, camera_of.cy) == (60, 61, 32, 24)
         assert camera_of.depth_scale == 4000 and camera_of.distortion[0] == pytest.approx(0.01)
-        with pytest.raises(InputError, match="unplugged"):  # there are no more images
-            list(frames)
+    with RealSenseCamera(camera, timeout=0.1) as opened, pytest.raises(InputError, match="unplugged"):
+        list(opened.frames())  # until there are no more images
+    for sensor, _, _ in camera.sensors.values():
+        sensor.stop()
+        sensor.close()
 
 
 def test_no_camera_is_connected(rs: Any) -> None:

@@ -38,8 +38,7 @@ def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], tex
 def test_only_frames_without_labels_need_opencv(
     model: Path, tmp_path: Path, messages: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
-    frame = FRAMES[0]
-    write_frame_files(tmp_path / "frames" / "0", dataclasses.replace(frame, labels=segment_table(frame)))
+    write_frame_files(tmp_path / "frames" / "0", dataclasses.replace(FRAMES[0], labels=segment_table(FRAMES[0])))
     monkeypatch.delitem(sys.modules, "thor2_jax.segmentation.table")
     monkeypatch.setitem(sys.modules, "cv2", None)
     command = "watch", "--model", model, "--folder", tmp_path / "frames", "--port", 0
