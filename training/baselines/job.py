@@ -10,7 +10,7 @@ from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files
-from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file
 from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
 from training.baselines.image_baselines import (
     check_backbone,
@@ -130,11 +130,10 @@ def train_baselines(
             file = baseline_file(directory, name)
             if not file.is_file():
                 task, start = FitTask(name, source, run, directory, weights, shown), time.perf_counter()
-                fitted = _METHODS[name][0](task)
-                write_baseline(file, fitted, run.classes, time.perf_counter() - start)
+                _METHODS[name][0](task).write(file, run.classes, time.perf_counter() - start)
                 # Checkpoints, including those of earlier versions.
                 remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
-            elif weights is not None and read_baseline(file, run.classes).weights != check_weights(weights, name):
+            elif weights is not None and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
                 raise InputError(
                     f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
                     "or leave out weights"
@@ -151,7 +150,7 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
     for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
         if not file.is_file():
             continue
-        stored = read_baseline(file, run.classes)
+        stored = StoredBaseline.read(file, run.classes)
         with decoding(f"model: {file} does not match its run", advice="delete it and train the baseline again"):
             predict = _METHODS[name][1](stored.arrays, run)
         loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
