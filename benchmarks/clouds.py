@@ -19,7 +19,7 @@ from thor2_jax.networks.networks import FEATURES, MLP, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
-from training.rendering.camera import RayCaster, camera_pose, render_view
+from training.rendering.camera import RayCaster, camera_pose
 from training.rendering.scenes import compose_scene
 
 __all__ = ["SCANS", "make_frames", "random_run", "sample_clouds"]
@@ -51,7 +51,7 @@ def sample_clouds(count: int, n_points: int, seed: int = 0) -> tuple[str, list[C
         caster = RayCaster([mesh])
         for _ in range(N_VIEWS):
             pose = camera_pose(rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 2.8), mesh.centre)
-            view = render_view(caster, pose)
+            view = caster.render(pose)
             seen = view.depth > 0
             points = backproject(view.depth.astype(np.float32) / np.float32(1000), view.intrinsics)[seen]
             views.append((points, view.color[seen]))

@@ -33,12 +33,12 @@ from training.baselines.architectures import crop_size, pretrained_files
 from training.baselines.baseline import baseline_file
 from training.baselines.job import check_baselines
 from training.evaluation.runs import load_runs
-from training.fitting.loop import find_run_directories
 from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrames
 from training.readers.uwis import UWISOccluded
 from training.storage.jobs import begin_job
+from training.train_run import find_run_directories
 
 BASELINES = "thor,forest,pointnet,rcfusion-small,vit-cnn-small,rgbd-vit-small,templates"
 RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor --segmentation --registration --base"

@@ -22,7 +22,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from thor2_jax.recognizer import DescribedFrame
 from training.baselines.architectures import ARCHITECTURES
-from training.baselines.baseline import Predictor, baseline_inputs
+from training.baselines.baseline import BaselineInputs, Predictor
 from training.baselines.job import CLOUD_BASELINES, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
@@ -234,7 +234,7 @@ def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
     for name, baseline in run.baselines.items():
 
         def recognize(number: int, predict: Predictor = baseline.predict) -> object:
-            return predict(baseline_inputs(described[number], config, frames[number]))
+            return predict(BaselineInputs.of_frame(described[number], config, frames[number]))
 
         seconds[name] = timed(recognize) + (describing if name in CLOUD_BASELINES else 0)
     return seconds

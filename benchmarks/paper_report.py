@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from thor2_jax.files import atomic_write
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.baselines.job import TITLES
-from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
+from training.evaluation.page import accuracy_table, comparison
 
 __all__ = ["draw_claims", "markdown_table", "report_text"]
 
@@ -97,8 +97,8 @@ def _dataset_text(name: str, results: Mapping[str, Any], folds: int) -> str:
     if results["published_tables"]:
         parts.append("### Tables of the paper, ours beside the printed figures\n")
         for table in results["published_tables"]:
-            parts += [f"**{comparison_title(table)}**\n", markdown_table(*comparison_table(table, "THOR2"))]
-            parts.append(comparison_text(table) + "\n")
+            title, text, compared = comparison(table, "THOR2")
+            parts += [f"**{title}**\n", markdown_table(*compared), text + "\n"]
     parts += ["### Time and memory\n", _cost_table(results["costs"], folds)]
     return "\n".join(parts)
 

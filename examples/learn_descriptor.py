@@ -40,7 +40,7 @@ from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
 from training.fitting.fit import scale_inputs
 from training.fitting.loop import FitOptions
-from training.fitting.samples import Batch, Samples, check_classes, describe_batch, sample_views
+from training.fitting.samples import Batch, Samples, describe_batch, sample_views
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes
 from training.readers.frames import FrameFolder
@@ -48,7 +48,7 @@ from training.readers.labelled import LabelledFrame
 from training.readers.uwis import UWISOccluded
 from training.rendering.scenes import compose_scene
 from training.views.mesh_views import render_views
-from training.views.normalized_views import MemoryViews
+from training.views.normalized_views import MemoryViews, check_classes
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

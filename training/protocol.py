@@ -12,7 +12,7 @@ from thor2_jax.networks.networks import EMBEDDING, FEATURES, Feature, check_feat
 from training.augmentation.augmentations import Augmentations
 from training.embedding.distractors import AUGMENTATIONS, Distractors
 from training.fitting.loop import FitOptions
-from training.fitting.samples import MIRRORS, PAPER_MIRRORS
+from training.fitting.samples import MIRRORS
 from training.objects.mesh import TexturedMesh
 from training.views.mesh_views import RenderJob
 
@@ -175,5 +175,5 @@ DEFAULT = Protocol(
 QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
 """The default with fewer distractors and networks, in three quarters of the time."""
 
-PAPER = Protocol(classifiers=FEATURES, fit=FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS)
+PAPER = Protocol(classifiers=FEATURES, fit=FitOptions(epochs=100, batch_size=128), mirrors=("", "x", "y", "xy"))
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

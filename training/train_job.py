@@ -18,7 +18,6 @@ from training.baselines.baseline import baseline_file
 from training.baselines.job import check_baselines, train_baselines
 from training.baselines.thor import types_of_views
 from training.fitting.loop import wait_for_all
-from training.fitting.samples import check_classes
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, scaled_meshes
 from training.protocol import DEFAULT, PAPER, Protocol
@@ -28,7 +27,7 @@ from training.storage.workers import local_workers
 from training.train_run import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.views.dataset import ViewDataset, remove_views, render_crops, render_dataset
 from training.views.labelled_views import MAX_COPIES, LabelledInstances, WithLabelledViews, read_instances
-from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
+from training.views.normalized_views import ViewSource, WithoutClasses, check_classes, sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
 

@@ -18,7 +18,7 @@ import dataclasses
 import functools
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,24 +43,23 @@ from training.embedding.distractors import Distractors
 from training.embedding.fit import RUN_SIZES, fit_embedding
 from training.fitting.calibration import fit_calibration, fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext, fit
-from training.fitting.loop import (
-    BEGUN,
-    CHECKPOINTS,
-    Checkpoints,
-    EpochMetrics,
-    find_run_directories,
-    fit_progress,
-    wait_for_all,
-)
-from training.fitting.samples import OF_EMBEDDING, Form, Samples, check_classes, sample_views
+from training.fitting.loop import Checkpoints, EpochMetrics, fit_progress, wait_for_all
+from training.fitting.samples import OF_EMBEDDING, Form, Samples, sample_views
 from training.protocol import Protocol, Stage
 from training.reports.plots import draw_curves
 from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, of_stage
-from training.views.normalized_views import ViewSource, fold_of_views
+from training.views.normalized_views import ViewSource, check_classes, fold_of_views
 
-__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "read_metrics", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "find_run_directories", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
+
+CHECKPOINTS = "checkpoints"
+"""Directory of the checkpoints, inside the run directory of an unfinished training."""
+
+BEGUN = "begun.json"
+"""File name, in this directory, of the job record of an unfinished training."""
+
 JOB = f"{CHECKPOINTS}/{BEGUN}"
 METRICS = "metrics.jsonl"
 HELD_OUT = 12
@@ -93,6 +92,23 @@ def check_trained(digest: str, out: Path, settings: Protocol) -> None:
     stored = {"orientation_copies": 0, **record, "dataset": record["dataset"]["digest"]}
     stored["descriptor_config"] = dataclasses.asdict(DescriptorConfig.of_record(record["descriptor_config"]))
     check_same_job(out, {name: stored.get(name) for name in requested}, requested)
+
+
+def find_run_directories(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
+
+    Raises:
+        InputError: a training is not finished. Other paths that are not run directories are refused on loading.
+    """
+    directories: list[Path] = []
+    for path in map(Path, paths):
+        runs = run_directories(path) or [path]
+        if path not in runs and (path / JOB).exists():
+            raise InputError(
+                f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
+            )
+        directories += runs
+    return directories
 
 
 def finished_record(out: Path) -> Mapping[str, Any]:

@@ -14,7 +14,7 @@ from small_runs import save_untrained_run
 from written_files import files_of
 
 from thor2_jax.model.run_directory import load_run
-from training.baselines.baseline import baseline_file, read_baseline
+from training.baselines.baseline import StoredBaseline, baseline_file
 from training.train_run import read_metrics
 
 pytestmark = pytest.mark.slow
@@ -91,7 +91,7 @@ def test_train(meshes: Path, frames: Path, refused: Command, tmp_path: Path) -> 
     assert written.keys() == expected.keys()
     different = {name for name in written if written[name] != expected[name]}  # these two hold measured times
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
-    first, second = (read_baseline(baseline_file(folder, "forest"), ("box", "brick")) for folder in (out, whole))
+    first, second = (StoredBaseline.read(baseline_file(folder, "forest"), ("box", "brick")) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
 
 

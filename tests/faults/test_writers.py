@@ -21,7 +21,7 @@ from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
-from training.baselines.baseline import StoredBaseline, write_baseline
+from training.baselines.baseline import StoredBaseline
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.evaluation.frame_pictures import draw_judged
 
@@ -94,7 +94,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "text.json": lambda path: write_text(path, "new" * 1000),
     "judged.jpg": lambda path: draw_judged(PHOTO, FRAME.label_image, [], path),
     "overlay.png": lambda path: draw_overlay(FRAME, [thor2.Recognition(1, "mug", 1.0)], path),
-    "forest.safetensors": lambda path: write_baseline(path, StoredBaseline({"w": np.zeros(9)}, None), ("a",), 1.0),
+    "forest.safetensors": lambda path: StoredBaseline({"w": np.zeros(9)}, None).write(path, ("a",), 1.0),
 }
 
 

@@ -20,7 +20,7 @@ from refusals import assert_refused
 from thor2_jax.frames.frames import Intrinsics, encode_image, read_color, read_depth, read_labels
 from thor2_jax.frames.intrinsics import read_intrinsics
 from thor2_jax.testing import damaged
-from training.baselines.baseline import StoredBaseline, read_baseline, write_baseline
+from training.baselines.baseline import StoredBaseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
 from training.objects.meshes import read_names
 from training.readers.ocid import read_organized_points
@@ -63,7 +63,7 @@ def write_answers(path: Path) -> None:
 
 
 def write_mug_baseline(path: Path) -> None:
-    write_baseline(path, BASELINE, ["mug"], 2.0)
+    BASELINE.write(path, ["mug"], 2.0)
 
 
 def is_image(image: np.ndarray) -> bool:
@@ -113,7 +113,11 @@ READERS: dict[str, tuple[bytes, Callable[[Path], Any], Callable[[Any], bool]]] =
     "names.yaml": (b"mug: 025_mug\nbowl: 024_bowl\n", read_names, are_names),
     "answers.jsonl": (written(write_answers), lambda path: AnswerFile(path, EVALUATION), are_answers),
     "metrics.jsonl": ("".join(json.dumps(row) + "\n" for row in ROWS).encode(), read_metrics, are_metrics),
-    "baseline.safetensors": (written(write_mug_baseline), lambda path: read_baseline(path, ["mug"]), is_the_baseline),
+    "baseline.safetensors": (
+        written(write_mug_baseline),
+        lambda path: StoredBaseline.read(path, ["mug"]),
+        is_the_baseline,
+    ),
 }
 color, depth, labels = ocid_scene()
 for kind in ("ascii", "binary"):

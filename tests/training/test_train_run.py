@@ -21,7 +21,7 @@ from training import train_run as module
 from training.evaluation.runs import load_runs
 from training.fitting.calibration import fit_temperature, sample_probabilities
 from training.fitting.fit import FitContext
-from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
+from training.fitting.loop import Checkpoints, FitOptions
 from training.fitting.samples import sample_views
 from training.protocol import Protocol
 from training.train_run import train_run
@@ -220,7 +220,7 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Interrupted):
         run()
     assert module.is_finished(out)
-    runs = [load_run(folder) for folder in find_run_directories([out])]
+    runs = [load_run(folder) for folder in module.find_run_directories([out])]
     finished = {"curves.png", "metrics.jsonl", "fold-0", "fold-1", "fold-2"}
     assert {name for name in names(out) if name[0] != "."} == finished
     assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]

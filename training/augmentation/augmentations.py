@@ -1,7 +1,7 @@
 """Augmentations of training views. They go beyond the paper, and each can be switched off.
 
     augmentations = Augmentations(illumination=Illumination(), occlusion=Occlusion())
-    copy = augment(render_view(caster, pose), augmentations, np.random.default_rng(0))
+    copy = augment(caster.render(pose), augmentations, np.random.default_rng(0))
 
 An augmented copy has the pose of its view. Illumination and registration change its colours only; segmentation adds or
 removes pixels along the outline; the base removes the lowest pixels; occlusion removes pixels behind another object;

@@ -20,15 +20,7 @@ from thor2_jax.frames.frames import Intrinsics, pixel_points
 from thor2_jax.frames.outliers import PIECE_CELL
 from training.augmentation.sensing import FRAME_PIXEL, Range
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.camera import (
-    DISTANCE,
-    TRAINING_CAMERA,
-    Camera,
-    RayCaster,
-    RenderedView,
-    camera_pose,
-    render_view,
-)
+from training.rendering.camera import DISTANCE, TRAINING_CAMERA, Camera, RayCaster, RenderedView, camera_pose
 
 __all__ = ["Base", "Occlusion", "Segmentation", "occluded", "resegmented", "without_base"]
 
@@ -97,7 +89,7 @@ def _silhouettes() -> tuple[NDArray[np.bool_], ...]:
     f = DISTANCE / SILHOUETTE_PIXEL
     camera = Camera.from_field_of_view(400, 400, float(np.degrees(2 * np.arctan(200 / f))))
     casters = [(RayCaster([mesh]), mesh.centre) for mesh in builtin_objects().values()]
-    views = (render_view(caster, camera_pose(*pose, centre), camera) for caster, centre in casters for pose in POSES)
+    views = (caster.render(camera_pose(*pose, centre), camera) for caster, centre in casters for pose in POSES)
     return tuple(np.pad(view.depth > 0, 1) for view in views)
 
 

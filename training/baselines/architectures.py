@@ -25,14 +25,7 @@ from thor2_jax.files import file_digest
 from training.baselines.cnn import DENSENET_161, RCFusion, ViTCNN
 from training.baselines.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY_4, RGBDViT, ViT
 
-__all__ = [
-    "ARCHITECTURES",
-    "TEMPLATES",
-    "check_weights",
-    "crop_size",
-    "network_inputs",
-    "pretrained_files",
-]
+__all__ = ["ARCHITECTURES", "TEMPLATES", "check_weights", "crop_size", "network_inputs", "pretrained_files"]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 """Last part of an NNX path -> last part of the tensor's name."""

@@ -33,17 +33,11 @@ from training.views.normalized_views import NormalizedViews, ViewSource, fold_of
 __all__ = [
     "BaselineInputs",
     "FitTask",
-    "NetworkFit",
     "Predictor",
     "StoredBaseline",
-    "as_given",
     "baseline_file",
-    "baseline_inputs",
     "compiled_network",
-    "fit_network",
     "in_batches",
-    "read_baseline",
-    "write_baseline",
 ]
 
 Integers = NDArray[np.integer[Any]]
@@ -62,6 +56,16 @@ class BaselineInputs(NamedTuple):
     tops: NDArray[np.float32]
     crops: Callable[[int], ViewCrops]
 
+    @classmethod
+    def of_frame(cls, described: DescribedFrame, config: DescriptorConfig, frame: RGBDFrame) -> "BaselineInputs":
+        """Return the instances of a frame in the row order of `described.packed`; crops are computed on demand."""
+
+        @functools.cache
+        def crops(size: int) -> ViewCrops:
+            return ViewCrops.stacked([rgbd_crop(frame, view.label, size) for view in described.usable], size)
+
+        return cls(view_normalize(described.packed, config), np.asarray(described.descriptors.tops), crops)
+
     def predicted(
         self, size: int, n_classes: int, predict: Callable[[ViewCrops], NDArray[np.float32]]
     ) -> NDArray[np.float32]:
@@ -71,16 +75,6 @@ class BaselineInputs(NamedTuple):
         if len(crops):
             values[: len(crops)] = predict(crops)
         return values
-
-
-def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: RGBDFrame) -> BaselineInputs:
-    """Return the instances of a frame in the row order of `described.packed`; crops are computed on demand."""
-
-    @functools.cache
-    def crops(size: int) -> ViewCrops:
-        return ViewCrops.stacked([rgbd_crop(frame, view.label, size) for view in described.usable], size)
-
-    return BaselineInputs(view_normalize(described.packed, config), np.asarray(described.descriptors.tops), crops)
 
 
 Predictor = Callable[[BaselineInputs], NDArray[np.float32]]
@@ -109,53 +103,66 @@ class StoredBaseline:
     temperature: float | None
     weights: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
+    def _digest(self, about: Mapping[str, Any]) -> str:
+        parts: list[str | bytes] = [json_digest(about)]
+        for name, array in sorted(self.arrays.items()):
+            parts += [f"{name} {array.dtype} {array.shape}\0", np.ascontiguousarray(array).tobytes()]
+        return content_digest(parts)
 
-def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
-    parts: list[str | bytes] = [json_digest(about)]
-    for name in sorted(arrays):
-        parts += [f"{name} {arrays[name].dtype} {arrays[name].shape}\0", np.ascontiguousarray(arrays[name]).tobytes()]
-    return content_digest(parts)
+    def write(self, path: Path, classes: Sequence[str], seconds: float) -> None:
+        """Write the file, with the training time, atomically, and create its directory if it is missing.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        about: dict[str, Any] = {
+            "format": BASELINE_FORMAT,
+            "classes": list(classes),
+            "temperature": self.temperature,
+            "seconds": round(seconds, 1),
+        }
+        if self.weights:
+            about["weights"] = dict(self.weights)
+        about["digest"] = self._digest(about)
+        path.parent.mkdir(exist_ok=True)
+        write_bytes(path, pack_arrays(self.arrays, {"about": json.dumps(about)}))
+
+    @classmethod
+    def read(cls, path: Path, classes: Sequence[str]) -> "StoredBaseline":
+        """Read a baseline file.
+
+        Args:
+            path: path of the file.
+            classes: class names of its run.
+
+        Raises:
+            InputError: the file is damaged or has another format or other classes; the message names the file.
+        """
+        with decoding(f"model: {path} cannot be read", advice="remove it and train the baseline again"):
+            arrays, metadata = unpack_arrays(read_file(path))
+            about = json.loads(metadata["about"])
+            if about["format"] != BASELINE_FORMAT:
+                raise ValueError(f"its format is {about['format']!r}; expected {BASELINE_FORMAT}")
+            stored, digest = cls(arrays, about["temperature"], about.get("weights", {})), about.pop("digest")
+            if digest != stored._digest(about):
+                raise ValueError("its digest does not match")
+            if about["classes"] != list(classes):
+                raise ValueError("it has other classes than its run")
+            return stored
 
 
-def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str], seconds: float) -> None:
-    """Write a baseline file and its training time atomically, and create its directory if it is missing.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    about: dict[str, Any] = {
-        "format": BASELINE_FORMAT,
-        "classes": list(classes),
-        "temperature": stored.temperature,
-        "seconds": round(seconds, 1),
-    }
-    if stored.weights:
-        about["weights"] = dict(stored.weights)
-    about["digest"] = _digest(stored.arrays, about)
-    path.parent.mkdir(exist_ok=True)
-    write_bytes(path, pack_arrays(stored.arrays, {"about": json.dumps(about)}))
+def _as_given(*arrays: Any) -> tuple[Any, ...]:
+    """Return the arrays of a batch as the arguments of a network."""
+    return arrays
 
 
-def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
-    """Read a baseline file.
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
+def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
+    def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:
+        logits = model(*inputs(*batch))
+        return logits, logits
 
-    Args:
-        path: path of the file.
-        classes: class names of its run.
-
-    Raises:
-        InputError: the file is damaged or has another format or other classes; the message names the file.
-    """
-    with decoding(f"model: {path} cannot be read", advice="remove it and train the baseline again"):
-        arrays, metadata = unpack_arrays(read_file(path))
-        about = json.loads(metadata["about"])
-        if about["format"] != BASELINE_FORMAT:
-            raise ValueError(f"its format is {about['format']!r}; expected {BASELINE_FORMAT}")
-        if about.pop("digest") != _digest(arrays, about):
-            raise ValueError("its digest does not match")
-        if about["classes"] != list(classes):
-            raise ValueError("it has other classes than its run")
-        return StoredBaseline(arrays, about["temperature"], about.get("weights", {}))
+    return network_step(graph, state, optimizer(rate), label, outputs_of)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,66 +222,56 @@ class FitTask:
         """Number of clouds of the source."""
         return sum(shard.views for shard in self.source.shards)
 
+    def fit_network(
+        self,
+        model: nnx.Module,
+        label: Integers,
+        held_out: NDArray[np.bool_],
+        draw: Callable[[NDArray[np.intp], np.random.Generator], tuple[Any, ...]],
+        optimizer: Callable[[Any], Any],
+        rate: Callable[[int, int], float],
+        batch_size: int,
+        *,
+        inputs: Callable[..., tuple[Any, ...]] = _as_given,
+        n_samples: int | None = None,
+        directory: str = "fit",
+    ) -> Any:
+        """Return a fitted network; an interrupted fit resumes.
 
-class NetworkFit(NamedTuple):
-    """Settings for fitting a network.
+        Args:
+            model: the network, with its initial weights.
+            label: [M] class indices of all clouds.
+            held_out: [M], True for clouds on which it is not fitted.
+            draw: function of the rows of a batch and a random number generator; returns the batch, a tuple of arrays.
+            optimizer: function of the learning rate that returns an optimizer. Static.
+            rate: function of the number of a step and the number of all steps that returns the learning rate.
+            batch_size: samples per step.
+            inputs: function of the arrays of a batch that returns the arguments of the network. Static.
+            n_samples: number of clouds that an epoch uses; by default all on which it is fitted.
+            directory: directory of the checkpoints.
 
-    Attributes:
-        directory: directory of its checkpoints.
-        draw: function of the rows of a batch and a random number generator; returns the batch, a tuple of arrays.
-        inputs: function of these arrays that returns the arguments of the network. Static.
-        batch_size: samples per step.
-        optimizer: function of the learning rate that returns an optimizer. Static.
-        rate: function of the number of a step and the number of all steps that returns the learning rate.
-    """
+        Raises:
+            InputError: the loss is not finite.
+        """
+        rows = np.flatnonzero(~held_out)
+        n_samples = n_samples or len(rows)
+        batch_size = min(batch_size, n_samples)
+        steps = Steps(self.options.epochs, n_samples // batch_size, batch_size)
+        graph, state = FitState.initial(model, optimizer(0.0))
 
-    directory: str
-    draw: Callable[[NDArray[np.intp], np.random.Generator], tuple[Any, ...]]
-    inputs: Callable[..., tuple[Any, ...]]
-    batch_size: int
-    optimizer: Callable[[Any], Any]
-    rate: Callable[[int, int], float]
+        def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, Any]]:
+            rng = np.random.default_rng((self.options.seed, number - 1))
+            order = rng.permutation(rows)[: steps.of_epoch * batch_size].reshape(-1, batch_size)
+            for step, chosen in enumerate(order, (number - 1) * steps.of_epoch):
+                now = np.float32(rate(step, steps.epochs * steps.of_epoch))
+                batch = draw(chosen, rng)
+                state, computed = _step(graph, inputs, optimizer, state, batch, label[chosen], now)
+                yield state, computed
 
-
-def as_given(*arrays: Any) -> tuple[Any, ...]:
-    """Return the arrays of a batch as the arguments of a network."""
-    return arrays
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
-def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
-    def outputs_of(model: Any) -> tuple[jax.Array, jax.Array]:
-        logits = model(*inputs(*batch))
-        return logits, logits
-
-    return network_step(graph, state, optimizer(rate), label, outputs_of)
-
-
-def fit_network(
-    task: FitTask, fit: NetworkFit, model: nnx.Module, label: Integers, rows: NDArray[np.intp], n_samples: int
-) -> Any:
-    """Return a network fitted on these rows, `n_samples` of them per epoch; an interrupted fit resumes.
-
-    Raises:
-        InputError: the loss is not finite.
-    """
-    batch_size = min(fit.batch_size, n_samples)
-    steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
-    graph, state = FitState.initial(model, fit.optimizer(0.0))
-
-    def train_epoch(number: int, state: FitState) -> Iterator[tuple[FitState, Any]]:
-        rng = np.random.default_rng((task.options.seed, number - 1))
-        order = rng.permutation(rows)[: steps.of_epoch * batch_size].reshape(-1, batch_size)
-        for step, chosen in enumerate(order, (number - 1) * steps.of_epoch):
-            rate = np.float32(fit.rate(step, steps.epochs * steps.of_epoch))
-            batch = fit.draw(chosen, rng)
-            state, computed = _step(graph, fit.inputs, fit.optimizer, state, batch, label[chosen], rate)
-            yield state, computed
-
-    checkpoints = Checkpoints(task.scratch / fit.directory)
-    shown = fit_progress(task.progress, f"fit {task.name}", steps.epochs)
-    state = run_epochs(task.name, checkpoints.last(state), steps, train_epoch, checkpoints, progress=shown)
-    return nnx.merge(graph, state.params, state.rest)
+        checkpoints = Checkpoints(self.scratch / directory)
+        shown = fit_progress(self.progress, f"fit {self.name}", steps.epochs)
+        state = run_epochs(self.name, checkpoints.last(state), steps, train_epoch, checkpoints, progress=shown)
+        return nnx.merge(graph, state.params, state.rest)
 
 
 def _apply(models: Sequence[Any], arrays: tuple[Any, ...], inputs: Any, output: Any) -> jax.Array:
@@ -283,7 +280,9 @@ def _apply(models: Sequence[Any], arrays: tuple[Any, ...], inputs: Any, output: 
 
 
 def compiled_network(
-    model: nnx.Module, inputs: Callable[..., tuple[Any, ...]], output: Callable[[Any], Any] = jax.nn.softmax
+    model: nnx.Module,
+    inputs: Callable[..., tuple[Any, ...]] = _as_given,
+    output: Callable[[Any], Any] = jax.nn.softmax,
 ) -> Callable[[tuple[Any, ...]], jax.Array]:
     """Return a compiled function of a tuple of arrays: `output` of the network applied to `inputs` of the arrays."""
     return Compiled(_apply, [nnx.split(model)], inputs, output)

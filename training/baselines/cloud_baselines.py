@@ -20,17 +20,7 @@ from colornet import ColorNetwork
 from thor2_jax import DescriptorConfig, PointClouds, Strips, mirror, strips, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import Linear, model_arrays, model_from_arrays
-from training.baselines.baseline import (
-    BaselineInputs,
-    FitTask,
-    NetworkFit,
-    Predictor,
-    StoredBaseline,
-    as_given,
-    compiled_network,
-    fit_network,
-    in_batches,
-)
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, compiled_network, in_batches
 from training.fitting.samples import MIRRORS
 from training.views.normalized_views import padded_batches
 
@@ -237,10 +227,8 @@ def fit_pointnet(task: FitTask) -> StoredBaseline:
         return (x,)
 
     held_out = task.held_out(label, view)
-    fitted_rows = np.flatnonzero(~held_out)
-    fit = NetworkFit("fit", draw, as_given, BATCH_SIZE, optax.adam, _learning_rate)
     network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
-    model = fit_network(task, fit, network, label, fitted_rows, len(fitted_rows))
+    model = task.fit_network(network, label, held_out, draw, optax.adam, _learning_rate, BATCH_SIZE)
     stored = xyz[held_out, :POINTS].astype(np.float32), rgb[held_out, :POINTS], box[held_out]
     predict = compiled_network(model, point_features)
     temperature = task.temperature(label, held_out, lambda: in_batches(predict, INFERENCE_BATCH, *stored))

@@ -20,17 +20,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import model_arrays, model_from_arrays
 from training.baselines.architectures import ARCHITECTURES, TEMPLATES, network_inputs
-from training.baselines.baseline import (
-    FitTask,
-    NetworkFit,
-    Predictor,
-    StoredBaseline,
-    baseline_file,
-    compiled_network,
-    fit_network,
-    in_batches,
-    read_baseline,
-)
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, compiled_network, in_batches
 from training.views.crops import ViewCrops
 
 __all__ = ["check_backbone", "fit_image_network", "fit_templates", "load_image_network", "load_templates"]
@@ -120,8 +110,8 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
         return color, normals
 
     model.train()
-    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, OPTIMIZER, partial(_learning_rate, rate))
-    fitted = fit_network(task, fit, model, label, np.flatnonzero(~held_out), n_views)
+    fit = partial(task.fit_network, inputs=network_inputs, n_samples=n_views, directory=directory)
+    fitted = fit(model, label, held_out, draw, OPTIMIZER, partial(_learning_rate, rate), BATCH_SIZE)
     predict = _crop_function(fitted)
     held = ViewCrops(samples.color[held_out], samples.normals[held_out])
     temperature = task.temperature(label, held_out, lambda: predict(held))
@@ -196,7 +186,7 @@ def _backbone(task: FitTask) -> tuple[int, nnx.Module, Mapping[str, str]]:
     for number, name in enumerate(TRAINED, 1):
         file = baseline_file(task.directory, name)
         if file.is_file():
-            stored = read_baseline(file, task.source.classes)
+            stored = StoredBaseline.read(file, task.source.classes)
             network = model_from_arrays(partial(ARCHITECTURES[name].build, len(task.source.classes), 0), stored.arrays)
             return number, network.color, stored.weights
     raise InputError(NO_BACKBONE)

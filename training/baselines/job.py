@@ -9,19 +9,13 @@ from typing import Any, NamedTuple
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from training.baselines import cloud_baselines as clouds
+from training.baselines import image_baselines as images
+from training.baselines import thor
 from training.baselines.architectures import ARCHITECTURES, TEMPLATES, check_weights, pretrained_files
-from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file, read_baseline, write_baseline
-from training.baselines.cloud_baselines import fit_forest, fit_pointnet, load_forest, load_pointnet
-from training.baselines.image_baselines import (
-    check_backbone,
-    fit_image_network,
-    fit_templates,
-    load_image_network,
-    load_templates,
-)
-from training.baselines.thor import fit_thor, load_thor
-from training.fitting.loop import find_run_directories
+from training.baselines.baseline import FitTask, Predictor, StoredBaseline, baseline_file
 from training.storage.jobs import Progress, add_prefix
+from training.train_run import find_run_directories
 from training.views.normalized_views import ViewSource
 
 __all__ = ["CLOUD_BASELINES", "TITLES", "TrainedBaseline", "check_baselines", "load_baselines", "train_baselines"]
@@ -49,11 +43,11 @@ TITLES = {
 Load = Callable[[Mapping[str, Any], TrainedRun], Predictor]
 
 _METHODS: dict[str, tuple[Callable[[FitTask], StoredBaseline], Load]] = {
-    "thor": (fit_thor, load_thor),
-    "forest": (fit_forest, load_forest),
-    "pointnet": (fit_pointnet, load_pointnet),
-    **{name: (fit_image_network, functools.partial(load_image_network, name)) for name in ARCHITECTURES},
-    TEMPLATES: (fit_templates, load_templates),
+    "thor": (thor.fit_thor, thor.load_thor),
+    "forest": (clouds.fit_forest, clouds.load_forest),
+    "pointnet": (clouds.fit_pointnet, clouds.load_pointnet),
+    **{name: (images.fit_image_network, functools.partial(images.load_image_network, name)) for name in ARCHITECTURES},
+    TEMPLATES: (images.fit_templates, images.load_templates),
 }
 """Name -> function that fits a baseline, and function that builds it from its arrays and run. The second one raises
 KeyError or ValueError for unsuitable arrays."""
@@ -76,7 +70,7 @@ def check_baselines(names: Sequence[str], weights: Path | None, out: Path) -> tu
             f"baselines is {', '.join(names)}; expected any of {', '.join(BASELINES)}; give each at most once"
         )
     if weights is None:
-        check_backbone(names, out)
+        images.check_backbone(names, out)
     elif not any(map(pretrained_files, names)):
         raise InputError(f"weights is {weights}, but none of the baselines reads pretrained weights; leave it out")
     else:
@@ -130,11 +124,10 @@ def train_baselines(
             file = baseline_file(directory, name)
             if not file.is_file():
                 task, start = FitTask(name, source, run, directory, weights, shown), time.perf_counter()
-                fitted = _METHODS[name][0](task)
-                write_baseline(file, fitted, run.classes, time.perf_counter() - start)
+                _METHODS[name][0](task).write(file, run.classes, time.perf_counter() - start)
                 # Checkpoints, including those of earlier versions.
                 remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
-            elif weights is not None and read_baseline(file, run.classes).weights != check_weights(weights, name):
+            elif weights is not None and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
                 raise InputError(
                     f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
                     "or leave out weights"
@@ -151,7 +144,7 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
     for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
         if not file.is_file():
             continue
-        stored = read_baseline(file, run.classes)
+        stored = StoredBaseline.read(file, run.classes)
         with decoding(f"model: {file} does not match its run", advice="delete it and train the baseline again"):
             predict = _METHODS[name][1](stored.arrays, run)
         loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)

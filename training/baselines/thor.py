@@ -27,7 +27,7 @@ from thor2_jax import DescriptorConfig, InputError, PointClouds
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.networks.networks import MLP, model_arrays, model_from_arrays
-from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, as_given, compiled_network
+from training.baselines.baseline import BaselineInputs, FitTask, Predictor, StoredBaseline, compiled_network
 from training.fitting.calibration import sample_probabilities
 from training.fitting.fit import FitContext, fit
 from training.fitting.loop import Checkpoints, EpochMetrics
@@ -108,7 +108,7 @@ def load_thor(arrays: Mapping[str, NDArray[Any]], run: TrainedRun) -> Predictor:
     config, size, predict = run.config, run.config.image_size**2, {}
     for name, k in itertools.product(VIEW_TYPES, range(1, config.n_slices + 1)):
         create = partial(_create_mlp, k * size, len(run.classes))
-        predict[name, k] = compiled_network(model_from_arrays(create, arrays, f"{name}-{k}/"), as_given)
+        predict[name, k] = compiled_network(model_from_arrays(create, arrays, f"{name}-{k}/"))
 
     def probabilities(inputs: BaselineInputs) -> NDArray[np.float32]:
         normal = inputs.normal

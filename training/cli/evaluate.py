@@ -153,12 +153,13 @@ def _print_report(report: Mapping[str, Any]) -> None:
             shown.add_row(*row)
     console.print(shown)
     for table in report["published_tables"]:
-        header, rows = page.marked(page.comparison_table(table, report["main"]), report["main"])
-        shown = Table(*header, title=page.comparison_title(table))
+        title, text, compared = page.comparison(table, report["main"])
+        header, rows = page.marked(compared, report["main"])
+        shown = Table(*header, title=title)
         for row in rows:
             shown.add_row(*row)
         console.print(shown)
-        console.print(page.comparison_text(table))
+        console.print(text)
     console.print(
         f"instances scored: {counts['scored']}; {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"

@@ -29,7 +29,6 @@ __all__ = [
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
-    "WorkersOption",
     "check_alone",
     "check_belongs",
     "find_segmenter",

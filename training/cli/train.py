@@ -21,12 +21,19 @@ class _TrainCommand(options.ManyFrames):
     """The train command. Its help states the defaults of the protocols."""
 
     def insert_values(self) -> None:
-        """Insert the values into the help, only when it is shown, since importing the protocols takes a second."""
+        """Insert the values into the help, only when it is shown, since importing the protocols takes a second.
+
+        "{own}" stands for the values of the protocols' field with the name of the option.
+        """
         from training.protocol import DEFAULT, PAPER, QUICK
 
         parameters: list[Any] = self.params
+        default, paper = (vars(each) | vars(each.fit) for each in (DEFAULT, PAPER))
         for option in parameters:
-            option.help = (option.help or "").format(default=DEFAULT, paper=PAPER, quick=QUICK)
+            text = option.help or ""
+            if "{own}" in text:
+                text = text.replace("{own}", f"({default[option.name]:g}; paper: {paper[option.name]:g})")
+            option.help = text.format(default=DEFAULT, paper=PAPER, quick=QUICK)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Insert the values, and show the help."""
@@ -61,18 +68,8 @@ class JobOptions:
 class ProtocolOptions:
     """Options that replace values of the protocol; None keeps a value."""
 
-    azimuth_step: Annotated[
-        float | None,
-        typer.Option(
-            help="Degrees between cameras around the object. ({default.azimuth_step:g}; paper: {paper.azimuth_step:g})"
-        ),
-    ] = None
-    polar_step: Annotated[
-        float | None,
-        typer.Option(
-            help="Degrees between cameras from pole to pole. ({default.polar_step:g}; paper: {paper.polar_step:g})"
-        ),
-    ] = None
+    azimuth_step: Annotated[float | None, typer.Option(help="Degrees between cameras around the object. {own}")] = None
+    polar_step: Annotated[float | None, typer.Option(help="Degrees between cameras from pole to pole. {own}")] = None
     epochs: Annotated[
         int | None,
         typer.Option(
@@ -81,23 +78,14 @@ class ProtocolOptions:
             "({default.fit.epochs}; paper: {paper.fit.epochs})."
         ),
     ] = None
-    batch_size: Annotated[
-        int | None,
-        typer.Option(
-            help="Samples per step of the classifiers. ({default.fit.batch_size}; paper: {paper.fit.batch_size})"
-        ),
-    ] = None
+    batch_size: Annotated[int | None, typer.Option(help="Samples per step of the classifiers. {own}")] = None
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0
     folds: Annotated[
         int, typer.Option(min=1, max=1000, help="Number of folds; if more than 1, one model per held-out fold.")
     ] = 1
     orientation_copies: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            help="Additional samples of each view in random orientations, for the classifiers. "
-            "({default.orientation_copies}; paper: {paper.orientation_copies})",
-        ),
+        typer.Option(min=0, help="Additional samples of each view in random orientations, for the classifiers. {own}"),
     ] = None
 
 

@@ -36,7 +36,7 @@ from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.fitting.samples import OF_EMBEDDING, Samples, sample_normalized
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
-from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles, render_view
+from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles
 from training.storage.jobs import cache_directory, load_arrays, processor, save_arrays
 from training.storage.workers import IN_PROCESS, WorkerPool, local_workers
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
@@ -80,7 +80,7 @@ def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple
         caster = RayCaster([mesh])
         rng = np.random.default_rng([SEED, index])
         for _ in range(views):
-            view = render_view(caster, camera_pose(*random_angles(rng), mesh.centre), CAMERA)
+            view = caster.render(camera_pose(*random_angles(rng), mesh.centre), CAMERA)
             cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
             if len(cloud[0]) >= MIN_VIEW_POINTS:
                 clouds.append((index, cloud))

@@ -33,7 +33,6 @@ __all__ = [
     "Predictions",
     "RULES",
     "Rule",
-    "fuse_by",
     "fusions",
     "main_fusion",
     "read_answers",
@@ -158,7 +157,7 @@ def _decode(line: str | bytes) -> FrameAnswers:
 
 Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
-"""The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
+"""The rules of `fused_probabilities`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "classifiers", "gallery", "both"
 """Columns of the embedding alone, of the classifiers with the confidence from the embedding (in runs that have both),
@@ -205,22 +204,22 @@ class Predictions(NamedTuple):
         """[N], whether the instance was described."""
         return self.class_index >= 0
 
+    @classmethod
+    def fused(
+        cls, rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float]
+    ) -> "Predictions":
+        """Return the predicted classes and their fused probabilities.
 
-def fuse_by(
-    rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float]
-) -> Predictions:
-    """Return the predicted classes and their fused probabilities.
-
-    Args:
-        rule: fusion rule.
-        probabilities: [B, C] class probabilities of each classifier.
-        temperatures: temperature of each classifier; read for "calibrated" only.
-    """
-    if set(probabilities) <= set(WHOLE):
-        (values,) = probabilities.values()  # scores, which need not sum to 1
-        return Predictions(values.argmax(axis=1), values.max(axis=1))
-    if rule == "calibrated":
-        probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
-        rule = "max"
-    fused = fused_probabilities(probabilities, rule)
-    return Predictions(fused.argmax(axis=1), fused.max(axis=1))
+        Args:
+            rule: fusion rule.
+            probabilities: [B, C] class probabilities of each classifier.
+            temperatures: temperature of each classifier; read for "calibrated" only.
+        """
+        if set(probabilities) <= set(WHOLE):
+            (values,) = probabilities.values()  # scores, which need not sum to 1
+            return cls(values.argmax(axis=1), values.max(axis=1))
+        if rule == "calibrated":
+            scaled = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
+            return cls.fused("max", scaled, temperatures)
+        fused = fused_probabilities(probabilities, rule)
+        return cls(fused.argmax(axis=1), fused.max(axis=1))

@@ -20,7 +20,7 @@ import numpy as np
 from thor2_jax import DESCRIPTOR_VERSION, InputError, RGBDFrame
 from thor2_jax.files import check_output_directory, file_digest, locked, write_text
 from thor2_jax.printable import find_name
-from training.baselines.baseline import baseline_inputs
+from training.baselines.baseline import BaselineInputs
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
 from training.evaluation.frame_pictures import draw_pictures
 from training.evaluation.page import write_report_page
@@ -184,7 +184,7 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
     described = recognizer.describe(item.frame)
     rows = {instance.label: row for row, instance in enumerate(described.usable)}
     has_baselines = rows and any(run.baselines for run in runs)
-    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if has_baselines else None
+    inputs = BaselineInputs.of_frame(described, recognizer.run.config, item.frame) if has_baselines else None
     values = [run.probabilities(item.identifier, described, inputs) for run in runs] if rows else []
     reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []

@@ -14,15 +14,7 @@ from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
-__all__ = [
-    "accuracy_table",
-    "answer_texts",
-    "comparison_table",
-    "comparison_text",
-    "comparison_title",
-    "marked",
-    "write_report_page",
-]
+__all__ = ["accuracy_table", "answer_texts", "comparison", "marked", "write_report_page"]
 
 NO_VALUE = {"mean": None, "std": None}
 
@@ -69,26 +61,18 @@ def _row(
     return [where, f"{cell['instances']:,}", *(_mean_std(value, factor, digits) for value in values)]
 
 
-def comparison_title(table: Mapping[str, Any]) -> str:
-    """Return the heading of a published table, an entry of `report["published_tables"]`."""
-    number = "" if table["number"] is None else f" table {table['number']}"
-    return f"Published{number}: {table['title']}"
+def comparison(table: Mapping[str, Any], main: str) -> tuple[str, str, Table]:
+    """Return the heading, the notes, and the accuracies of a published table beside the measured ones, in percent.
 
-
-def comparison_text(table: Mapping[str, Any]) -> str:
-    """Return the source of a published table, its notes, and the differences between the data."""
-    return " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]])
-
-
-def comparison_table(table: Mapping[str, Any], main: str) -> Table:
-    """Return header and rows of a published table together with the measured accuracies, in percent.
-
-    The measured column of a published method, if there is one, stands before it. The column `main` is always shown.
+    The notes have the source of the table and the differences between the data. The measured column of a published
+    method, if there is one, stands before it. The column `main` is always shown.
 
     Args:
         table: an entry of `report["published_tables"]`.
         main: title of the column whose answers the recognizer gives.
     """
+    number = "" if table["number"] is None else f" table {table['number']}"
+    text = " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]])
     methods = dict.fromkeys(method for cell in table["cells"] for method in cell["published"])
     columns: list[tuple[str, str]] = [] if main in table["ours"].values() else [("accuracy", main)]
     for method in methods:
@@ -98,7 +82,7 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
     header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
     # The values are in percent with two decimals, as in the publications.
     rows = [_row(cell, [cell[key].get(name, NO_VALUE) for key, name in columns], 100.0, 2) for cell in table["cells"]]
-    return header, rows
+    return f"Published{number}: {table['title']}", text, (header, rows)
 
 
 def write_report_page(report: Mapping[str, Any], out: Path) -> None:
@@ -112,13 +96,11 @@ def write_report_page(report: Mapping[str, Any], out: Path) -> None:
         OSError: a file cannot be written.
     """
     main = report["main"]
+    published = (comparison(table, main) for table in report["published_tables"])
     sections = [
         _answer_section(report, out),
         *_accuracy_sections(report, out),
-        *(
-            Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
-            for table in report["published_tables"]
-        ),
+        *(Section(title, text, marked(table, main)) for title, text, table in published),
         *_fusion_sections(report),
         *_placement_sections(report),
         _confidence_section(report, out),

@@ -12,16 +12,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.printable import find_name, first_names
 from training.evaluation import scores
-from training.evaluation.answers import (
-    RULES,
-    FrameAnswers,
-    InstancePrediction,
-    Predictions,
-    Rule,
-    fuse_by,
-    fusions,
-    main_fusion,
-)
+from training.evaluation.answers import RULES, FrameAnswers, InstancePrediction, Predictions, Rule, fusions, main_fusion
 from training.evaluation.published import compare_with_published
 from training.evaluation.runs import Run, all_predictors, scratch_networks
 from training.evaluation.scores import Flags, Floats, summarize_rows, summarize_runs
@@ -73,7 +64,7 @@ def fuse_answers(
             if owner == index and (rule != "calibrated" or name in run.temperatures)
         }
         for title, names in fusions(probabilities).items():
-            fused = fuse_by(rule, {name: probabilities[name] for name in names}, run.temperatures)
+            fused = Predictions.fused(rule, {name: probabilities[name] for name in names}, run.temperatures)
             answer = Predictions(np.full(len(instances), -1), np.zeros(len(instances), fused.confidence.dtype))
             answer.class_index[described], answer.confidence[described] = fused
             predictions[title][index] = answer

@@ -27,8 +27,8 @@ from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
 from training.baselines.job import TITLES, TrainedBaseline, load_baselines
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
-from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
+from training.train_run import find_run_directories
 
 __all__ = ["Run", "all_predictors", "load_runs", "load_sequence_runs", "scratch_networks"]
 

@@ -159,13 +159,7 @@ def predicted_labels(context: FitContext, graph: Any, state: FitState, batch: Ba
 def scale_inputs(sample: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig) -> jax.Array:
     """Return the input scaling [F]: 1 / root mean square over a batch, one value for images, one for embeddings."""
     descriptors = describe_batch(sample, network, config)
-    images, embeddings = descriptors.images, descriptors.embeddings
-    block = dataclasses.replace(
-        descriptors,
-        images=jnp.full(images.shape[1:], jnp.sqrt((images**2).mean()))[None],
-        embeddings=jnp.full(embeddings.shape[1:], jnp.sqrt((embeddings**2).mean()))[None],
-        overflow=descriptors.overflow[:1],
-    )
+    block = jax.tree.map(lambda a: jnp.full((1, *a.shape[1:]), jnp.sqrt((a**2).mean())), descriptors)
     size = feature_of(block, feature)[0]
     return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
 

@@ -14,7 +14,7 @@ before an older one is removed, so the last complete checkpoint survives any cra
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -25,21 +25,9 @@ import safetensors
 from jax.experimental import multihost_utils
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.model.run_record import run_directories
 from training.storage.jobs import Progress, load_arrays, save_arrays
 
-__all__ = [
-    "BEGUN",
-    "CHECKPOINTS",
-    "Checkpoints",
-    "EpochMetrics",
-    "FitOptions",
-    "Steps",
-    "find_run_directories",
-    "fit_progress",
-    "run_epochs",
-    "wait_for_all",
-]
+__all__ = ["Checkpoints", "EpochMetrics", "FitOptions", "Steps", "fit_progress", "run_epochs", "wait_for_all"]
 
 MAX_SEED = 2**31 - 1
 """Largest seed: JAX requires that it fits into 32 signed bits."""
@@ -100,13 +88,6 @@ def fit_progress(progress: Progress, stage: str, epochs: int) -> Callable[[int, 
         progress(stage, done, total, note + rate)
 
     return show
-
-
-CHECKPOINTS = "checkpoints"
-"""Directory of the checkpoints, inside the run directory of an unfinished training."""
-
-BEGUN = "begun.json"
-"""File name, in this directory, of the job record of an unfinished training."""
 
 
 class Checkpoints:
@@ -191,23 +172,6 @@ class Checkpoints:
                 if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
                     raise ValueError(f"it has {leaf.dtype} {leaf.shape}; expected {expected.dtype} {expected.shape}")
             return jax.tree.unflatten(structure, stored)
-
-
-def find_run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
-
-    Raises:
-        InputError: a training is not finished. Other paths that are not run directories are refused on loading.
-    """
-    directories: list[Path] = []
-    for path in map(Path, paths):
-        runs = run_directories(path) or [path]
-        if path not in runs and (path / CHECKPOINTS / BEGUN).exists():
-            raise InputError(
-                f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
-            )
-        directories += runs
-    return directories
 
 
 def wait_for_all(point: str) -> None:

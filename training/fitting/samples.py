@@ -19,29 +19,15 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from colornet import ColorNetwork
-from thor2_jax import DescriptorConfig, InputError, describe_strips, mirror, strips, turn
+from thor2_jax import DescriptorConfig, describe_strips, mirror, strips, turn
 from thor2_jax.descriptor.looks import balanced_histogram, cloud_statistics
 from thor2_jax.types import Cloud, Descriptors, Parameters, PointClouds, Strips
 from training.views.normalized_views import ViewSource, padded_batches, reorient
 
-__all__ = [
-    "MIRRORS",
-    "OF_EMBEDDING",
-    "PAPER_MIRRORS",
-    "Batch",
-    "Form",
-    "Samples",
-    "check_classes",
-    "describe_batch",
-    "sample_normalized",
-    "sample_views",
-]
+__all__ = ["MIRRORS", "OF_EMBEDDING", "Batch", "Form", "Samples", "describe_batch", "sample_normalized", "sample_views"]
 
 MIRRORS = ("", "x")
 """Mirrors of a normalized view that change its descriptor. A mirror in y changes no strip length and no count."""
-
-PAPER_MIRRORS = ("", "x", "y", "xy")
-"""The four mirrors of the paper."""
 
 
 class Form(NamedTuple):
@@ -194,16 +180,6 @@ def sample_normalized(
             chunks.append(Samples(csr_array(values), statistics, *named))
         done += count
     return Samples.concatenated(chunks)
-
-
-def check_classes(source: ViewSource) -> None:
-    """Raise InputError if there are fewer than two classes, or a class has no views."""
-    if len(source.classes) < 2:
-        names = ", ".join(source.classes) or "none"
-        raise InputError(f"the objects with views are {names}; expected at least two; add views of another one")
-    for label, name in enumerate(source.classes):
-        if not any(shard.label == label and shard.views for shard in source.shards):
-            raise InputError(f"class {name!r} has no views; render more views or leave it out")
 
 
 def sample_views(

@@ -13,17 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from training.objects.mesh import (
-    TexturedMesh,
-    arc_lengths,
-    box_surface,
-    merge_meshes,
-    moved,
-    revolved_surface,
-    standing,
-    texel_centres,
-    tube_surface,
-)
+from training.objects.mesh import TexturedMesh, arc_lengths, box_surface, revolved_surface, texel_centres, tube_surface
 
 __all__ = ["COLOR_PAIRS", "SHAPE_PAIRS", "builtin_objects"]
 
@@ -132,7 +122,7 @@ def _mug(outside: Color, inside: Color, stripe: Color) -> TexturedMesh:
     arc = _arc(0.029, 90, -90, 15)
     path = np.stack([0.0395 + arc[:, 0] * 1.15, np.zeros(15), 0.049 + arc[:, 1]], axis=1)
     handle = _sweep(path, np.tile([0.0045, 0.0065], (15, 1)), (0, 1, 0), outside)
-    return merge_meshes([body, handle])
+    return TexturedMesh.merged([body, handle])
 
 
 def _cereal_box(ground: Color, panel: Color, bowl: Color) -> TexturedMesh:
@@ -200,7 +190,7 @@ def _banana() -> TexturedMesh:
     size[-4:-1] = np.maximum(size[-4:-1], 0.0048)
     ends: Mark = (BROWN, lambda u, t: (t < 0.035) | (t > 0.93))
     spot: Mark = (BROWN, lambda u, t: (abs(u - 0.3) < 0.02) & (abs(t - 0.45) < 0.06))
-    return standing(_sweep(path, np.stack([size, size], axis=1), (0, 0, 1), YELLOW, ends, spot, sides=12))
+    return _sweep(path, np.stack([size, size], axis=1), (0, 0, 1), YELLOW, ends, spot, sides=12).standing()
 
 
 def _apple() -> TexturedMesh:
@@ -212,14 +202,14 @@ def _apple() -> TexturedMesh:
     body = _lathe(np.stack([r.clip(0), z], axis=1), RED, top, cheek)
     line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041]])
     stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2], (0, 1, 0), BROWN, sides=8)
-    return standing(body, stem)
+    return TexturedMesh.merged([body, stem]).standing()
 
 
 def _tennis_ball() -> TexturedMesh:
     phi = np.radians(np.linspace(-90, 90, 33))
     profile = 0.0335 * np.stack([np.cos(phi).clip(0), np.sin(phi)], axis=1)
     seam: Mark = (IVORY, lambda u, r, z, s: abs(np.arctan2(z, r) - 0.75 * np.sin(4 * np.pi * u)) < 0.085)
-    return standing(_lathe(profile, LIME, seam))
+    return _lathe(profile, LIME, seam).standing()
 
 
 def _sponge() -> TexturedMesh:
@@ -236,7 +226,7 @@ def _screwdriver() -> TexturedMesh:
     handle: Mark = (RED, lambda u, r, z, s: z < 0.1015)
     grooves: Mark = (DARK, lambda u, r, z, s: (z > 0.012) & (z < 0.080) & (u * 6 % 1 < 0.4))
     collar: Mark = (DARK, lambda u, r, z, s: (z > 0.084) & (z < 0.1015))
-    return standing(moved(_lathe(profile, STEEL, handle, grooves, collar), axis="y", degrees=90))
+    return _lathe(profile, STEEL, handle, grooves, collar).moved(axis="y", degrees=90).standing()
 
 
 def _hammer() -> TexturedMesh:
@@ -247,7 +237,7 @@ def _hammer() -> TexturedMesh:
     profile = [(0, 0), (0.014, 0), (0.016, 0.004), (0.016, 0.022)]
     profile += [(0.011, 0.028), (0.011, 0.062), (0.004, 0.100), (0, 0.100)]
     head = _lathe(profile, STEEL, (DARK, lambda u, r, z, s: (z > 0.024) & (z < 0.066)))
-    return standing(handle, moved(head, (0.222, 0.045, 0), axis="x", degrees=90))
+    return TexturedMesh.merged([handle, head.moved((0.222, 0.045, 0), axis="x", degrees=90)]).standing()
 
 
 def _wooden_spoon() -> TexturedMesh:
@@ -258,7 +248,7 @@ def _wooden_spoon() -> TexturedMesh:
     thick = np.where(bowl > 0, 0.0045, 0.0055)
     path = np.stack([x, np.zeros_like(x), z], axis=1)
     hollow: Mark = (BROWN, lambda u, t: _ellipse(t, u, (0.855, 0.5), (0.105, 0.17)) | (t < 0.06))
-    return standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, hollow))
+    return _sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, hollow).standing()
 
 
 def builtin_objects() -> dict[str, TexturedMesh]:

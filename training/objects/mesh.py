@@ -14,10 +14,7 @@ __all__ = [
     "TexturedMesh",
     "arc_lengths",
     "box_surface",
-    "merge_meshes",
-    "moved",
     "revolved_surface",
-    "standing",
     "superellipse",
     "texel_centres",
     "tube_surface",
@@ -49,6 +46,29 @@ class TexturedMesh:
     face_texture: NDArray[np.int32] | None = None
     corner_colors: NDArray[np.uint8] | None = None
 
+    @classmethod
+    def merged(cls, parts: Sequence["TexturedMesh"]) -> "TexturedMesh":
+        """Merge meshes in the same frame into one.
+
+        Raises:
+            InputError: some meshes have textures and others corner colours.
+        """
+        offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        vertices = np.concatenate([part.vertices for part in parts])
+        faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(
+            np.int32
+        )
+        colors = [part.corner_colors for part in parts if part.corner_colors is not None]
+        if len(colors) == len(parts):
+            return cls(vertices, faces, corner_colors=np.concatenate(colors))
+        if colors:
+            raise InputError("some parts of the mesh have textures and others vertex colours; bake them into one kind")
+        first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
+        uv = np.concatenate([part.uv for part in parts if part.uv is not None])
+        textures = tuple(texture for part in parts for texture in part.textures)
+        numbers = [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
+        return cls(vertices, faces, uv, textures, np.concatenate(numbers).astype(np.int32))
+
     @property
     def centre(self) -> NDArray[np.float64]:
         """Centre of the axis-aligned bounding box [3], metres; training cameras look at it."""
@@ -70,6 +90,19 @@ class TexturedMesh:
     def transformed(self, matrix: NDArray[np.float64]) -> "TexturedMesh":
         """Return the mesh transformed by a homogeneous matrix [4, 4]; the colours are shared."""
         return dataclasses.replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+
+    def moved(self, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> "TexturedMesh":
+        """Return the mesh rotated about a coordinate axis, then translated."""
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+        matrix = np.eye(4)
+        matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+        matrix[:3, 3] = position
+        return self.transformed(matrix)
+
+    def standing(self) -> "TexturedMesh":
+        """Return the mesh placed on z = 0, centred over the origin."""
+        return self.moved((*-self.centre[:2], -self.vertices[:, 2].min()))
 
     def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Return the sRGB colours of points on the surface.
@@ -108,27 +141,6 @@ def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArra
     column = np.floor(uv[0] * width).astype(np.int64) % width
     row = np.floor((1 - uv[1]) * height).astype(np.int64) % height
     return image.reshape(-1, 3).take(row * width + column, axis=0)
-
-
-def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
-    """Merge meshes in the same frame into one.
-
-    Raises:
-        InputError: some meshes have textures and others corner colours.
-    """
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(np.int32)
-    colors = [part.corner_colors for part in parts if part.corner_colors is not None]
-    if len(colors) == len(parts):
-        return TexturedMesh(vertices, faces, corner_colors=np.concatenate(colors))
-    if colors:
-        raise InputError("some parts of the mesh have textures and others vertex colours; bake them into one kind")
-    first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
-    uv = np.concatenate([part.uv for part in parts if part.uv is not None])
-    textures = tuple(texture for part in parts for texture in part.textures)
-    numbers = [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
-    return TexturedMesh(vertices, faces, uv, textures, np.concatenate(numbers).astype(np.int32))
 
 
 def texel_centres(n: int) -> tuple[Array, Array]:
@@ -224,20 +236,3 @@ def box_surface(size: Sequence[float], textures: Sequence[NDArray[np.uint8]]) ->
     faces = (4 * np.arange(6, dtype=np.int32)[:, None, None] + np.array(QUAD_FACES, np.int32)).reshape(-1, 3)
     uv = np.tile(QUAD_UV, (6, 1, 1))
     return TexturedMesh(vertices, faces, uv, tuple(textures), np.arange(12, dtype=np.int32) // 2)
-
-
-def moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:
-    """Rotate a mesh about a coordinate axis, then translate it."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    matrix = np.eye(4)
-    matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
-    matrix[:3, 3] = position
-    return mesh.transformed(matrix)
-
-
-def standing(*parts: TexturedMesh) -> TexturedMesh:
-    """Merge parts and place them on z = 0, centred over the origin."""
-    mesh = merge_meshes(parts)
-    centre = mesh.centre
-    return moved(mesh, (-centre[0], -centre[1], -mesh.vertices[:, 2].min()))

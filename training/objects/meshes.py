@@ -16,7 +16,7 @@ from thor2_jax.errors import InputError, reason_of, with_context
 from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.frames import check_size
 from thor2_jax.printable import check_name
-from training.objects.mesh import TexturedMesh, merge_meshes
+from training.objects.mesh import TexturedMesh
 
 if TYPE_CHECKING:  # takes 0.2 s to import, so it is imported where meshes are read
     import trimesh
@@ -209,7 +209,7 @@ def _read(path: Path) -> TexturedMesh:
             parts.append(_part(geometry, transform))
     if not parts:
         raise InputError("no faces; expected triangles, not points alone")
-    mesh = merge_meshes(parts)
+    mesh = TexturedMesh.merged(parts)
     # The bounds of an object are those of its faces.
     used, faces = np.unique(mesh.faces, return_inverse=True)
     mesh = dataclasses.replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))

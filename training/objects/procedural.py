@@ -14,17 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from training.objects.mesh import (
-    TexturedMesh,
-    box_surface,
-    merge_meshes,
-    moved,
-    revolved_surface,
-    standing,
-    superellipse,
-    texel_centres,
-    tube_surface,
-)
+from training.objects.mesh import TexturedMesh, box_surface, revolved_surface, superellipse, texel_centres, tube_surface
 
 __all__ = ["procedural_object"]
 
@@ -59,8 +49,8 @@ def procedural_object(seed: int) -> TexturedMesh:
     longest = np.ptp(vertices, axis=0).max()
     mesh = dataclasses.replace(mesh, vertices=vertices * (np.clip(longest, *SIZES) / longest))
     if rng.random() < 0.5:
-        mesh = moved(mesh, axis="x", degrees=float(rng.choice([0, 90])))
-    return standing(mesh)
+        mesh = mesh.moved(axis="x", degrees=float(rng.choice([0, 90])))
+    return mesh.standing()
 
 
 def _log_uniform(rng: Rng, low: float, high: float) -> float:
@@ -226,7 +216,7 @@ def _vessel(rng: Rng, paint: Paint) -> TexturedMesh:
     path = np.stack([0.9 * reach * np.cos(angle), 0 * angle, reach * np.sin(angle)], axis=1) + [0.93 * r, 0, h / 2]
     texture = paint(0 if rng.random() < 0.7 else 1)
     handle = tube_surface(path, np.tile([0.005, 0.007], (13, 1)), (0, 1, 0), texture, 10)
-    return merge_meshes([vessel, handle])
+    return TexturedMesh.merged([vessel, handle])
 
 
 def _ball(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -261,7 +251,7 @@ def _tool(rng: Rng, paint: Paint) -> TexturedMesh:
     length, width = _log_uniform(rng, 0.06, 0.2), _log_uniform(rng, 0.012, 0.04)
     if rng.random() < 0.5:
         size = length, width, width * rng.uniform(0.5, 1.2)
-        parts = [moved(box_surface(size, [paint(0)] * 6), (0, 0, -size[2] / 2))]
+        parts = [box_surface(size, [paint(0)] * 6).moved((0, 0, -size[2] / 2))]
     else:
         path = np.linspace([-length / 2, 0, 0], [length / 2, 0, 0], 6)
         parts = [tube_surface(path, np.full((6, 2), width / 2), (0, 1, 0), paint(0), 20)]
@@ -273,10 +263,10 @@ def _tool(rng: Rng, paint: Paint) -> TexturedMesh:
             top = wide / 2 * rng.uniform(0.4, 1)
             profile = _closed([(wide / 2, -long / 2), (wide / 2, 0), (top, long / 2)])
             part = revolved_surface(profile, paint(1 + index), SIDES)
-        part = moved(part, -part.centre, "y", rng.choice([0, 90, rng.uniform(0, 90)]))
+        part = part.moved(-part.centre, "y", rng.choice([0, 90, rng.uniform(0, 90)]))
         position = rng.uniform(-0.5, 0.5) * length, rng.uniform(-0.5, 0.5) * width, rng.uniform(-1, 1) * width
-        parts.append(moved(part, position, "z", rng.choice([0, 90, rng.uniform(0, 180)])))
-    return merge_meshes(parts)
+        parts.append(part.moved(position, "z", rng.choice([0, 90, rng.uniform(0, 180)])))
+    return TexturedMesh.merged(parts)
 
 
 def _plate(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -296,11 +286,11 @@ def _scissors(rng: Rng, paint: Paint) -> TexturedMesh:
     for side in (-1, 1):
         bar = box_surface((length, width, width * rng.uniform(0.4, 1)), [paint(0)] * 6)
         shift = side * rng.uniform(0, 0.4) * length * np.sin(np.radians(angle))
-        parts.append(moved(bar, (0, shift, 0), "z", side * angle / 2))
+        parts.append(bar.moved((0, shift, 0), "z", side * angle / 2))
         if with_rings:
             ring = tube_surface(loop, np.full((15, 2), 0.4 * width), (0, 0, 1), paint(1), 8)
-            parts.append(moved(ring, (-length / 2, side * 1.1 * reach, 0)))
-    return merge_meshes(parts)
+            parts.append(ring.moved((-length / 2, side * 1.1 * reach, 0)))
+    return TexturedMesh.merged(parts)
 
 
 def _prism(rng: Rng, paint: Paint) -> TexturedMesh:

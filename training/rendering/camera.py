@@ -2,7 +2,7 @@
 
     poses = [camera_pose(azimuth, polar, mesh.centre) for azimuth, polar in view_angles()]   # 2,664 poses
     caster = RayCaster([mesh])                                    # once per mesh
-    view = render_view(caster, poses[0])                          # view.color, view.depth, view.intrinsics
+    view = caster.render(poses[0])                                # view.color, view.depth, view.intrinsics
 
 The object's frame is the frame of the scan, with z up. The polar angle is 0 from above, pi/2 from the side, pi from
 below (paper, section "Training"). No light is added, since the textures of scans already contain the studio's light.
@@ -30,7 +30,6 @@ __all__ = [
     "depth_edges",
     "pixel_rays",
     "random_angles",
-    "render_view",
     "view_angles",
 ]
 
@@ -48,6 +47,12 @@ class Camera:
     width: int
     height: int
     intrinsics: Intrinsics
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The camera in JSON types; fields of the intrinsics without a value are left out, as in version 0.1.0."""
+        intrinsics = {name: value for name, value in dataclasses.asdict(self.intrinsics).items() if value}
+        return {"width": self.width, "height": self.height, "intrinsics": intrinsics, "distance": DISTANCE}
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, degrees: float) -> "Camera":
@@ -170,6 +175,31 @@ def camera_pose(
     return pose
 
 
+def pixel_rays(intrinsics: Intrinsics, height: int, width: int, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rays through the pixels [height * width, 3] float64, object frame, of a camera with this pose [4, 4].
+
+    Their component along the optical axis is 1, so that hit distances are depths.
+    """
+    x, y, z = pose[:3, :3].T
+    columns = ((np.arange(width) - intrinsics.cx) / intrinsics.fx)[:, None] * x
+    rows = ((np.arange(height) - intrinsics.cy) / intrinsics.fy)[:, None] * y
+    return ((rows + z)[:, None] + columns).reshape(-1, 3)
+
+
+def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+    """Return the range of rows and columns that the vertices can cover (first, end, first, end); never empty."""
+    in_camera = (vertices - pose[:3, 3]) @ pose[:3, :3]
+    if in_camera[:, 2].min() <= 0:
+        return 0, camera.height, 0, camera.width
+    k = camera.intrinsics
+    box = []
+    for axis, (f, c, size) in enumerate([(k.fx, k.cx, camera.width), (k.fy, k.cy, camera.height)]):
+        pixels = in_camera[:, axis] / in_camera[:, 2] * f + c
+        low = int(np.clip(np.floor(pixels.min()), 0, size - 1))
+        box.append((low, int(np.clip(np.ceil(pixels.max()) + 1, low + 1, size))))
+    return *box[1], *box[0]
+
+
 @dataclasses.dataclass(frozen=True)
 class Hits:
     """First intersections of rays with surfaces.
@@ -225,51 +255,24 @@ class RayCaster:
                 color[here] = mesh.colors_at(result["primID"].take(here), barycentric)
         return Hits(distance, mesh_index, color)
 
+    def render(self, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> RenderedView:
+        """Render colours and depth from a pose.
 
-def pixel_rays(intrinsics: Intrinsics, height: int, width: int, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rays through the pixels [height * width, 3] float64, object frame, of a camera with this pose [4, 4].
+        Args:
+            pose: [4, 4] camera to object frame, as from `camera_pose`.
+            camera: size and intrinsics of the whole image.
 
-    Their component along the optical axis is 1, so that hit distances are depths.
-    """
-    x, y, z = pose[:3, :3].T
-    columns = ((np.arange(width) - intrinsics.cx) / intrinsics.fx)[:, None] * x
-    rows = ((np.arange(height) - intrinsics.cy) / intrinsics.fy)[:, None] * y
-    return ((rows + z)[:, None] + columns).reshape(-1, 3)
-
-
-def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
-    """Return the range of rows and columns that the vertices can cover (first, end, first, end); never empty."""
-    in_camera = (vertices - pose[:3, 3]) @ pose[:3, :3]
-    if in_camera[:, 2].min() <= 0:
-        return 0, camera.height, 0, camera.width
-    k = camera.intrinsics
-    box = []
-    for axis, (f, c, size) in enumerate([(k.fx, k.cx, camera.width), (k.fy, k.cy, camera.height)]):
-        pixels = in_camera[:, axis] / in_camera[:, 2] * f + c
-        low = int(np.clip(np.floor(pixels.min()), 0, size - 1))
-        box.append((low, int(np.clip(np.ceil(pixels.max()) + 1, low + 1, size))))
-    return *box[1], *box[0]
-
-
-def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> RenderedView:
-    """Render colours and depth from a pose.
-
-    Args:
-        caster: ray-casting index of the object.
-        pose: [4, 4] camera to object frame, as from `camera_pose`.
-        camera: size and intrinsics of the whole image.
-
-    Returns:
-        The part of the image that the object can cover, which saves time: for a mug, it is a twentieth of the image.
-    """
-    top, bottom, left, right = _pixel_box(caster.vertices, pose, camera)
-    k = camera.intrinsics
-    intrinsics = Intrinsics(k.fx, k.fy, k.cx - left, k.cy - top)
-    height, width = bottom - top, right - left
-    hits = caster.cast(pose[:3, 3], pixel_rays(intrinsics, height, width, pose))
-    distance = np.where(hits.mesh >= 0, hits.distance, 0)
-    depth = np.rint(distance.astype(np.float64) * 1000).astype(np.uint16).reshape(height, width)
-    return RenderedView(hits.color.reshape(height, width, 3), depth, intrinsics, pose, (top, left))
+        Returns:
+            The part of the image that the object can cover, which saves time: for a mug, a twentieth of the image.
+        """
+        top, bottom, left, right = _pixel_box(self.vertices, pose, camera)
+        k = camera.intrinsics
+        intrinsics = Intrinsics(k.fx, k.fy, k.cx - left, k.cy - top)
+        height, width = bottom - top, right - left
+        hits = self.cast(pose[:3, 3], pixel_rays(intrinsics, height, width, pose))
+        distance = np.where(hits.mesh >= 0, hits.distance, 0)
+        depth = np.rint(distance.astype(np.float64) * 1000).astype(np.uint16).reshape(height, width)
+        return RenderedView(hits.color.reshape(height, width, 3), depth, intrinsics, pose, (top, left))
 
 
 def axial_deviation(z: Any) -> Any:

@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from thor2_jax import InputError, Intrinsics, RGBDFrame
-from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh, moved
-from training.rendering.camera import (
-    Camera,
-    RayCaster,
-    axial_deviation,
-    camera_pose,
-    depth_edges,
-    pixel_rays,
-    render_view,
-)
+from training.objects.mesh import QUAD_FACES, QUAD_UV, TexturedMesh
+from training.rendering.camera import Camera, RayCaster, axial_deviation, camera_pose, depth_edges, pixel_rays
 
 __all__ = ["SCENE_CAMERA", "Scene", "compose_scene", "compose_views"]
 
@@ -164,7 +156,7 @@ def _arrange(
         in_line = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else ()
         places = itertools.chain(in_line, _anywhere(rng))
         place = next(each for each in places if all(new.apart(other, each) for other in placed))
-        placed.append(_Placed(moved(new.mesh, (*place, 0)), new.corners + place, new.normals))
+        placed.append(_Placed(new.mesh.moved((*place, 0)), new.corners + place, new.normals))
     return [item.mesh for item in placed]
 
 
@@ -305,7 +297,7 @@ def _render(
             labels[labels == label] = 0
             continue
         truth[label] = name
-        visible[label] = pixels / int((render_view(RayCaster([mesh]), pose, camera).depth > 0).sum())
+        visible[label] = pixels / int((RayCaster([mesh]).render(pose, camera).depth > 0).sum())
 
     depth = np.where(hits.mesh >= 0, hits.distance, 0).astype(np.float64).reshape(shape)
     color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)

@@ -13,7 +13,7 @@ from thor2_jax import DescriptorConfig, PointClouds, align, describe_strips, plo
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.plot import PALETTE
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import RayCaster, camera_pose, render_view
+from training.rendering.camera import RayCaster, camera_pose
 
 __all__ = [
     "draw_accuracy",
@@ -35,7 +35,7 @@ def draw_objects(objects: Mapping[str, TexturedMesh], path: str | Path) -> None:
     columns = min(6, len(objects))
     rows = -(-len(objects) // columns)
     figure = Figure(figsize=(1.9 * columns, 2.1 * rows), layout="constrained")
-    views = {name: render_view(RayCaster([mesh]), camera_pose(0.6, 1.1, mesh.centre)) for name, mesh in objects.items()}
+    views = {name: RayCaster([mesh]).render(camera_pose(0.6, 1.1, mesh.centre)) for name, mesh in objects.items()}
     half = max(max(view.depth.shape) for view in views.values()) / 2
     for axes, (name, view) in zip(figure.subplots(rows, columns, squeeze=False).flat, views.items(), strict=False):
         picture = np.where((view.depth > 0)[..., None], view.color, 255).astype(np.uint8)

@@ -25,16 +25,7 @@ from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstanc
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
-from training.rendering.camera import (
-    DISTANCE,
-    TRAINING_CAMERA,
-    RayCaster,
-    RenderedView,
-    camera_pose,
-    random_angles,
-    render_view,
-    view_angles,
-)
+from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose, random_angles, view_angles
 
 if TYPE_CHECKING:  # not needed by rendering processes; the first one imports JAX
     from thor2_jax.types import Cloud
@@ -101,7 +92,7 @@ def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64]) -> "Cloud":
     Raises:
         InputError: the mesh is not visible.
     """
-    xyz, rgb = cloud_of(render_view(RayCaster([mesh]), pose))
+    xyz, rgb = cloud_of(RayCaster([mesh]).render(pose))
     if len(xyz) == 0:
         raise InputError("pose: the mesh is not visible; expected a camera that looks at it, as from camera_pose")
     return xyz, rgb
@@ -133,11 +124,11 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
     caster, centre = RayCaster([task.mesh]), task.mesh.centre
     name = int.from_bytes(hashlib.sha256(task.name.encode(errors="surrogatepass")).digest()[:8], "little")
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
-        yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
+        yield number, 0, caster.render(camera_pose(azimuth, polar, centre))
         if task.augmentations:
             for copy in range(1, 1 + task.augmentations.copies):
                 rng = np.random.default_rng([task.seed, name, number, copy])
-                other = render_view(caster, camera_pose(*random_angles(rng), centre))
+                other = caster.render(camera_pose(*random_angles(rng), centre))
                 yield number, copy, augment(other, task.augmentations, rng)
 
 
@@ -231,16 +222,14 @@ class RenderJob:
         """
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}; it must be at least 0")
-        augmentations, camera, checked = self.augmentations, TRAINING_CAMERA, _checked_meshes(self.meshes, self.angles)
-        # Fields without a value for this camera are left out, as in datasets of version 0.1.0.
-        intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
+        augmentations, checked = self.augmentations, _checked_meshes(self.meshes, self.angles)
         return {
             "descriptor_version": DESCRIPTOR_VERSION,
             "sigma_s": SIGMA_S,
             "voxel": DESCRIPTOR_VOXEL,
             "step": COORDINATE_STEP,
             "min_points": MIN_VIEW_POINTS,
-            "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
+            "camera": TRAINING_CAMERA.record,
             "azimuth_step": float(self.azimuth_step),
             "polar_step": float(self.polar_step),
             "variations": {"seed": self.seed, "cameras": "random", **augmentations.record()} if augmentations else None,

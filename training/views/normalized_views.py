@@ -35,6 +35,7 @@ __all__ = [
     "SourceShard",
     "ViewSource",
     "WithoutClasses",
+    "check_classes",
     "fold_of_views",
     "normalize_views",
     "padded_batches",
@@ -141,6 +142,16 @@ class ViewSource(Protocol):
         Raises:
             InputError: there are no crops, or they are smaller.
         """
+
+
+def check_classes(source: ViewSource) -> None:
+    """Raise InputError if there are fewer than two classes, or a class has no views."""
+    if len(source.classes) < 2:
+        names = ", ".join(source.classes) or "none"
+        raise InputError(f"the objects with views are {names}; expected at least two; add views of another one")
+    for label, name in enumerate(source.classes):
+        if not any(shard.label == label and shard.views for shard in source.shards):
+            raise InputError(f"class {name!r} has no views; render more views or leave it out")
 
 
 def normalize_views(

@@ -16,7 +16,7 @@ from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.masks import Base, Occlusion, Segmentation, _silhouettes
 from training.augmentation.sensing import Illumination, Registration
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose, render_view
+from training.rendering.camera import TRAINING_CAMERA, RayCaster, RenderedView, camera_pose
 from training.views.mesh_views import cloud_of
 
 from .conftest import augmented_view, flat_view, wall
@@ -29,7 +29,7 @@ NO_BLUR: dict[str, Any] = {"blur": (0, 0), "chroma": (0, 0)}
 
 def view_of(name: str = "mug_blue", azimuth: float = 0.6, polar: float = 1.1) -> RenderedView:
     mesh = OBJECTS[name]
-    return render_view(RayCaster([mesh]), camera_pose(azimuth, polar, mesh.centre))
+    return RayCaster([mesh]).render(camera_pose(azimuth, polar, mesh.centre))
 
 
 MUG = view_of()
@@ -90,7 +90,7 @@ def test_all_objects_from_all_sides() -> None:
     for mesh in OBJECTS.values():
         caster = RayCaster([mesh])
         for polar in (0.0, np.pi / 2, 2.5):
-            view = render_view(caster, camera_pose(0.0, polar, mesh.centre))
+            view = caster.render(camera_pose(0.0, polar, mesh.centre))
             shares = [(augment(view, augmentations, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
             # A fifth is visible, half of it in the eroded mask, .6 of that above the base, .8 of that outside of
             # patches, and .7 of the edges have depth.

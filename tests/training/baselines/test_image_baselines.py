@@ -27,7 +27,7 @@ from training.baselines.architectures import (
     pretrained_files,
     tensors,
 )
-from training.baselines.baseline import BaselineInputs, baseline_file, read_baseline
+from training.baselines.baseline import BaselineInputs, StoredBaseline, baseline_file
 from training.baselines.image_baselines import check_backbone, compare
 from training.baselines.job import load_baselines, train_baselines
 from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
@@ -132,7 +132,7 @@ def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     (file,) = pretrained_files(SMALL)
     folder = write_run(tmp_path / "run", folds=1, epochs=1)
     train_baselines(folder, SOURCE, [SMALL], weights=weights)
-    stored = read_baseline(folder / "baselines" / f"{SMALL}.safetensors", NAMES)
+    stored = StoredBaseline.read(folder / "baselines" / f"{SMALL}.safetensors", NAMES)
     assert list(stored.weights) == [f"{file}.safetensors"] and stored.temperature is None
     given = load_file(weights / f"{file}.safetensors")["blocks.0.mlp.fc1.weight"].T
     moved = stored.arrays["color/blocks/0/mlp/fc1/kernel"] - given

@@ -17,14 +17,7 @@ from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.types import Cloud
 from training.baselines import job, thor
-from training.baselines.baseline import (
-    FitTask,
-    StoredBaseline,
-    baseline_file,
-    baseline_inputs,
-    read_baseline,
-    write_baseline,
-)
+from training.baselines.baseline import BaselineInputs, FitTask, StoredBaseline, baseline_file
 from training.baselines.cloud_baselines import load_forest
 from training.baselines.job import CLOUD_BASELINES, check_baselines, load_baselines, train_baselines
 from training.evaluation.runs import load_runs
@@ -78,7 +71,7 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
     assert set(run.temperatures) == {"tops", *names} and run.temperatures["tops"] == 1.5
     packed = thor2.PointClouds.pack([cloud for each in clouds(5, 4).values() for cloud in each])
     described: Any = SimpleNamespace(packed=packed, descriptors=describe(packed, colornet.load_default(), CONFIG))
-    inputs = baseline_inputs(described, CONFIG, None)
+    inputs = BaselineInputs.of_frame(described, CONFIG, None)
     for name, baseline in run.baselines.items():
         probabilities = baseline.predict(inputs)
         np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
@@ -127,10 +120,10 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path, refused: C
 
 def test_damaged_and_foreign_files_are_refused(trained: Path, tmp_path: Path) -> None:
     folder, whole = write_run(tmp_path / "run"), baseline_file(trained, "forest")
-    file, content, stored = baseline_file(folder, "forest"), whole.read_bytes(), read_baseline(whole, NAMES)
+    file, content, stored = baseline_file(folder, "forest"), whole.read_bytes(), StoredBaseline.read(whole, NAMES)
     for write, message in (
-        (lambda: write_baseline(file, stored, ("a", "b"), 1.0), r"cannot be read \(it has other classes"),
-        (lambda: write_baseline(file, StoredBaseline({}, None), NAMES, 1.0), "does not match its run"),
+        (lambda: stored.write(file, ("a", "b"), 1.0), r"cannot be read \(it has other classes"),
+        (lambda: StoredBaseline({}, None).write(file, NAMES, 1.0), "does not match its run"),
         (lambda: file.write_bytes(content[:-9]), "cannot be read"),
         (lambda: file.write_bytes(content[:-1] + bytes([content[-1] ^ 1])), "cannot be read"),
     ):

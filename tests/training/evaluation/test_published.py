@@ -10,7 +10,7 @@ import pytest
 from toy_recognizers import ToyRun
 
 from training.evaluation import published
-from training.evaluation.page import comparison_table, comparison_title, marked
+from training.evaluation.page import comparison, marked
 from training.evaluation.published import compare_with_published, published_tables
 from training.readers.uwis import NOT_SCORED
 
@@ -76,15 +76,16 @@ def test_comparison_table_pairs_columns_and_prints_percent() -> None:
     correct = {"THOR2": [np.ones(8, bool), np.arange(8) < 7], "THOR": [np.zeros(8, bool)] * 2}
     tables = compare_with_published("uwis", *OWN, [attributes] * 8, ["a"] * 8, correct)
     (light,) = (table for table in tables if table["number"] == 6)
-    assert comparison_title(light).startswith("Published table 6: ") and "assumed" in " ".join(light["notes"])
-    header, (row,) = marked(comparison_table(light, "THOR2"), "THOR2")
+    title, text, table = comparison(light, "THOR2")
+    assert title.startswith("Published table 6: ") and "assumed" in text
+    header, (row,) = marked(table, "THOR2")
     assert row[:2] == ["lounge, dim", "8"] and len(header) == 9
     assert list(zip(header, row, strict=True))[5:] == [
         ("THOR", "0.00 ±\u00a00.00"), ("THOR, published", "57.64 ±\u00a00.39"),
         ("THOR2 (thor2 recognize)", "93.75 ±\u00a08.84"), ("THOR2, published", "63.95 ±\u00a00.51"),
     ]  # fmt: skip
-    assert comparison_table(light, "gallery")[0][2] == "gallery"
-    assert comparison_table(light, "gallery")[1][0][2] == "–"
+    header, (row,) = comparison(light, "gallery")[2]
+    assert header[2] == "gallery" and row[2] == "–"
 
 
 def test_networks_stand_beside_their_published_figures() -> None:

@@ -11,7 +11,7 @@ from training.evaluation.answers import (
     EMBEDDED,
     FrameAnswers,
     InstancePrediction,
-    fuse_by,
+    Predictions,
     fusions,
     main_fusion,
 )
@@ -81,11 +81,11 @@ def test_the_page_says_which_column_gives_the_names(columns: tuple[str, ...], sh
 
 def test_calibrated_and_unfused_columns_match_hand_calculation() -> None:
     """Scores of the gallery are not normalized. A temperature of 4 turns 0.9 into 0.634, which is less than 0.8."""
-    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])}, {})
+    index, confidence = Predictions.fused("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])}, {})
     assert list(index) == [0, 1] and list(confidence) == [0.2, 0.7]
     both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
     for rule, expected in (("max", (0, 0.9)), ("calibrated", (1, 0.8))):
-        index, confidence = fuse_by(rule, both, {"tops": 4.0, "tops2": 1.0})
+        index, confidence = Predictions.fused(rule, both, {"tops": 4.0, "tops2": 1.0})
         assert (index[0], confidence[0]) == pytest.approx(expected)
 
 

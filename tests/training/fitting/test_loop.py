@@ -13,8 +13,9 @@ from failures import small_disk
 from refusals import assert_refused
 
 from colornet import files
-from training.fitting.loop import Checkpoints, find_run_directories
+from training.fitting.loop import Checkpoints
 from training.storage.jobs import load_arrays, save_arrays
+from training.train_run import find_run_directories
 
 
 def state(seed: int, size: int = 100) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from small_clouds import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
-from training.fitting.samples import PAPER_MIRRORS, Form, describe_batch, sample_views
+from training.fitting.samples import Form, describe_batch, sample_views
+from training.protocol import PAPER
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
 NETWORK = colornet.load_default()
@@ -28,7 +29,7 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
     monkeypatch.setattr("training.views.normalized_views.CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     progress: list[tuple[int, ...]] = []
-    samples, kept = sample_views(source, NETWORK, config, Form(PAPER_MIRRORS), progress=lambda *n: progress.append(n))
+    samples, kept = sample_views(source, NETWORK, config, Form(PAPER.mirrors), progress=lambda *n: progress.append(n))
     assert kept == []
     assert progress == [(3, 4), (4, 4)]
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
@@ -45,7 +46,7 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))
             normal = thor2.PointClouds.pack([cloud])
-            for row, axes in zip(rows, PAPER_MIRRORS, strict=True):
+            for row, axes in zip(rows, PAPER.mirrors, strict=True):
                 aligned = thor2.turn(thor2.mirror(normal, axes), config)
                 expected = thor2.describe_aligned(aligned, NETWORK, config)
                 # Relaxed strips are sums of many small numbers, whose order depends on the batch.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.objects.procedural import _FAMILIES, SIZES, procedural_object
-from training.rendering.camera import RayCaster, camera_pose, render_view
+from training.rendering.camera import RayCaster, camera_pose
 
 OBJECTS = [procedural_object(seed) for seed in range(60)]
 
@@ -23,7 +23,7 @@ def test_every_family_is_visible_from_all_sides(family) -> None:
     for seed in range(5):
         mesh = family(np.random.default_rng(seed), lambda part: texture)
         for polar in (0.1, 1.5, 3.0):
-            view = render_view(RayCaster([mesh]), camera_pose(0.3, polar, mesh.centre))
+            view = RayCaster([mesh]).render(camera_pose(0.3, polar, mesh.centre))
             assert (view.depth > 0).sum() > 20 and (view.color[view.depth > 0] == 90).all()
 
 

@@ -10,7 +10,7 @@ from rendered_objects import full_image
 from segmentation_scenes import surface
 
 from thor2_jax.frames.frames import Intrinsics
-from training.rendering.camera import DISTANCE, Camera, RayCaster, camera_pose, pixel_rays, render_view, view_angles
+from training.rendering.camera import DISTANCE, Camera, RayCaster, camera_pose, pixel_rays, view_angles
 
 CAMERA = Camera.from_field_of_view(161, 121, 30.0)
 RED = (200, 30, 40)
@@ -67,7 +67,7 @@ def test_matches_another_intersector_and_crops_nothing_visible(azimuth: float, p
     shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
     shape.apply_translation([0.02, -0.01, 0.03])
     pose = camera_pose(azimuth, polar, np.array([0.0, 0.01, 0.05]), distance)
-    view = render_view(RayCaster([surface(shape, RED)]), pose, camera)
+    view = RayCaster([surface(shape, RED)]).render(pose, camera)
     assert (view.depth.size < camera.width * camera.height / 2) == (distance > 0.1)
     _, depth = full_image(view, camera)
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
@@ -79,8 +79,8 @@ def test_matches_another_intersector_and_crops_nothing_visible(azimuth: float, p
 def test_objects_outside_the_image_and_cameras_inside_an_object() -> None:
     mesh = surface(trimesh.creation.box([0.1] * 3), RED)
     for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):
-        view = render_view(RayCaster([mesh]), camera_pose(0.0, 1.5, np.array(centre)), CAMERA)
+        view = RayCaster([mesh]).render(camera_pose(0.0, 1.5, np.array(centre)), CAMERA)
         assert not view.depth.any() and not view.color.any()
-    view = render_view(RayCaster([surface(trimesh.creation.box([1.0] * 3), RED)]), np.eye(4), CAMERA)
+    view = RayCaster([surface(trimesh.creation.box([1.0] * 3), RED)]).render(np.eye(4), CAMERA)
     assert view.depth.shape == (CAMERA.height, CAMERA.width) and set(np.unique(view.depth)) == {500}
     assert view.corner == (0, 0) and view.intrinsics == CAMERA.intrinsics

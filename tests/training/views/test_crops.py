@@ -16,7 +16,7 @@ from written_files import files_of
 import thor2_jax as thor2
 from training.objects.meshes import find_meshes, load_mesh
 from training.protocol import DEFAULT
-from training.rendering.camera import RayCaster, camera_pose, render_view, view_angles
+from training.rendering.camera import RayCaster, camera_pose, view_angles
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, rgbd_crop, surface_normals
 from training.views.dataset import ViewDataset, render_crops, render_dataset
@@ -140,7 +140,7 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
     assert len(views) == len(crops) and (views.copy == 1).sum() == (views.copy == 0).sum() > 0
     for row in np.flatnonzero(views.copy == 0):
         azimuth, polar = view_angles(180, 90)[views.view[row]]
-        view = render_view(RayCaster([mesh]), camera_pose(azimuth, polar, mesh.centre))
+        view = RayCaster([mesh]).render(camera_pose(azimuth, polar, mesh.centre))
         color, normals = rgbd_crop(view.frame, 1, SIZE)
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
