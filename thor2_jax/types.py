@@ -153,7 +153,7 @@ def _padded_size(sizes: list[int], capacity: int | None) -> int:
 
 def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
     given = as_array(camera, "camera", f"[3] or [{n_clouds}, 3]")
-    with decoding(f"camera is {given.tolist()}", f"numbers, [3] or [{n_clouds}, 3]"):
+    with decoding("camera is not numeric", f"numbers, [3] or [{n_clouds}, 3]"):
         position = _as_float32(given.astype(np.float64))
     if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
         raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{n_clouds}, 3]")

@@ -167,7 +167,7 @@ FEW = 10
 
 
 _CHANGE = threading.Lock()
-"""Held during changes and reads into memory, so that no thread loses the change of another one, as that on disk is.
+"""Held while a thread changes the gallery in memory or reads it again, so that it loses no change of another thread.
 
 An attribute could not be pickled."""
 

@@ -50,7 +50,10 @@ class Camera:
 
     @property
     def record(self) -> dict[str, Any]:
-        """The camera in JSON types; fields of the intrinsics without a value are left out, as in version 0.1.0."""
+        """The camera and the distance of training views, in JSON types.
+
+        Fields of the intrinsics without a value are left out, as in version 0.1.0.
+        """
         intrinsics = {name: value for name, value in dataclasses.asdict(self.intrinsics).items() if value}
         return {"width": self.width, "height": self.height, "intrinsics": intrinsics, "distance": DISTANCE}
 
