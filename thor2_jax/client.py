@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, as_array
+from thor2_jax.files import as_path
 from thor2_jax.frames.frames import encode_image
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.model.recognition import Recognition
@@ -328,7 +329,7 @@ def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, i
 def _read(name: str, file: File) -> bytes:
     if not isinstance(file, File):
         raise InputError(f"{name} is of type {type(file).__name__}; expected a path, or the content of a file as bytes")
-    return file if isinstance(file, bytes) else Path(file).read_bytes()
+    return file if isinstance(file, bytes) else as_path(file, name).read_bytes()
 
 
 def _encode_labels(labels: NDArray[Any]) -> bytes:

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from colornet import ColorNetwork
 from colornet.draw import plot_network
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, as_array
 from thor2_jax.figures import name_style, plain_text
 from thor2_jax.types import Diagrams, check_types
 
@@ -60,19 +60,19 @@ def attribution_colors(values: ArrayLike) -> ScalarMappable:
     Returns:
         A mappable: `to_rgba(values)` gives colours, and `figure.colorbar` accepts it.
     """
-    magnitudes = np.abs(np.asarray(values, float)).ravel()
+    magnitudes = np.abs(_as_numbers("values", values).astype(float)).ravel()
     end = float(np.percentile(magnitudes, 98)) if len(magnitudes) else 0.0
     end = end or float(magnitudes.max(initial=0)) or 1.0
     return ScalarMappable(Normalize(-end, end), _DIVERGING)
 
 
 def _as_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
-    """Return an array of real numbers; texts, rows of different lengths and other objects raise InputError."""
+    """Return an array of real numbers; texts, rows of different lengths, masked values and others raise InputError."""
     try:
         np.asarray(values, float)
     except (TypeError, ValueError):
         raise InputError(f"{name} is {reprlib.repr(values)}; expected an array of numbers") from None
-    return np.asarray(values)
+    return as_array(values, name, "an array of numbers")
 
 
 def _check_points(points: ArrayLike, colors: ArrayLike) -> tuple[NDArray[Any], NDArray[np.float64]]:
@@ -302,8 +302,8 @@ def color_matrix(
         InputError: the matrix has another shape, or the network lacks a region.
     """
     color = _check_matrix(matrix, network)
-    rows = np.flatnonzero(color.any(axis=0)) if regions is None else np.asarray(regions, int)
-    if not ((rows >= 0) & (rows < network.n_regions)).all():
+    rows = np.flatnonzero(color.any(axis=0)) if regions is None else _as_numbers("regions", regions).astype(int)
+    if rows.ndim != 1 or not ((rows >= 0) & (rows < network.n_regions)).all():
         raise InputError(f"regions is {rows.tolist()}; expected numbers from 0 to {network.n_regions - 1}")
     top = (float(color.max(initial=0)) if largest is None else largest) or 1.0
     cells = np.zeros((len(rows), len(color), 4))

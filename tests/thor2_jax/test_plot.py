@@ -99,7 +99,7 @@ def test_color_matrix_has_mean_colors(ax) -> None:
     assert (np.delete(cells[..., 3], 3, axis=1) == 0).all()
     assert [label.get_text() for label in ax.get_yticklabels()] == ["4", "7"]
     assert_refused("matrix", plot.color_matrix, ax, matrix.T, NETWORK)
-    for region in (-1, NETWORK.n_regions):
+    for region in (-1, NETWORK.n_regions, [1], "1st"):
         assert_refused("regions is", plot.color_matrix, ax, matrix, NETWORK, regions=[region])
 
 
@@ -145,7 +145,9 @@ def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
     assert_refused(r"points is \[300, 2\]", plot.cloud, ax, POINTS[:, :2], COLORS)
     assert_refused(r"colors is \[2, 3\]; expected \[300, 3\]", plot.cloud, ax, POINTS, COLORS[:2])
     assert_refused("points is .*numbers", plot.cloud, ax, [[1.0, 2.0, 3.0], [1.0]], COLORS[:2])
+    assert_refused("points is .*masked", plot.cloud, ax, np.ma.masked_less(POINTS, 0.1), COLORS)
     assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
+    assert_refused("values is .*numbers", plot.attribution_colors, ["red"])
     assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)
     assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CONFIG)
     assert_refused("config is a ColorNetwork", plot.persistence_image, ax, np.zeros((32, 32)), NETWORK)

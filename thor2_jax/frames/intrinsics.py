@@ -236,7 +236,7 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
         )
     if not intrinsics.distortion:
         return
-    row, column = np.mgrid[0:height, 0:width][:, :: max(height // 16, 1), :: max(width // 16, 1)].reshape(2, -1)
+    row, column = np.meshgrid(np.linspace(0, height - 1, 17), np.linspace(0, width - 1, 17))
     x, y = (column - intrinsics.cx) / intrinsics.fx, (row - intrinsics.cy) / intrinsics.fy
     with np.errstate(all="ignore"):
         again_x, again_y = distort(*undistort(x, y, intrinsics.distortion), intrinsics.distortion)
@@ -250,7 +250,7 @@ def check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
 
 def _is_given(coefficients: Any) -> bool:
     """Return whether there are coefficients of which one is not 0."""
-    return bool(np.any(np.asarray(coefficients, dtype=object)))
+    return bool(np.any(as_array(coefficients, "intrinsics.distortion", "coefficients", object)))
 
 
 def _distortion(values: Mapping[Any, Any]) -> Any:
@@ -283,7 +283,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
     if "cam_K" in values:
         return values["cam_K"], _units_per_metre(scale, 1000, math.inf, "a positive number")
     if "intrinsic_matrix" in values:
-        matrix = np.asarray(values["intrinsic_matrix"], dtype=object).ravel()
+        matrix = as_array(values["intrinsic_matrix"], "intrinsics.intrinsic_matrix", dtype=object).ravel()
         if matrix.size != 9 or any(matrix[[2, 5]]):  # with cx and cy there, it is given row by row
             raise InputError(
                 f"intrinsics.intrinsic_matrix is {str(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, 0, "

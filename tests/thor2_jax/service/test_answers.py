@@ -166,6 +166,7 @@ def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     for token in ("", "é", "secret\n"):
         assert_refused("token", Client, url, token)
     assert_refused("clouds", Client(url).describe, [])
+    assert_refused("color is 'a.x00b'", Client(url).recognize, color="a\0b", depth=b"", intrinsics=b"")
     for labels in (np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)):
         assert_refused(
             r"labels has .* from 0 to 65535", Client(url).recognize, color=b"", depth=b"", labels=labels, intrinsics=b""
