@@ -55,30 +55,27 @@ class ReaderProcess:
     seconds, memory = HANG, 2**30
 
     def __init__(self) -> None:
-        self.pool: Any = None
+        self.start()
+
+    def start(self) -> None:
+        # A forked process could deadlock on the locks of the threads of JAX.
+        self.pool = multiprocessing.get_context("spawn").Pool(1, signal.signal, (signal.SIGINT, signal.SIG_IGN))
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        if self.pool is None:  # a forked process could deadlock on the locks of the threads of JAX
-            self.pool = multiprocessing.get_context("spawn").Pool(1, signal.signal, (signal.SIGINT, signal.SIG_IGN))
         try:
             return self.pool.apply_async(call_pickled, (cloudpickle.dumps((function, arguments)),)).get(self.seconds)
         except multiprocessing.TimeoutError:
             self.pool.terminate()
-            self.pool = None
+            self.start()
             raise AssertionError(f"the reader crashed, or has not returned after {self.seconds} s") from None
-
-    def close(self) -> None:
-        """Let the process end by itself, which writes its coverage."""
-        if self.pool is not None:
-            self.pool.close()
-            self.pool.join()
 
 
 @pytest.fixture(scope="session")
 def reader_process() -> Iterator[ReaderProcess]:
     process = ReaderProcess()
     yield process
-    process.close()
+    process.pool.close()  # The process ends by itself, which writes its coverage.
+    process.pool.join()
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.printable import find_name
+from thor2_jax.processes import ended_by_signals
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, explained_frame, instance_answer, object_answers
 from thor2_jax.service.decoding import read_body, read_form
@@ -33,7 +34,6 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.signals import ended_by_signals
 
 __all__ = ["create_app"]
 

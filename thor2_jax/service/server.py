@@ -19,11 +19,11 @@ from uvicorn.config import LOGGING_CONFIG
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
 
+from thor2_jax.processes import end_with_parent, ended_by_signals, signals_blocked
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.hosts import listening, page_headers
 from thor2_jax.service.settings import Settings
-from thor2_jax.signals import end_with_parent, ended_by_signals, signals_blocked
 
 __all__ = ["TimedConnection", "serve"]
 

@@ -59,7 +59,7 @@ def serve(
     ] = None,
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
-    from thor2_jax.signals import ended_by_signals
+    from thor2_jax.processes import ended_by_signals
 
     with ended_by_signals():
         with needs_extra("serve", "FastAPI and uvicorn", "serve"):
