@@ -62,10 +62,6 @@ def write_answers(path: Path) -> None:
         file.append(FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, instances))
 
 
-def write_mug_baseline(path: Path) -> None:
-    BASELINE.write(path, ["mug"], 2.0)
-
-
 def is_image(image: np.ndarray) -> bool:
     return image.ndim in (2, 3) and image.dtype.kind in "uf" and image.size > 0
 
@@ -114,7 +110,7 @@ READERS: dict[str, tuple[bytes, Callable[[Path], Any], Callable[[Any], bool]]] =
     "answers.jsonl": (written(write_answers), lambda path: AnswerFile(path, EVALUATION), are_answers),
     "metrics.jsonl": ("".join(json.dumps(row) + "\n" for row in ROWS).encode(), read_metrics, are_metrics),
     "baseline.safetensors": (
-        written(write_mug_baseline),
+        written(lambda path: BASELINE.write(path, ["mug"], 2.0)),
         lambda path: StoredBaseline.read(path, ["mug"]),
         is_the_baseline,
     ),

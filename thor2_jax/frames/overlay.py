@@ -6,7 +6,6 @@ draw_overlay(frame, recognizer.recognize(frame), "overlay.png")
 from __future__ import annotations
 
 import functools
-import importlib.util
 import itertools
 import math
 from collections.abc import Sequence
@@ -191,12 +190,13 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]
 
 
 @functools.lru_cache(maxsize=32)
-def _font(size: int, wide: bool = False) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def _font(size: int, wide: bool) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return Pillow's font or, with `wide`, matplotlib's font, which has many more characters."""
-    matplotlib = importlib.util.find_spec("matplotlib") if wide else None
-    if matplotlib is None or matplotlib.origin is None:
+    if not wide:
         return ImageFont.load_default(size)
-    return ImageFont.truetype(Path(matplotlib.origin).with_name("mpl-data") / "fonts" / "ttf" / "DejaVuSans.ttf", size)
+    import matplotlib  # importing it takes a tenth of a second
+
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
 
 
 @functools.lru_cache(maxsize=4096)

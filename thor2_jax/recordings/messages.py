@@ -78,7 +78,7 @@ def camera_of(message: Any, color_topic: str) -> Intrinsics:
     """
     projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
     if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
-        return Intrinsics.of({"K": projection.reshape(3, 4)[:, :3], "width": message.width, "height": message.height})
+        return Intrinsics.of_matrix(projection.reshape(3, 4)[:, :3], width=message.width, height=message.height)
     return Intrinsics.of(message)
 
 

@@ -65,8 +65,7 @@ def test_arrays_in_npy(tmp_path: Path, written: np.ndarray, expected: np.ndarray
 )
 def test_floats_in_exr(tmp_path: Path, channels: dict[str, np.ndarray]) -> None:
     write_exr(tmp_path / "d.exr", **channels)
-    expected = METRES.astype(np.float16) if "V" in channels else METRES
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), expected)
+    assert_depth(tmp_path / "d.exr", METRES.astype(np.float16) if "V" in channels else METRES)
 
 
 def test_invalid_exr_files(tmp_path: Path) -> None:
