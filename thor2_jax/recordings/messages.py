@@ -154,7 +154,7 @@ def _compressed_depth(content: bytes, described: str) -> NDArray[Any]:
         return depth
     # compressed_depth_image_transport quantizes inverse depth: depth = scale / (value - offset).
     _, scale, offset = _DEPTH_HEADER.unpack_from(content)
-    with np.errstate(divide="ignore"):
+    with np.errstate(all="ignore"):
         return np.where(depth > 0, scale / (depth - np.float32(offset)), 0).astype(np.float32)
 
 

@@ -132,9 +132,7 @@ def assert_within(
     assert (off <= bound).all(), f"{name}: off by {off.max():.3g}; expected at most {np.max(bound):.3g}"
 
 
-def assert_near(
-    actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None = 0.0
-) -> None:
+def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
     """Assert that descriptors are equal up to rounding, if each aligned point moved by at most `drift` in its strip.
 
     Births and counts are then equal, and each persistence changes by at most 2 `drift`. The change of an image, summed

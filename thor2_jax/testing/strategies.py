@@ -8,7 +8,6 @@ number of points and the kind of the cloud.
 >>> batches = packed(camera_clouds(kinds=("balls", "thin")), size=4, capacity=512)
 """
 
-import functools
 import math
 from collections.abc import Sequence
 
@@ -197,8 +196,8 @@ def aligned_clouds(
         margin: the margin of `settled`.
         reach: longest side as a fraction of the extent of the descriptor; above 1, some clouds overflow.
     """
-    make = functools.partial(_aligned_cloud, config=config, margin=margin, reach=reach)
-    return st.builds(make, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
+    fixed = st.just(config), st.just(margin), st.just(reach)
+    return st.builds(_aligned_cloud, seeds(), st.sampled_from(kinds), st.integers(0, max_points), *fixed)
 
 
 def _decided_cloud(seed: int, n_body: int, config: DescriptorConfig) -> Cloud:
@@ -259,8 +258,7 @@ def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.Search
         raise ValueError(
             f"alpha is {config.alpha}, max_points {max_points}; expected pi/4 and at least {17 * BODY_COPIES}"
         )
-    make = functools.partial(_decided_cloud, config=config)
-    return st.builds(make, seeds(), st.integers(16, max_points // BODY_COPIES - 1))
+    return st.builds(_decided_cloud, seeds(), st.integers(16, max_points // BODY_COPIES - 1), st.just(config))
 
 
 def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.SearchStrategy[PointClouds]:

@@ -74,6 +74,8 @@ def test_compressed_float_depth() -> None:
     read = depth_image(compressed(content, "32FC1; compressedDepth png"))
     assert read[0, 0] == 0
     np.testing.assert_allclose(read.ravel()[1:], metres.ravel()[1:], rtol=2e-4)
+    damaged = struct.pack("<iff", 0, 3e38, 99.5) + encode_image(np.full((1, 1), 100, np.uint16), "PNG")
+    assert np.isinf(depth_image(compressed(damaged, "32FC1; compressedDepth png")))
 
 
 @pytest.mark.parametrize(
