@@ -171,6 +171,7 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": "none"}', "distortion is 'none'"),
         ('{"K": 0, "D": [0.1, 0], "distortion_model": "equidistant"}', "the distortion model equidistant; expected"),
         ('{"ppx": 3, "ppy": 2, "fx": 5, "fy": 5, "model": "a.inverse_brown", "coeffs": [1]}', "model a.inverse_brown"),
+        (json.dumps({"a\nb": 1}), "has a b; expected"),
         ("{}", "has no entry"),
         ('{"fx": 5e-324, "fy": 5, "cx": 3, "cy": 2}', "intrinsics.fx is 5e-324"),
         ("x" * 100_000, "100000 bytes"),

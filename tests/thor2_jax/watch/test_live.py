@@ -2,7 +2,6 @@
 
 import base64
 import dataclasses
-import functools
 import io
 import json
 import threading
@@ -83,11 +82,10 @@ def latest(broadcast: Broadcast) -> dict[str, Any]:
 
 def test_messages_of_a_view() -> None:
     broadcast = Broadcast()
-    message = functools.partial(latest, broadcast)
     view = LiveView(recognize, segment_table, broadcast)
-    assert message()["state"] == "waiting" and "image" not in message()
+    assert latest(broadcast)["state"] == "waiting" and "image" not in latest(broadcast)
     view.show(recorded(1))
-    one = message()
+    one = latest(broadcast)
     assert (one["state"], one["number"], one["frame"], one["fps"], one["error"]) == ("live", 1, "1.000", None, None)
     assert [(o["label"], o["name"], o["track"]) for o in one["objects"]] == [(1, "<b>mug</b>", None), (2, None, None)]
     assert one["objects"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
@@ -97,13 +95,14 @@ def test_messages_of_a_view() -> None:
         near = picture[115, column - 3 : column + 4].astype(int) - list(bytes.fromhex(shown["color"][1:]))
         assert np.abs(near).sum(axis=1).min() < 180  # without a line, at least 260
     view.show(recorded(2, fail))
-    failed = message()
+    failed = latest(broadcast)
     assert failed["error"] == "depth is missing" and failed["objects"] == [] and failed["number"] == 1
     assert failed["image"] == one["image"] and failed["fps"] > 0
     view.show(recorded(3, fail))
     assert view.first_error == "2.000: depth is missing"
     view.publish_state("ended", "no more")
-    assert message()["state"] == "ended" and message()["message"] == "no more" and "image" in message()
+    ended = latest(broadcast)
+    assert ended["state"] == "ended" and ended["message"] == "no more" and "image" in ended
 
 
 def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
