@@ -317,8 +317,7 @@ class Gallery:
     @functools.cached_property
     def has_output(self) -> NDArray[np.bool_]:
         """[n] bool, whether the classifiers have an output for each of `answered_names`."""
-        outputs = set(self._outputs)
-        return np.array([name in outputs for name in self.answered_names], bool)
+        return np.array([self._is_answered_class(name) for name in self.answered_names], bool)
 
     @functools.cached_property
     def summary(self) -> str:

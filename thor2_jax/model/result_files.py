@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as coco_mask  # type: ignore[import-untyped]
 
 from thor2_jax.errors import InputError
@@ -99,11 +98,6 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
     }
 
 
-def _encoded(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    encoded = coco_mask.encode(np.asfortranarray(mask, np.uint8))
-    return {**encoded, "counts": encoded["counts"].decode("ascii")}
-
-
 class ResultTables:
     """The COCO and BOP results of all frames, filled frame by frame and written at the end.
 
@@ -148,6 +142,7 @@ class ResultTables:
             if category is None:
                 self.n_without_number += 1
                 continue
+            mask = coco_mask.encode(np.asfortranarray(frame.label_image == answer.label, np.uint8))
             self._coco.append(
                 {
                     # COCO has no scenes: images of several scenes are counted from 1.
@@ -155,7 +150,7 @@ class ResultTables:
                     "category_id": category,
                     "bbox": list(detection.box),
                     "score": answer.confidence,
-                    "segmentation": _encoded(frame.label_image == answer.label),
+                    "segmentation": {**mask, "counts": mask["counts"].decode("ascii")},
                     "frame": name,
                     "category_name": answer.name,
                 }
