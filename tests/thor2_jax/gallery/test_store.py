@@ -17,9 +17,8 @@ import safetensors.numpy
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
-from written_files import files_of
+from written_files import files_of, killed
 
-from thor2_jax.files import temporary_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
@@ -111,9 +110,8 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     before, stamp = files_of(directory), gallery_stamp(directory)
     update_gallery(directory, add("new", 5), FINGERPRINT)
     assert gallery_stamp(directory) != stamp
-    for folder in (directory, directory / "objects"):  # what a killed process leaves
-        with temporary_directory(folder) as temporary:
-            shutil.copytree(temporary, folder / ".thor2-killed")
+    for folder in (directory, directory / "objects"):
+        killed(folder)
     update_gallery(directory, lambda gallery: gallery.without("new"), FINGERPRINT)
     update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
     after = files_of(directory)
