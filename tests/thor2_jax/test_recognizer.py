@@ -33,12 +33,11 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 
 CLASSES = ("a", "b", "c", "d")
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    return untrained_run(CLASSES, config=CONFIG)
+    return untrained_run(CLASSES, config=thor2.DescriptorConfig(homology="closed_form"))
 
 
 @pytest.fixture(scope="module")

@@ -261,7 +261,7 @@ class OnlineAdaptation:
         self._recent.extend(usable)
         self._new += len(usable)
         is_busy = self._thread is not None and self._thread.is_alive()
-        if is_busy or self._new < EVERY or len(self._recent) < MIN_INSTANCES:
+        if is_busy or self._new < EVERY:
             return
         self._new = 0
         self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)

@@ -86,16 +86,16 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
     Args:
         classes: names of the objects.
         names: number -> name; other classes get no number. By default `obj_000012` has the number 12 if all classes
-            have such names, and otherwise the classes are counted from 1.
+            have such names with different numbers, and otherwise the classes are counted from 1.
     """
     if names is not None:
         numbers = {name: number for number, name in names.items()}
         return {name: numbers[name] for name in classes if name in numbers}
-    matches = [re.fullmatch(r"obj_(\d+)", name) for name in classes]
-    return {
-        name: int(match[1]) if match and all(matches) else position
-        for position, (name, match) in enumerate(zip(classes, matches, strict=True), start=1)
-    }
+    matches = (re.fullmatch(r"obj_(\d+)", name) for name in classes)
+    numbers = [int(match[1]) for match in matches if match]
+    if len(set(numbers)) < len(classes):
+        numbers = list(range(1, len(classes) + 1))
+    return dict(zip(classes, numbers, strict=True))
 
 
 class ResultTables:

@@ -216,7 +216,7 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
         for name in names:
             (directory / name).unlink(missing_ok=True)
         assert_unusable(f"{directory}.*thor2 objects --reembed", directory)
-        rebuilt = update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT), rebuild=True)
+        rebuilt = update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT))
         assert rebuilt.generation == {1: expected.generation + 1, 2: 1}[len(names)]
         if len(names) == 1:  # Without the former index, the two files of the mug are equally old.
             assert object_files(rebuilt) == object_files(expected)
@@ -242,7 +242,7 @@ def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> No
     assert changed.without("unknown").names == ("mug ",)
     for name in ("index.json", "previous.json"):
         (directory / name).unlink()
-    names = update_gallery(directory, lambda gallery: gallery, rebuild=True).names
+    names = update_gallery(directory, lambda gallery: gallery).names
     assert "mug " in names and sum(name.startswith("object-") for name in names) == 2
 
 

@@ -8,13 +8,12 @@ from scipy.stats import entropy
 from thor2_jax.tracking.viewpoints import ViewTable, next_view
 from training.rendering.camera import camera_pose
 
-AZIMUTHS = np.arange(8) * np.pi / 4
 CENTRE = np.array([0.3, -0.2, 0.1])
 
 
 def poses(centre: np.ndarray = CENTRE, start: float = 0.0) -> list[np.ndarray]:
     """Return cameras around a point, from the side."""
-    return [camera_pose(start + azimuth, np.pi / 2, centre, 0.8) for azimuth in AZIMUTHS]
+    return [camera_pose(start + azimuth, np.pi / 2, centre, 0.8) for azimuth in np.arange(8) * np.pi / 4]
 
 
 def table(front: np.ndarray) -> ViewTable:
