@@ -20,8 +20,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
 from thor2_jax.files import (
     atomic_write,
@@ -194,7 +192,7 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 
 
 def _object_content(name: str, views: GalleryObject) -> bytes:
-    arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
+    arrays = {"embeddings": views.embeddings, **vars(views.clouds)}
     if views.surface is not None:
         arrays |= {SURFACE + field: array for field, array in views.surface.items()}
     return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
@@ -271,8 +269,10 @@ def update_gallery(
             changed = dataclasses.replace(changed, objects=objects)
             write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
-            for path in reversed(written):
-                path.unlink(missing_ok=True)
+            index = _read_index(directory / INDEX_FILE)
+            if index is None or index["generation"] < changed.generation:  # Otherwise the index names the files.
+                for path in reversed(written):
+                    path.unlink(missing_ok=True)
             raise
         # The change is complete. If this write fails, or if previous.json is another file, it only cannot be undone.
         with contextlib.suppress(OSError, GalleryError):

@@ -177,6 +177,14 @@ def test_a_failed_change_leaves_the_gallery_as_it_was(
     assert files_of(directory) == before
 
 
+def test_a_change_that_is_interrupted_at_its_end_is_complete(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_text = store.write_text
+    monkeypatch.setattr(store, "write_text", lambda *given: [write_text(*given), signal.raise_signal(signal.SIGINT)])
+    with pytest.raises(KeyboardInterrupt):
+        update_gallery(directory, add("new", 5), FINGERPRINT)
+    assert load_gallery(directory, FINGERPRINT).names == ("mug", "bowl", "new")
+
+
 def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
     assert_unusable("embedding ffffffff.*00000000", directory, "0" * 64)
 
