@@ -89,8 +89,8 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
             have such names with different numbers, and otherwise the classes are counted from 1.
     """
     if names is not None:
-        numbers = {name: number for number, name in names.items()}
-        return {name: numbers[name] for name in classes if name in numbers}
+        number_of = {name: number for number, name in names.items()}
+        return {name: number_of[name] for name in classes if name in number_of}
     matches = (re.fullmatch(r"obj_(\d+)", name) for name in classes)
     numbers = [int(match[1]) for match in matches if match]
     if len(set(numbers)) < len(classes):
