@@ -1,13 +1,24 @@
-"""Files that commands write: the contents of a folder, and HTML pages."""
+"""Files that commands write: the contents of a folder, leftovers of killed processes, and HTML pages."""
 
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+
+from thor2_jax.files import temporary_directory
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
     """Return the contents of all files of a folder but locks, by relative paths."""
     paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def killed(directory: Path) -> Path:
+    """Leave what a killed process leaves, and return its directory."""
+    with temporary_directory(directory) as temporary:
+        (temporary / "half").touch()
+        shutil.copytree(temporary, directory / f"{temporary.name}2")
+    return directory / f"{temporary.name}2"
 
 
 class ParsedPage(HTMLParser):

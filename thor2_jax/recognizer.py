@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, camera_instances, estimate_transform
+from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, estimate_transform
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
@@ -265,7 +265,11 @@ class Recognizer:
                 instances. Nothing changes.
         """
         _check_frames(frames)
-        instances = camera_instances(frames, self.run.config.sigma_s)
+        instances: list[PreparedInstance] = []  # with the camera's colours
+        for number, frame in enumerate(frames):
+            with with_context(f"frames[{number}]"):
+                check_frame(frame)
+                instances += [prepare_instance(frame, label, self.run.config.sigma_s) for label in frame.instances]
         adaptation = estimate_transform(instances, adaptation_criterion(self.model), report)
         self.model = dataclasses.replace(self.model, color_transform=adaptation.transform)
         return adaptation

@@ -4,7 +4,6 @@ import errno
 import hashlib
 import os
 import re
-import shutil
 import signal
 import stat
 import subprocess
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 from processes import HANG
 from refusals import assert_refused
+from written_files import killed
 
 from thor2_jax.files import (
     atomic_directory,
@@ -116,14 +116,6 @@ def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
         for name in ("file", "folder"):
             (unfinished / name).write_text("third")
     assert (target / "file").read_text() == "second"
-
-
-def killed(directory: Path) -> Path:
-    """Leave what a killed process leaves, and return its directory."""
-    with temporary_directory(directory) as temporary:
-        (temporary / "half").touch()
-        shutil.copytree(temporary, directory / f"{temporary.name}2")
-    return directory / f"{temporary.name}2"
 
 
 def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:

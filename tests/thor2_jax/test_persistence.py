@@ -151,12 +151,11 @@ def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> 
 
 
 SOME, RAGGED = np.zeros(3, np.float32), [[1.0, 2.0], [1.0]]
-BAD_HEIGHTS = (np.zeros(3, np.int32), np.float32(1), None, "high", RAGGED)
 BAD_EDGES = ((SOME, SOME), (np.zeros((2, 3), np.float32), SOME[:2]), (SOME, np.zeros(2, np.int32)), (SOME, RAGGED))
 
 
 def test_bad_heights_and_edges() -> None:
-    for heights in BAD_HEIGHTS:
+    for heights in (np.zeros(3, np.int32), np.float32(1), None, "high", RAGGED):
         assert_refused("^heights is [^\n]*$", persistence.sublevel_diagrams, heights)
     for heights, edges in BAD_EDGES:
         assert_refused("^edges is [^\n]*$", persistence.sublevel_diagrams, heights, edges)

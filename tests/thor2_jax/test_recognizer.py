@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import re
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,14 +12,7 @@ from image_files import frame_of_squares, patches, tilted
 from refusals import assert_refused
 from scipy.stats import gmean
 from small_clouds import random_clouds
-from small_runs import (
-    SMALL_CONFIG,
-    class_probabilities,
-    small_embedding,
-    untrained_embedding_run,
-    untrained_run,
-    with_surfaces,
-)
+from small_runs import class_probabilities, small_embedding, untrained_embedding_run, untrained_run, with_surfaces
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
@@ -33,12 +27,11 @@ from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 
 CLASSES = ("a", "b", "c", "d")
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    return untrained_run(CLASSES, config=CONFIG)
+    return untrained_run(CLASSES, config=thor2.DescriptorConfig(homology="closed_form"))
 
 
 @pytest.fixture(scope="module")
@@ -143,12 +136,14 @@ def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     assert_refused("shape", shape_only.recognize, tilted(patches()), classifiers=("shape",))
 
 
-def test_clouds_are_embedded_by_the_descriptor_of_the_embedding() -> None:
-    """The run has another one."""
-    config, embedding = dataclasses.replace(SMALL_CONFIG, sigma_1=0.03), small_embedding()
-    model = Recognizer(dataclasses.replace(untrained_run(CLASSES, ("tops",), config), embedding=embedding)).model
+@pytest.mark.parametrize(("field", "changes"), [("config", {"sigma_1": 0.03}), ("network", {"similarity": np.eye(22)})])
+def test_clouds_are_embedded_by_the_descriptor_of_the_embedding(field: str, changes: dict[str, Any]) -> None:
+    """The run has another one, or another colour network."""
+    run, embedding = untrained_run(CLASSES, ("tops",)), small_embedding()
+    other: Any = {field: dataclasses.replace(getattr(run, field), **changes)}
+    model = Recognizer(dataclasses.replace(run, embedding=embedding, **other)).model
     clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
-    inference = infer(model, describe_looks(clouds, model.run.network, config, 2), clouds, embeds=True)
+    inference = infer(model, describe_looks(clouds, model.run.network, model.run.config, 2), clouds, embeds=True)
     expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
     np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
 

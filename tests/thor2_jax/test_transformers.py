@@ -99,7 +99,6 @@ INVALID: list[tuple[str, Any, dict[str, Any]]] = [
     ("X[1] is a int", [(XYZ, RGB), 7], {}),
     ("X[1]: xyz[2] is [nan, nan, nan]", [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)], {}),
     ("X[0]: xyz has rows of different lengths", [([[0.0, 1.0, 2.0], [0.0]], RGB)], {}),
-    ("X[0]: rgb is [2, 3]", [(XYZ, RGB[:2])], {}),
     ("X[1] has 8193 points", [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))], {}),
     ("larger capacity", [(XYZ, RGB)], {"capacity": np.array([2])[0]}),  # as a grid search over an array gives it
     ("config is 'paper'", [(XYZ, RGB)], {"config": "paper"}),

@@ -15,7 +15,7 @@ import dataclasses
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,18 +24,16 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from colornet.colors import LUMA
-from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
-from thor2_jax.errors import InputError, with_context
-from thor2_jax.frames.frames import RGBDFrame, check_frame
-from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.types import PointClouds
 
-__all__ = ["Adaptation", "OnlineAdaptation", "adaptation_criterion", "camera_instances", "estimate_transform"]
+__all__ = ["Adaptation", "OnlineAdaptation", "adaptation_criterion", "estimate_transform"]
 
 ROWS = 8
 """Number of instances that are described in one call."""
@@ -97,7 +95,7 @@ def objective(
     chunks = []
     for start in range(0, len(ordered), ROWS):
         part = ordered[start : start + ROWS]
-        clouds = pack_instances(part, ROWS, capacity or point_bucket(len(part[-1].points)))
+        clouds = pack_instances(part, ROWS, capacity)
         chunks.append((len(part), clouds, jnp.minimum(criterion(clouds).sum(axis=1), 1)))
 
     def total(parameters: NDArray[np.floating]) -> float:
@@ -146,24 +144,6 @@ class Adaptation:
     instances: int
     uncertainty_before: float
     uncertainty_after: float
-
-
-def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[PreparedInstance]:
-    """Return the instances of frames of one camera, with the camera's colours.
-
-    Args:
-        frames: frames with instance labels.
-        sigma_s: scaled units per metre, see `DescriptorConfig`.
-
-    Raises:
-        InputError: a frame is of another type, or has no labels; the message has its number.
-    """
-    instances: list[PreparedInstance] = []
-    for number, frame in enumerate(frames):
-        with with_context(f"frames[{number}]"):
-            check_frame(frame)
-            instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
-    return instances
 
 
 def adaptation_criterion(model: Model) -> Criterion:
@@ -281,7 +261,7 @@ class OnlineAdaptation:
         self._recent.extend(usable)
         self._new += len(usable)
         is_busy = self._thread is not None and self._thread.is_alive()
-        if is_busy or self._new < EVERY or len(self._recent) < MIN_INSTANCES:
+        if is_busy or self._new < EVERY:
             return
         self._new = 0
         self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)

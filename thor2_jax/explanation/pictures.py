@@ -184,7 +184,7 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
         title = "other colour" if change.kind == "color" else "other side lengths"
         changed = apply_change(explanation.instance, change, explanation.config)
         shown.append((f"{title}:\n{change.answer}", changed))
-    figure = _clouds(shown, len(shown), 2.6)
+    figure = _clouds(shown)
     caption = (
         "The smallest changes of the object's colour and of its side lengths that were found to give another answer. "
         "Each was confirmed by recognizing the changed cloud."
@@ -198,7 +198,7 @@ def _surfaces(explanation: Explanation) -> ExplanationPicture:
     for fit in explanation.surfaces:
         colors = scale.to_rgba(1000 * fit.of_points.clip(max=FAR), bytes=True)[:, :3]
         shown.append((fit.name, dataclasses.replace(instance, colors=colors)))
-    figure = _clouds(shown, len(shown), 2.6)
+    figure = _clouds(shown)
     figure.colorbar(scale, ax=figure.axes, location="bottom", shrink=0.6, label="distance from the surface (mm)")
     caption = (
         "The distance of each point from the surfaces of the most probable objects, in the pose that fits best. Points "
@@ -210,7 +210,7 @@ def _surfaces(explanation: Explanation) -> ExplanationPicture:
 def _nearest(explanation: Explanation) -> ExplanationPicture:
     shown = [("this object", explanation.instance)]
     shown += [(f"{one.name}\n{one.similarity:.2f}", one.view) for one in explanation.nearest]
-    figure = _clouds(shown, 2, 2.9, own_scales=True)
+    figure = _clouds(shown, own_scales=True)
     caption = (
         "The enrolled views that the object resembles most, one for each of the most similar objects, each as its "
         "camera saw it and at its own scale. Numbers are similarities (1: equal)."
@@ -218,10 +218,9 @@ def _nearest(explanation: Explanation) -> ExplanationPicture:
     return ExplanationPicture("nearest", "nearest", "Nearest enrolled views", caption, figure)
 
 
-def _clouds(
-    shown: Sequence[tuple[str, PreparedInstance]], columns: int, height: float, own_scales: bool = False
-) -> Figure:
-    """Draw clouds with titles in rows of the given height in inches, around their means or at their own scales."""
+def _clouds(shown: Sequence[tuple[str, PreparedInstance]], own_scales: bool = False) -> Figure:
+    """Draw clouds with titles, in one row around their means or in rows of two at their own scales."""
+    columns, height = (2, 2.9) if own_scales else (len(shown), 2.6)
     rows = math.ceil(len(shown) / columns)
     is_shared = not own_scales
     figure, grid = _figure(5.2, rows * height, rows, columns, squeeze=False, sharex=is_shared, sharey=is_shared)

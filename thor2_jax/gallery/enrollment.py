@@ -127,7 +127,7 @@ def augmented_view(view: PreparedInstance, copy: int, cast: float = CAST) -> Pre
         copy: number of the copy.
         cast: largest deviation from 1 of the factor of each colour channel.
     """
-    rng = np.random.default_rng([zlib.crc32(np.ascontiguousarray(view.colors).tobytes()), len(view.points), copy])
+    rng = np.random.default_rng([zlib.crc32(view.colors.tobytes()), len(view.points), copy])
     points, keep = _sensed(view.points, rng), ~_cut(view.points, rng)
     if keep.sum() < MIN_POINTS:
         keep[:] = True
@@ -212,9 +212,9 @@ class ObjectGallery:
             InputError: as `refresh`.
             OSError: the gallery cannot be written; it is unchanged.
         """
-        self.directory, self.gallery = directory, dataclasses.replace(self.gallery, stamp=None)
+        self.directory = directory
         if reembed and directory.exists():
-            self._change(self._reembedded, rebuild=True)
+            self._change(self._reembedded, reembed=True)
         else:
             store.check_index(directory)
             self.refresh()
@@ -255,18 +255,16 @@ class ObjectGallery:
             objects[name] = dataclasses.replace(again, date=views.date)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
-    def _change(self, change: Callable[[Gallery], Gallery], rebuild: bool = False) -> None:
-        def change_stored(stored: Gallery) -> Gallery:
+    def _change(self, change: Callable[[Gallery], Gallery], reembed: bool = False) -> None:
+        def changed(stored: Gallery) -> Gallery:
             return self._of_run(change(self._of_run(stored)))
 
-        embedding = None if rebuild else self.embedding.fingerprint
+        embedding = None if reembed else self.embedding.fingerprint
         if self.directory is None:
             with _CHANGE:
-                self.gallery = change_stored(self.gallery)
+                self.gallery = changed(self.gallery)
         else:
-            self.gallery = store.update_gallery(
-                self.directory, change_stored, embedding, self.gallery, self.lock_seconds, rebuild
-            )
+            self.gallery = store.update_gallery(self.directory, changed, embedding, self.gallery, self.lock_seconds)
             self.refresh()  # Another thread may have changed it since, and may have set the attribute before.
 
     def _of_run(self, gallery: Gallery) -> Gallery:

@@ -156,7 +156,7 @@ class Gallery:
         """Names of the objects, in the order of the scores."""
         return tuple(self.objects)
 
-    def name_to_enroll(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
+    def name_to_enroll(self, name: str, *, extend: bool, replace: bool) -> str:
         """Return the name under which `with_object` adds views; the arguments and errors are those of `with_object`."""
         known = find_name(name, (*self.objects, *self.trained)) or check_name(name)
         if extend and replace:
@@ -317,8 +317,7 @@ class Gallery:
     @functools.cached_property
     def has_output(self) -> NDArray[np.bool_]:
         """[n] bool, whether the classifiers have an output for each of `answered_names`."""
-        outputs = set(self._outputs)
-        return np.array([name in outputs for name in self.answered_names], bool)
+        return np.array([self._is_answered_class(name) for name in self.answered_names], bool)
 
     @functools.cached_property
     def summary(self) -> str:

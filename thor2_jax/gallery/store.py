@@ -20,8 +20,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
 from thor2_jax.files import (
     atomic_write,
@@ -194,7 +192,7 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 
 
 def _object_content(name: str, views: GalleryObject) -> bytes:
-    arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
+    arrays = {"embeddings": views.embeddings, **vars(views.clouds)}
     if views.surface is not None:
         arrays |= {SURFACE + field: array for field, array in views.surface.items()}
     return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
@@ -226,17 +224,16 @@ def update_gallery(
     embedding: str | None = None,
     known: Gallery | None = None,
     lock_seconds: float = LOCK_SECONDS,
-    rebuild: bool = False,
 ) -> Gallery:
     """Change a gallery on disk without losing the change of another writer.
 
     Args:
         directory: directory of the gallery; created if it is missing.
         change: function of the gallery on disk that returns the new one. If it raises, nothing changes on disk.
-        embedding: fingerprint that the gallery must have; None accepts any.
+        embedding: fingerprint that the gallery must have. None accepts any, for a `change` that embeds the views again;
+            if the index is missing, the change then starts from the existing object files.
         known: an earlier state of the gallery, whose objects are not read again.
         lock_seconds: time to wait for another writer.
-        rebuild: if the index is missing, start from the existing object files; `change` embeds the views again.
 
     Returns:
         The gallery after the change.
@@ -249,7 +246,7 @@ def update_gallery(
     busy = f"another process or thread has been writing to {directory} for {lock_seconds:.2g} s; try again when it ends"
     lock = locked(directory, GalleryBusyError(f"gallery: {busy}"), lock_seconds)
     with lock, new_directory(directory / "objects"):
-        is_lost = rebuild and gallery_stamp(directory) is None
+        is_lost = embedding is None and gallery_stamp(directory) is None
         before = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
         _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
@@ -272,8 +269,10 @@ def update_gallery(
             changed = dataclasses.replace(changed, objects=objects)
             write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
-            for path in reversed(written):
-                path.unlink(missing_ok=True)
+            index = _read_index(directory / INDEX_FILE)
+            if index is None or index["generation"] < changed.generation:  # Otherwise the index names the files.
+                for path in reversed(written):
+                    path.unlink(missing_ok=True)
             raise
         # The change is complete. If this write fails, or if previous.json is another file, it only cannot be undone.
         with contextlib.suppress(OSError, GalleryError):

@@ -144,13 +144,13 @@ def infer(
         probabilities[EMBEDDING] = _with_evidence(probabilities[EMBEDDING], surfaces, samples)
     if not embeds:
         return Inference(oriented.overflow, probabilities)
-    ours, config = model.embedding.config, model.run.config
-    is_ours = dataclasses.replace(config, homology=ours.homology, looks=ours.looks) == ours
-    first = oriented
-    if not is_ours or oriented.shape[1] < LOOKS:
-        first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
-    first = jax.tree.map(lambda a: a[:, :LOOKS], first)
-    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), samples=samples)
+    embedding, run = model.embedding, model.run
+    config = dataclasses.replace(embedding.config, homology=run.config.homology, looks=run.config.looks)
+    if run.network == embedding.network and run.config == config and oriented.shape[1] >= LOOKS:
+        first = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
+    else:
+        first = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
+    return Inference(oriented.overflow, probabilities, embedding.embed_oriented(first, clouds), samples=samples)
 
 
 def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as coco_mask  # type: ignore[import-untyped]
 
 from thor2_jax.errors import InputError
@@ -87,21 +86,16 @@ def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = N
     Args:
         classes: names of the objects.
         names: number -> name; other classes get no number. By default `obj_000012` has the number 12 if all classes
-            have such names, and otherwise the classes are counted from 1.
+            have such names with different numbers, and otherwise the classes are counted from 1.
     """
     if names is not None:
-        numbers = {name: number for number, name in names.items()}
-        return {name: numbers[name] for name in classes if name in numbers}
-    matches = [re.fullmatch(r"obj_(\d+)", name) for name in classes]
-    return {
-        name: int(match[1]) if match and all(matches) else position
-        for position, (name, match) in enumerate(zip(classes, matches, strict=True), start=1)
-    }
-
-
-def _encoded(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    encoded = coco_mask.encode(np.asfortranarray(mask, np.uint8))
-    return {**encoded, "counts": encoded["counts"].decode("ascii")}
+        number_of = {name: number for number, name in names.items()}
+        return {name: number_of[name] for name in classes if name in number_of}
+    matches = (re.fullmatch(r"obj_(\d+)", name) for name in classes)
+    numbers = [int(match[1]) for match in matches if match]
+    if len(set(numbers)) < len(classes):
+        numbers = list(range(1, len(classes) + 1))
+    return dict(zip(classes, numbers, strict=True))
 
 
 class ResultTables:
@@ -148,6 +142,7 @@ class ResultTables:
             if category is None:
                 self.n_without_number += 1
                 continue
+            mask = coco_mask.encode(np.asfortranarray(frame.label_image == answer.label, np.uint8))
             self._coco.append(
                 {
                     # COCO has no scenes: images of several scenes are counted from 1.
@@ -155,7 +150,7 @@ class ResultTables:
                     "category_id": category,
                     "bbox": list(detection.box),
                     "score": answer.confidence,
-                    "segmentation": _encoded(frame.label_image == answer.label),
+                    "segmentation": {**mask, "counts": mask["counts"].decode("ascii")},
                     "frame": name,
                     "category_name": answer.name,
                 }

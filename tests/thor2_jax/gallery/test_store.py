@@ -17,9 +17,8 @@ import safetensors.numpy
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
-from written_files import files_of
+from written_files import files_of, killed
 
-from thor2_jax.files import temporary_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
@@ -111,9 +110,8 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     before, stamp = files_of(directory), gallery_stamp(directory)
     update_gallery(directory, add("new", 5), FINGERPRINT)
     assert gallery_stamp(directory) != stamp
-    for folder in (directory, directory / "objects"):  # what a killed process leaves
-        with temporary_directory(folder) as temporary:
-            shutil.copytree(temporary, folder / ".thor2-killed")
+    for folder in (directory, directory / "objects"):
+        killed(folder)
     update_gallery(directory, lambda gallery: gallery.without("new"), FINGERPRINT)
     update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
     after = files_of(directory)
@@ -179,6 +177,14 @@ def test_a_failed_change_leaves_the_gallery_as_it_was(
     assert files_of(directory) == before
 
 
+def test_a_change_that_is_interrupted_at_its_end_is_complete(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_text = store.write_text
+    monkeypatch.setattr(store, "write_text", lambda *given: [write_text(*given), signal.raise_signal(signal.SIGINT)])
+    with pytest.raises(KeyboardInterrupt):
+        update_gallery(directory, add("new", 5), FINGERPRINT)
+    assert load_gallery(directory, FINGERPRINT).names == ("mug", "bowl", "new")
+
+
 def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
     assert_unusable("embedding ffffffff.*00000000", directory, "0" * 64)
 
@@ -218,7 +224,7 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
         for name in names:
             (directory / name).unlink(missing_ok=True)
         assert_unusable(f"{directory}.*thor2 objects --reembed", directory)
-        rebuilt = update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT), rebuild=True)
+        rebuilt = update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT))
         assert rebuilt.generation == {1: expected.generation + 1, 2: 1}[len(names)]
         if len(names) == 1:  # Without the former index, the two files of the mug are equally old.
             assert object_files(rebuilt) == object_files(expected)
@@ -244,7 +250,7 @@ def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> No
     assert changed.without("unknown").names == ("mug ",)
     for name in ("index.json", "previous.json"):
         (directory / name).unlink()
-    names = update_gallery(directory, lambda gallery: gallery, rebuild=True).names
+    names = update_gallery(directory, lambda gallery: gallery).names
     assert "mug " in names and sum(name.startswith("object-") for name in names) == 2
 
 

@@ -75,5 +75,6 @@ def test_category_numbers() -> None:
     assert category_numbers(["bowl", "mug"]) == {"bowl": 1, "mug": 2}
     assert category_numbers(["obj_000012", "obj_000003"]) == {"obj_000012": 12, "obj_000003": 3}
     assert category_numbers(["obj_000012", "mug"]) == {"obj_000012": 1, "mug": 2}
+    assert category_numbers(["obj_12", "obj_012"]) == {"obj_12": 1, "obj_012": 2}
     assert category_numbers(["bowl", "mug"], {14: "mug", 15: "fork"}) == {"mug": 14}
     assert category_numbers([]) == {}

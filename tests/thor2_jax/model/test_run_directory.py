@@ -26,14 +26,13 @@ from thor2_jax.recognizer import Recognizer
 from thor2_jax.surfaces.surfaces import SURFACES_FILE
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
-CLASSES = ("a mug", "b", "ç")
 CONSTANTS = dataclasses.asdict(CONFIG)
 
 
 @functools.cache
 def make_run() -> TrainedRun:
     """Return a run with all files: those of classifiers, an embedding, its references, and surfaces."""
-    run = untrained_embedding_run(CLASSES, ("tops", "ce"), CONFIG, {"epochs": 3, "figures": [0.5, 1]})
+    run = untrained_embedding_run(("a mug", "b", "ç"), ("tops", "ce"), CONFIG, {"epochs": 3, "figures": [0.5, 1]})
     views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
     return with_surfaces(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)))
 

@@ -36,6 +36,9 @@ class ToyRecognizer(Recognizer):
 
 
 SURE_A, UNSURE_B = (230, 15, 10), (100, 125, 30)
+TWO = frame_of_squares({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
+TWO = dataclasses.replace(TWO, color=np.random.default_rng(0).integers(0, 256, TWO.color.shape, np.uint8))
+"""A frame of two instances in random colours."""
 
 
 def test_a_track_keeps_its_number_and_fuses_the_answers() -> None:
@@ -63,30 +66,24 @@ def test_a_view_of_fewer_points_has_a_smaller_weight() -> None:
 
 @pytest.mark.parametrize("is_taught", [False, True])
 def test_the_first_answer_is_that_of_the_frame_alone(is_taught: bool) -> None:
-    rng = np.random.default_rng(0)
     recognizer = Recognizer(run(), embedding=small_embedding())
-    image = frame_of_squares({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
-    image = dataclasses.replace(image, color=rng.integers(0, 256, image.color.shape, dtype=np.uint8))
     if is_taught:
-        recognizer.enroll("mug", [(image, 1)])
+        recognizer.enroll("mug", [(TWO, 1)])
     tracker = recognizer.track()
-    alone, tracked = recognizer.recognize(image), tracker.update(image, np.eye(4))
-    again = tracker.update(image, np.eye(4))  # merged with an equal cloud
+    alone, tracked = recognizer.recognize(TWO), tracker.update(TWO, np.eye(4))
+    again = tracker.update(TWO, np.eye(4))  # merged with an equal cloud
     for answers in (tracked, again):
         assert_same_answers(answers, alone, 1e-3)
 
 
 @pytest.mark.parametrize("answer_by", ["both", "gallery"])
 def test_tracks_answer_as_their_last_views_after_enrolling(answer_by: str) -> None:
-    rng = np.random.default_rng(0)
     recognizer = Recognizer(run(), embedding=small_embedding(), answer_by=answer_by)
-    image = frame_of_squares({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
-    image = dataclasses.replace(image, color=rng.integers(0, 256, image.color.shape, dtype=np.uint8))
     tracker = recognizer.track()
-    first, _ = tracker.update(image)
-    recognizer.enroll("mug", [(image, 2)])
-    labels = np.where(image.label_image == 2, 2, 0)
-    (second,) = tracker.update(dataclasses.replace(image, labels=labels))
+    first, _ = tracker.update(TWO)
+    recognizer.enroll("mug", [(TWO, 2)])
+    labels = np.where(TWO.label_image == 2, 2, 0)
+    (second,) = tracker.update(dataclasses.replace(TWO, labels=labels))
     earlier, later = tracker.tracks()
     assert "gallery" in second.top and later == second and earlier.confidence == first.confidence
 

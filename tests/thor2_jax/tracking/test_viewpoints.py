@@ -1,20 +1,54 @@
-"""The next view of an object in doubt, on tables of views that are written by hand."""
+"""Camera poses, merged clouds of several views, and the next view of an object in doubt, on hand-written tables."""
 
 import numpy as np
 import pytest
 from refusals import assert_refused
 from scipy.stats import entropy
 
-from thor2_jax.tracking.viewpoints import ViewTable, next_view
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.tracking.viewpoints import ViewTable, check_pose, merge_views, next_view, read_poses
 from training.rendering.camera import camera_pose
 
-AZIMUTHS = np.arange(8) * np.pi / 4
+NO_MOTIONS = (
+    *(np.eye(3), "x", np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), np.diag([1.0, 1, -1, 1])),
+    *(np.eye(4) + np.eye(4, k=-3) * 0.5, [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+)
+
+
+@pytest.mark.parametrize("pose", NO_MOTIONS)
+def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
+    is_nan = np.shape(pose) == (4, 4) and np.isnan(pose).any()
+    assert_refused("^poses is 'a.x00b'; expected a path", read_poses, "a\0b", [])
+    assert_refused("pose has NaN" if is_nan else "pose (has shape|is not)", check_pose, pose, "camera_pose")
+
+
+@pytest.mark.parametrize("middle", [(0, 0, 0), (500_000, 4_000_000, 100)])
+def test_merged_clouds_coincide_in_space(middle: tuple[float, ...]) -> None:
+    """The coordinates of the world may be those of a map."""
+    rng = np.random.default_rng(0)
+    world = rng.uniform(-0.05, 0.05, (500, 3)) + middle
+    colors = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+    poses = [camera_pose(azimuth, 1.0, np.array(middle, float), 0.8) for azimuth in (0.3, 2.0)]
+    views = []
+    for pose in poses:
+        points = ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
+        rim = rng.random(500) < 0.2
+        views.append((PreparedInstance(1, points, colors, np.zeros(500, bool), rim=rim), pose))
+    one, both = merge_views(views[1:], 2.5), merge_views(views, 2.5)
+    assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
+    np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)
+    for merged in (one, both):
+        np.testing.assert_allclose(merged.points.mean(axis=0), views[1][0].points.mean(axis=0), atol=2e-3)
+    packed = pack_instances([both, one], 2)  # the rim of the last view is not that of the merged cloud
+    assert packed.rim is not None and not packed.rim.any()
+
+
 CENTRE = np.array([0.3, -0.2, 0.1])
 
 
 def poses(centre: np.ndarray = CENTRE, start: float = 0.0) -> list[np.ndarray]:
     """Return cameras around a point, from the side."""
-    return [camera_pose(start + azimuth, np.pi / 2, centre, 0.8) for azimuth in AZIMUTHS]
+    return [camera_pose(start + azimuth, np.pi / 2, centre, 0.8) for azimuth in np.arange(8) * np.pi / 4]
 
 
 def table(front: np.ndarray) -> ViewTable:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +14,10 @@ from image_files import small_frame, write_frame_files
 from PIL import Image
 from refusals import assert_refused
 from toy_recognizers import NamesInOrder, UntaughtRecognizer, described
-from written_files import ParsedPage, files_of
+from written_files import ParsedPage, files_of, killed
 
 import thor2_jax as thor2
-from thor2_jax.files import LOCK, locked, temporary_directory
+from thor2_jax.files import LOCK, locked
 from thor2_jax.frames.overlay import Annotation
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import answer_frames, evaluate_dataset
@@ -110,8 +109,7 @@ def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None
         file.write('{"frame": "frame5", "attrib')  # as after a kill during a write
     (report / "frames").mkdir()
     for folder in (report, report / "frames"):
-        with temporary_directory(folder) as temporary:
-            shutil.copytree(temporary, folder / ".thor2-killed")
+        killed(folder)
     dataset = toy_frames(9)
     resumed = evaluate_toys(tmp_path / "stopped", dataset)
     assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
