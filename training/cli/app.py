@@ -261,7 +261,7 @@ def _with_options(message: str) -> str:
 def _check_not_empty(arguments: list[str]) -> None:
     """Raise InputError for an empty argument, since an empty path would mean the current directory."""
     for previous, argument in itertools.pairwise(["the first argument", *arguments]):
-        option, _, value = argument.rpartition("=") if argument.startswith("--") else (previous, "", argument)
+        option, value = argument.split("=", 1) if re.match("--[^=]+=", argument) else (previous, argument)
         if not value and option not in MAY_BE_EMPTY:
             place = option if option.startswith("--") else f"the argument after {previous}"
             raise InputError(f"{place} is empty; expected a value: is a variable of the shell not set?")

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -231,15 +232,15 @@ class ManyFrames(TyperCommand):
     """A command whose option --frames takes all values up to the next option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments after repeating --frames before each value that follows it."""
+        """Parse the arguments after repeating --frames before each further value that follows it."""
         expanded: list[str] = []
         taking = False
-        for argument in args:
+        for previous, argument in itertools.pairwise(["", *args]):
             if argument.startswith("-") and argument != "-":
                 taking = argument == "--frames"
-                expanded += [] if taking else [argument]
-            else:
-                expanded += ["--frames", argument] if taking else [argument]
+            elif taking and previous != "--frames":
+                expanded.append("--frames")
+            expanded.append(argument)
         return super().parse_args(ctx, expanded)
 
 

@@ -178,6 +178,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--segment", "table"), "segment is table; it belongs to frames"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
     ):
         assert text in refused("enroll", "--model", model, *arguments)

@@ -249,6 +249,7 @@ def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Co
     assert "1000" in report["findings"][0]["advice"] and report["notes"]
     assert texts(*command, "--depth-scale", 100, status=1)[0].startswith("depth-unit: ")
     assert "--mesh-scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
+    assert "no such folder" in refused(*command, "--meshes", tmp_path / "absent")
     files.color.unlink()
     assert f"{files.color} is missing" in refused(*command, "--json")
 
