@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from commands import Command, Texts, json_lines
 from dataset_files import write_bop
+from image_files import SAMPLES
 from rendered_objects import write_box
 from toy_recognizers import recognizer_that_prefers
 
-import thor2_jax
 from benchmarks.doctor import _interpolated, _zoomed
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, encode_image
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
@@ -24,8 +24,6 @@ from training.diagnosis.depth import check_depth, instance_extents
 from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.diagnosis.setup import diagnose
 from training.readers.frames import FrameFiles, frame_files
-
-SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
 
 
 @pytest.fixture(scope="module")
