@@ -121,10 +121,19 @@ app = typer.Typer(
 )
 # A closed stream is None, and its file descriptor would go to the next file that is opened.
 sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
+
+
+class _Console(Console):
+    """A console that shows control characters in texts escaped, for instance those in names of folders."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*(escape_characters(each) if isinstance(each, str) else each for each in objects), **options)
+
+
 # Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so
 # tables are at least 72 wide, and the terminal breaks their lines. Names of objects may look like markup.
 WIDTH = max(shutil.get_terminal_size().columns, 72) if sys.stdout.isatty() else 160
-console = Console(width=WIDTH, markup=False, emoji=False)
+console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):

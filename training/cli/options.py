@@ -145,8 +145,7 @@ class FrameOptions:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
         of_bag = ("color_topic", "depth_topic", "camera_topic", "max_gap", "every")
-        given = given_values(self)
-        check_belongs("--bag", self.bag, **{name: given[name] for name in of_bag if name in given})
+        check_belongs("--bag", self.bag, **{name: each for name, each in given_values(self).items() if name in of_bag})
         if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
 
