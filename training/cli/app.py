@@ -190,19 +190,14 @@ def show_help(context: typer.Context) -> None:
         print(context.get_help(), end="")
 
 
-def _show_version(requested: bool) -> None:
-    if requested:
-        print(f"thor2 {__version__}")
-        raise typer.Exit
-
-
 @app.callback(invoke_without_command=True)
 def thor2(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
+    if version:
+        print(f"thor2 {__version__}")
+        raise typer.Exit
     show_help(context)
 
 
