@@ -17,6 +17,10 @@ Recognize = Callable[..., list[dict[str, Any]]]
 """Type of the fixture `recognize`, which recognizes frames on the command line."""
 
 
+STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
+"""Options of `thor2 render` and `train`: few views, rendered in one process."""
+
+
 def run_thor2(*arguments: object) -> int:
     """Run the command line in this process and return its exit status."""
     from training import cli

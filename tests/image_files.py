@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 import thor2_jax as thor2
 from thor2_jax.frames.frames import encode_image
 
+SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
+"""The sample frames of the service's page."""
+
 
 def encode_npy(array: np.ndarray, **options: Any) -> bytes:
     """Return an NPY file's bytes."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from image_files import SAMPLES
 from toy_recognizers import recognizer_that_prefers
 
 import thor2_jax as thor2
@@ -93,9 +94,6 @@ def test_the_service_accepts_the_host_of_the_load_test() -> None:
     head = multipart_request({"color": b"", "depth": b""}).split(b"\r\n\r\n")[0].decode()
     fields = dict(line.split(": ") for line in head.split("\r\n")[1:])
     assert is_allowed_host(fields["Host"], "127.0.0.1", ())
-
-
-SAMPLES = Path(thor2.__file__).parent / "service" / "page" / "samples"
 
 
 @pytest.mark.slow

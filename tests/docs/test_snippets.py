@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from commands import run_thor2
 from doc_pages import PAGES, ROOT, thor2_commands
-from image_files import patches, tilted, write_frame_files
+from image_files import SAMPLES, patches, tilted, write_frame_files
 from recording_files import table_frame
 from small_clouds import random_clouds
 from small_runs import save_untrained_run, untrained_run
@@ -100,8 +100,7 @@ def test_landing_page_and_first_tutorial(run: Path, capsys: pytest.CaptureFixtur
     assert len(capsys.readouterr().out.splitlines()) == 5
     page = "docs/tutorials/first-table.md"
     (words,) = [words for words in thor2_commands(page) if words[0] == "recognize"]
-    samples = str(Path(thor2.__path__[0], "service/page/samples"))
-    assert run_thor2(*(word.replace("$samples", samples) for word in words)) == 0
+    assert run_thor2(*(word.replace("$samples", str(SAMPLES)) for word in words)) == 0
     answers = json.loads(Path("answer/recognition.json").read_text())
     names = run_blocks(page, 0)["names"]
     assert len(names) == 5 and str(min(names)) in json.dumps(answers)

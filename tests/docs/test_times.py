@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 import trimesh
 from doc_pages import ROOT, thor2_commands
+from image_files import SAMPLES
 from rendered_objects import write_meshes, write_scene
-
-import thor2_jax as thor2
 
 PAGES = ["README.md", *(f"docs/tutorials/{name}.md" for name in ("first-table", "own-objects"))]
 UNTIMED = {"fetch": "a download", "serve": "runs until it is ended"}
@@ -51,13 +50,12 @@ def test_renew_times(tmp_path: Path) -> None:
         write_scene(tmp_path / f"table-{number}", OBJECTS[:4], 10 + number)
     for name, source in {"c.png": "color", "d.png": "depth", "l.png": "mask", "k.json": "intrinsics"}.items():
         shutil.copy(tmp_path / "table-1" / f"{source}{Path(name).suffix}", tmp_path / name)
-    samples = str(Path(thor2.__path__[0], "service/page/samples"))
     rows = []
     for called, words in timed_commands().items():
         if "--out" in words:
             shutil.rmtree(tmp_path / words[words.index("--out") + 1], ignore_errors=True)
         start, before = time.monotonic(), sum(os.times()[2:4])  # of the processes that have ended
-        command = [sys.executable, "-m", "training.cli", *(word.replace("$samples", samples) for word in words)]
+        command = [sys.executable, "-m", "training.cli", *(word.replace("$samples", str(SAMPLES)) for word in words)]
         environment = {**os.environ, "XLA_FLAGS": "", "THOR2_CACHE": str(tmp_path / "cache")}
         subprocess.run(command, cwd=tmp_path, env=environment, check=True)
         used = sum(os.times()[2:4]) - before

@@ -15,7 +15,6 @@ from small_runs import random_classifier
 from thor2_jax.networks.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks.networks import MLP, EmbeddingSizes, input_size
 from training import train_run
-from training.embedding import fit
 from training.fitting.fit import FitContext
 from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
@@ -86,4 +85,4 @@ def weights(request: pytest.FixtureRequest) -> str:
 def small_networks(module_patch: pytest.MonkeyPatch) -> None:
     """Let the embeddings of runs have small networks, which are fitted in small batches."""
     module_patch.setattr(train_run, "RUN_SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
-    module_patch.setattr(fit, "BATCH_SIZE", 64)
+    module_patch.setattr("training.embedding.fit.BATCH_SIZE", 64)

@@ -121,10 +121,19 @@ app = typer.Typer(
 )
 # A closed stream is None, and its file descriptor would go to the next file that is opened.
 sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
+
+
+class _Console(Console):
+    """A console that shows control characters in texts escaped, for instance those in names of folders."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*(escape_characters(each) if isinstance(each, str) else each for each in objects), **options)
+
+
 # Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so
 # tables are at least 72 wide, and the terminal breaks their lines. Names of objects may look like markup.
 WIDTH = max(shutil.get_terminal_size().columns, 72) if sys.stdout.isatty() else 160
-console = Console(width=WIDTH, markup=False, emoji=False)
+console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
@@ -181,19 +190,14 @@ def show_help(context: typer.Context) -> None:
         print(context.get_help(), end="")
 
 
-def _show_version(requested: bool) -> None:
-    if requested:
-        print(f"thor2 {__version__}")
-        raise typer.Exit
-
-
 @app.callback(invoke_without_command=True)
 def thor2(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
+    if version:
+        print(f"thor2 {__version__}")
+        raise typer.Exit
     show_help(context)
 
 
@@ -261,7 +265,7 @@ def _with_options(message: str) -> str:
 def _check_not_empty(arguments: list[str]) -> None:
     """Raise InputError for an empty argument, since an empty path would mean the current directory."""
     for previous, argument in itertools.pairwise(["the first argument", *arguments]):
-        option, _, value = argument.rpartition("=") if argument.startswith("--") else (previous, "", argument)
+        option, value = argument.split("=", 1) if re.match("--[^=]+=", argument) else (previous, argument)
         if not value and option not in MAY_BE_EMPTY:
             place = option if option.startswith("--") else f"the argument after {previous}"
             raise InputError(f"{place} is empty; expected a value: is a variable of the shell not set?")

@@ -41,7 +41,7 @@ def doctor(
 
     options.check_belongs("--meshes", meshes, mesh_scale=None if mesh_scale == 1 else mesh_scale)
     sources = given.sources(masks=False)
-    paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
+    paths = {} if meshes is None else {meshes.stem: meshes} if meshes.is_file() else find_meshes(meshes)
     recognizer = None if model is None else RecognizerArguments(model).load()
     known: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
     is_sound, failed = True, []

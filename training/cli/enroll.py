@@ -61,7 +61,7 @@ def enroll(
     if name is None and (target.label_name is not None or target.instance is not None):
         raise InputError("name is missing; --label-name and --instance enroll one object")
     options.check_alone("replace", target.replace, extend=target.extend)
-    options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance)
+    options.check_belongs("frames", has_frames, label_name=target.label_name, instance=target.instance, segment=segment)
     scale = options.given_values(target).get("mesh_scale")
     options.check_belongs("--mesh", mesh, mesh_scale=scale, **options.given_values(processes))
     from training.objects.meshes import find_object_meshes

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import escape_characters, first_names
+from thor2_jax.printable import first_names
 from training.cli import options
 from training.cli.app import Table, app, console, finish, show_help, show_progress
 
@@ -66,7 +66,7 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
-        console.print(f"skipped: {escape_characters(folder.note)}")
+        console.print(f"skipped: {folder.note}")
     _evaluate("frames", folder, dataset, job, runs, given=given.arguments)
 
 
@@ -172,4 +172,4 @@ def _print_report(report: Mapping[str, Any]) -> None:
         f"median {speed['median_seconds']:.2f} s a frame"
     )
     for text in page.answer_texts(report):
-        console.print(escape_characters(text))
+        console.print(text)

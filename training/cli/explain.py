@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, print_note
 
@@ -59,7 +58,7 @@ def explain(
                 continue
             write_explanation(explanation, frame, source.name, directory)
             explained, last = explained + 1, label
-            console.print(escape_characters(f"{explanation.title}: {directory / PAGE}"))
+            console.print(f"{explanation.title}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
     pages = f"pages in {out}: {explained}"

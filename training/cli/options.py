@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -144,8 +145,7 @@ class FrameOptions:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
         of_bag = ("color_topic", "depth_topic", "camera_topic", "max_gap", "every")
-        given = given_values(self)
-        check_belongs("--bag", self.bag, **{name: given[name] for name in of_bag if name in given})
+        check_belongs("--bag", self.bag, **{name: each for name, each in given_values(self).items() if name in of_bag})
         if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
 
@@ -231,15 +231,15 @@ class ManyFrames(TyperCommand):
     """A command whose option --frames takes all values up to the next option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments after repeating --frames before each value that follows it."""
+        """Parse the arguments after repeating --frames before each further value that follows it."""
         expanded: list[str] = []
         taking = False
-        for argument in args:
+        for previous, argument in itertools.pairwise(["", *args]):
             if argument.startswith("-") and argument != "-":
                 taking = argument == "--frames"
-                expanded += [] if taking else [argument]
-            else:
-                expanded += ["--frames", argument] if taking else [argument]
+            elif taking and previous != "--frames":
+                expanded.append("--frames")
+            expanded.append(argument)
         return super().parse_args(ctx, expanded)
 
 

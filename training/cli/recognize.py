@@ -247,5 +247,5 @@ def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> No
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:
-        console.print(f"{escape_characters(frame)}:")
+        console.print(f"{frame}:")
     console.print(table if recognitions else "no instances: all pixels are background")

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import app, console, finish, show_progress
 
@@ -233,7 +232,7 @@ def _report(directory: Path, runs: Sequence[Any], has_baselines: bool) -> None:
     model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
     if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
         views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
-        console.print(f"enrolled, too, since they have no mesh: {escape_characters(views)}")
+        console.print(f"enrolled, too, since they have no mesh: {views}")
     finished = "finished, with its baselines" if has_baselines else "finished already: nothing was trained"
     objects = f" (objects: {len(runs[0].classes)})" if runs else ""
     written = "run written to" if runs else f"{finished}; the run is in"

@@ -5,7 +5,6 @@ for finding in diagnose(FrameFiles(color, depth, labels, intrinsics)).findings:
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -78,9 +77,9 @@ def diagnose(
         check_labels_alignment(diagnosis, color, labels)
     if depth is None or camera is None:
         return diagnosis
-    camera = dataclasses.replace(camera, width=None, height=None)  # its size was checked
+    unsized = dataclasses.replace(camera, width=None, height=None)  # its size was checked
     seen = np.zeros((*depth.shape, 3), np.uint8) if color is None else color
-    frame = _read(diagnosis, "intrinsics", functools.partial(RGBDFrame, seen, depth, labels, camera))
+    frame = _read(diagnosis, "intrinsics", lambda: RGBDFrame(seen, depth, labels, unsized))
     if frame is None:  # the lens distortion has no inverse
         return diagnosis
     is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)

@@ -31,11 +31,11 @@ def path_ends(sequence: str) -> list[str]:
 
 
 def named_labels(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    """Return label -> name; raise InputError with the path unless labels are integers with one string each."""
+    """Return label -> name; raise InputError with the path unless labels are integers with one name each."""
     names: dict[int, str] = {}
     for label, name in entries:
-        if type(label) is not int or not isinstance(name, str):
-            raise InputError(f"{path}: label {label!r} has the name {name!r}; expected an integer and a string")
+        if type(label) is not int or not (isinstance(name, str) and name.strip()):
+            raise InputError(f"{path}: label {label!r} has the name {name!r}; expected an integer and a non-empty text")
         if label in names:
             raise InputError(f"{path}: label {label} has the names {names[label]!r} and {name!r}; expected one")
         names[label] = name

@@ -4,17 +4,13 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+import small_runs
 from commands import Command, Recognize, json_lines
-from small_runs import SMALL_CONFIG, save_untrained_run
-from small_runs import small_embedding as embedding_of_tests
 
-from thor2_jax.gallery import enrollment
-from thor2_jax.model import model as models
-from thor2_jax.networks import embedding
 from training import protocol
 from training.protocol import DEFAULT, PAPER
 
-COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
+COVERING = dataclasses.replace(small_runs.SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
 """A small descriptor whose grid covers the objects: if it overflowed, nothing would have a name."""
 
 
@@ -22,7 +18,7 @@ COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
     folder, classes = tmp_path_factory.mktemp("run"), ("bowl", "mug", "plate")
-    return save_untrained_run(folder, classes, ("tops", "tops2"), COVERING, seed=1)
+    return small_runs.save_untrained_run(folder, classes, ("tops", "tops2"), COVERING, seed=1)
 
 
 @pytest.fixture
@@ -42,7 +38,7 @@ def small_descriptors(small_networks: None, module_patch: pytest.MonkeyPatch) ->
 @pytest.fixture(scope="module")
 def small_embedding(module_patch: pytest.MonkeyPatch) -> None:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
-    small = embedding_of_tests()
-    for module in (embedding, enrollment, models):
-        module_patch.setattr(module, "load_default", lambda: small)
+    small = small_runs.small_embedding()
+    for module in ("gallery.enrollment", "model.model", "networks.embedding"):
+        module_patch.setattr(f"thor2_jax.{module}.load_default", lambda: small)
     module_patch.setattr("training.views.mesh_views.MESH_VIEWS", 1)

@@ -11,7 +11,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from commands import Command, Texts, frame_options, run_thor2
+from commands import STEPS, Command, Texts, frame_options, run_thor2
 from rendered_objects import write_meshes, write_scene
 from written_files import files_of
 
@@ -27,7 +27,6 @@ from training.train_job import TrainJob
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
-STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
 FEW_STEPS = ("--epochs", 1, "--batch-size", 64, "--classifiers", "tops,tops2", "--embedding", 0)
 
 

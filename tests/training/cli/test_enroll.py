@@ -178,16 +178,17 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--segment", "table"), "segment is table; it belongs to frames"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
     ):
         assert text in refused("enroll", "--model", model, *arguments)
 
 
 def test_names_that_are_invalid_are_skipped_and_few_views_noted(tmp_path: Path, printed: Command) -> None:
-    frame = write_frame(tmp_path / "frame", {1: "brick", 5: "book"})
+    frame = write_frame(tmp_path / "fr\x1bame", {1: "brick", 5: "book"})
     (frame / "labels.json").write_text('{"labels": {"1": "mug ", "5": "unknown"}}')
     text = printed("enroll", "--frames", frame, "--model", tmp_path / "run")
-    assert "skipped: frame: name is 'unknown'" in text and "unknown objects are hardly rejected" in text
+    assert r"skipped: fr\x1bame: name is 'unknown'" in text and "unknown objects are hardly rejected" in text
     assert "1 object: mug" in text and f"thor2 recognize FRAME --model {tmp_path / 'run'}" in text
     assert Recognizer.load(tmp_path / "run").gallery.names == ("mug",)
     assert run_thor2("evaluate", "frames", frame, "--model", tmp_path / "run", "--out", tmp_path / "report") == 0

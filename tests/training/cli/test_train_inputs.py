@@ -7,7 +7,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from commands import Command, run_thor2
+from commands import STEPS, Command, run_thor2
 from image_files import write_frame
 from PIL import Image
 
@@ -17,7 +17,6 @@ from training import train_job
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_descriptors")
 TINY = ("--embedding", 0, "--orientation-copies", 0, "--classifiers", "ce", "--epochs", 1, "--batch-size", 4, "--quiet")
-STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
 
 
 @pytest.fixture(scope="module")

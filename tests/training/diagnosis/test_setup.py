@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from commands import Command, Texts, json_lines
 from dataset_files import write_bop
+from image_files import SAMPLES
 from rendered_objects import write_box
 from toy_recognizers import recognizer_that_prefers
 
-import thor2_jax
 from benchmarks.doctor import _interpolated, _zoomed
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, encode_image
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
@@ -24,8 +24,6 @@ from training.diagnosis.depth import check_depth, instance_extents
 from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.diagnosis.setup import diagnose
 from training.readers.frames import FrameFiles, frame_files
-
-SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
 
 
 @pytest.fixture(scope="module")
@@ -249,6 +247,7 @@ def test_the_command(tmp_path: Path, texts: Texts, printed: Command, refused: Co
     assert "1000" in report["findings"][0]["advice"] and report["notes"]
     assert texts(*command, "--depth-scale", 100, status=1)[0].startswith("depth-unit: ")
     assert "--mesh-scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
+    assert "no such folder" in refused(*command, "--meshes", tmp_path / "absent")
     files.color.unlink()
     assert f"{files.color} is missing" in refused(*command, "--json")
 

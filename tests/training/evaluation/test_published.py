@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from toy_recognizers import ToyRun
 
-from training.evaluation import published
 from training.evaluation.page import comparison, marked
-from training.evaluation.published import compare_with_published, published_tables
+from training.evaluation.published import compare_with_published, published_seconds, published_tables
 from training.readers.uwis import NOT_SCORED
 
 OWN: tuple[Any, Any] = [ToyRun("run", own_objects=True)] * 2, 10
@@ -37,7 +36,7 @@ def test_published_figures_are_complete() -> None:
     figures = [figure for table in thor2_tables() for cell in table["cells"] for figure in cell["accuracy"].values()]
     assert len(figures) == 5 * (75 + 17) + 7 * 7 + 5 * 6 + 4 * 7
     assert all(0 <= mean <= 100 and std is not None and 0 <= std < 10 for mean, std in figures)
-    assert all(seconds > 0 for seconds in published.published_seconds().values())
+    assert all(seconds > 0 for seconds in published_seconds().values())
     # UW-IS Occluded has 20 objects, of which the paper does not score three.
     assert {table["objects"] for table in published_tables("uwis")} == {20 - len(NOT_SCORED)}
 

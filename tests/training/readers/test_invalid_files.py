@@ -100,6 +100,7 @@ POSES = "42/images/000000_poses.yaml"
         *(("uwis", POSES, content, "does not hold") for content in ("- mug\n", "mug: {pose: [1, 2, 3]}\n")),
         ("uwis", POSES, "mug: {label: true}\n", "label True has the name 'mug'"),
         ("uwis", POSES, "12: {label: 1}\n", "label 1 has the name 12"),
+        ("uwis", POSES, "' ': {label: 1}\n", "label 1 has the name ' '"),
         ("uwis", POSES, "a: {label: 1}\nb: {label: 1}\n", "'a' and 'b'"),
         *(("folder", "b/labels.json", {"labels": names}, "is invalid") for names in (["mug"], {"1.0": "mug"})),
         ("folder", "b/labels.json", {"labels": {"1": None}}, "name None"),

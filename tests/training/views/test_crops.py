@@ -8,7 +8,7 @@ from unittest import mock
 import cv2
 import numpy as np
 import pytest
-from commands import run_thor2
+from commands import STEPS, run_thor2
 from refusals import assert_refused
 from scipy.ndimage import generic_filter
 from written_files import files_of
@@ -121,7 +121,7 @@ SIZE = 24
 
 def render_command(meshes: Path, out: Path) -> list[object]:
     """Return the command that renders them, but for the size of the crops."""
-    options = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1, "--illumination", "--copies", 1, "--quiet")
+    options = (*STEPS, "--illumination", "--copies", 1, "--quiet")
     return ["render", "--meshes", meshes, "--out", out, *options, "--crops"]
 
 
