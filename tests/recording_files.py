@@ -102,11 +102,14 @@ def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
 
 
 def write_images(
-    write: Any, frame: thor2.RGBDFrame, arrival: int = START, stamp: int = START, camera: bool = True, **color: Any
+    write: Any, frame: thor2.RGBDFrame, arrival: int, stamp: int, gap: int = 0, camera: bool = True, **color: Any
 ) -> None:
-    """Write the messages of one frame, uncompressed; `color` has further fields of the colour image."""
+    """Write the messages of one frame, uncompressed, whose depth is taken `gap` nanoseconds after colour.
+
+    `color` has further fields of the colour image.
+    """
     write(COLOR, image(frame.color, "rgb8", stamp, **color), arrival)
-    write(DEPTH, image(frame.depth, "16UC1", stamp), arrival)
+    write(DEPTH, image(frame.depth, "16UC1", stamp + gap), arrival + gap)
     if camera:
         write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), arrival)
 
@@ -127,10 +130,9 @@ def write_recording(
                 jpeg = encode_image(frame.color, "JPEG", quality=95)
                 write(f"{COLOR}/compressed", compressed(jpeg, "rgb8; jpeg compressed bgr8", stamp), stamp)
                 write(f"{DEPTH}/compressedDepth", compressed_depth(frame.depth, stamp + gap), stamp + gap)
+                write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), stamp)
             else:
-                write(COLOR, image(frame.color, "rgb8", stamp), stamp)
-                write(DEPTH, image(frame.depth, "16UC1", stamp + gap), stamp + gap)
-            write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), stamp)
+                write_images(write, frame, stamp, stamp, gap)
     return path
 
 

@@ -41,7 +41,6 @@ from .conftest import Files
 @pytest.fixture
 def http(teaching_url: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
     """The service with an empty gallery; it still answers after the test."""
-    shutil.rmtree(gallery, ignore_errors=True)
     with httpx.Client(base_url=teaching_url, timeout=HANG) as client:
         yield client
         shutil.rmtree(gallery, ignore_errors=True)
