@@ -104,7 +104,7 @@ def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
 def write_images(
     write: Any, frame: thor2.RGBDFrame, arrival: int, stamp: int, gap: int = 0, camera: bool = True, **color: Any
 ) -> None:
-    """Write the messages of one frame, uncompressed, depth `gap` nanoseconds later.
+    """Write the messages of one frame, uncompressed, whose depth is taken `gap` nanoseconds after colour.
 
     `color` has further fields of the colour image.
     """

@@ -7,10 +7,10 @@ import numpy as np
 from thor2_jax.types import Cloud
 
 
-def aligned_cloud(seed: int, n: int, size: Sequence[float] = (0.76, 0.4, 0.68)) -> Cloud:
+def aligned_cloud(seed: int, n: int) -> Cloud:
     """Return random points in the first octant, none within 1e-5 of a border of slices or strips, and colours."""
     rng = np.random.default_rng(seed)
-    points = (rng.random((n, 3)) * size).astype(np.float32)
+    points = (rng.random((n, 3)) * (0.76, 0.4, 0.68)).astype(np.float32)
     for axis, width in ((0, 0.025), (2, 0.1)):
         border = np.round(points[:, axis] / width) * width
         points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)

@@ -27,7 +27,6 @@ from thor2_jax.service.answers import why_answer
 from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine, recognize
 from thor2_jax.service.metrics import Metrics
 from thor2_jax.service.preparation import (
-    Prepare,
     PreparedRequest,
     prepare_clouds,
     prepare_frame,
@@ -366,7 +365,10 @@ class Service:
             self.engine.read_gallery()
         return self.engine.objects
 
-    async def _prepare(self, request: AdmittedRequest, function: Prepare, *arguments: Any) -> PreparedRequest:
+    async def _prepare(
+        self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any
+    ) -> PreparedRequest:
+        """Call a function of `preparation` in a worker process."""
         call = self._pool.submit(function, *arguments, deadline=request.deadline)
         try:
             prepared: PreparedRequest = await asyncio.wrap_future(call)

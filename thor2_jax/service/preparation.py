@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from thor2_jax.service.decoding import check_instances, decode_frame, decode_jso
 from thor2_jax.service.problem import RequestError, field_errors
 from thor2_jax.service.schemas import LabelMap
 
-__all__ = ["Prepare", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "start_processes", "timed"]
+__all__ = ["PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "start_processes", "timed"]
 
 MAX_LABEL_RUNS = 50_000
 """Largest number of runs in the label map of an explained frame."""
@@ -55,10 +55,6 @@ class PreparedRequest:
     seconds: dict[str, float]
     label_map: LabelMap | None = None
     frame: RGBDFrame | None = None
-
-
-Prepare = Callable[..., PreparedRequest]
-"""A function such as `prepare_frame`; it and its arguments are pickled."""
 
 
 def prepare_frame(

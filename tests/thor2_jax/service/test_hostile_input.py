@@ -204,26 +204,24 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
     check_refused(http.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
 
 
+def cloud(points: bytes, colors: bytes) -> bytes:
+    """Return a body with one cloud, whose points and colours are given in JSON."""
+    return b'{"clouds": [{"points": %b, "colors": %b}]}' % (points, colors)
+
+
+ORIGIN = b"[[0, 0, 0]]"
 NO_NUMBERS = b'"1"', b"true", b"null"
 INVALID_JSON = [
     *[(body, "body") for body in (b"", b"{", b"[" * 100_000, b'{"clouds":' * 10_000, b"[]", b"\xff\xfe")],
     *[(body, "clouds") for body in (b"{}", b'{"clouds": []}', b'{"clouds": 3}')],
     (b'{"clouds": [' + b",".join([b'{"points": [], "colors": []}'] * 33) + b"]}", "clouds"),
-    (b'{"clouds": [{"points": [' + b",".join([b"[0,0,0]"] * 8193) + b'], "colors": []}]}', "clouds.0.points"),
-    (b'{"clouds": [{"points": [[0, 0, 0]], "colors": []}]}', "clouds.0.colors"),
-    (b'{"clouds": [{"points": [[0, 0, NaN]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
-    (b'{"clouds": [{"points": [[0, 0, 1e9]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
-    (b'{"clouds": [{"points": [[0, 0]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
-    (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 256]]}]}', "clouds.0.colors.0.2"),
-    (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 0.5]]}]}', "clouds.0.colors.0.2"),
-    *[
-        (b'{"clouds": [{"points": [[%b, 0, 0]], "colors": [[0, 0, 0]]}]}' % x, "clouds.0.points.0.0")
-        for x in NO_NUMBERS
-    ],
-    *[
-        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[%b, 0, 0]]}]}' % x, "clouds.0.colors.0.0")
-        for x in NO_NUMBERS
-    ],
+    (cloud(b"[" + b",".join([b"[0,0,0]"] * 8193) + b"]", b"[]"), "clouds.0.points"),
+    (cloud(ORIGIN, b"[]"), "clouds.0.colors"),
+    *[(cloud(b"[[0, 0, %b]]" % x, ORIGIN), "clouds.0.points.0.2") for x in (b"NaN", b"1e9")],
+    (cloud(b"[[0, 0]]", ORIGIN), "clouds.0.points.0.2"),
+    *[(cloud(ORIGIN, b"[[0, 0, %b]]" % x), "clouds.0.colors.0.2") for x in (b"256", b"0.5")],
+    *[(cloud(b"[[%b, 0, 0]]" % x, ORIGIN), "clouds.0.points.0.0") for x in NO_NUMBERS],
+    *[(cloud(ORIGIN, b"[[%b, 0, 0]]" % x), "clouds.0.colors.0.0") for x in NO_NUMBERS],
     (b'{"clouds": [{"points": [], "colors": [], "other": 1}]}', "clouds.0.other"),
 ]
 
