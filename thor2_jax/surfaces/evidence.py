@@ -199,27 +199,26 @@ def compared(
 
     Every instance and name is compared on its own, so that other numbers of instances and names compile nothing.
     """
+    probabilities = np.pad(probabilities, ((0, 0), (0, max(N_COMPARED - len(surfaces), 0))))
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)
     logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
-    is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
+    is_compared, values = np.zeros(index.shape, bool), np.zeros((*index.shape, 4), np.float32)
     alone = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in range(len(index))]
     best = np.full(len(index), -np.inf)
-    for k in range(index.shape[1]):
+    for k in range(N_COMPARED):
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
         # All are dispatched before the first result is awaited.
         fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
         values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
-    missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
-    arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
-    changed = np.array(probabilities)
-    for row in range(len(changed)):
+    arguments = largest, probabilities.sum(axis=1), is_compared, values
+    for row in range(len(probabilities)):
         shares, factor = map(np.asarray, _changed(*(jnp.asarray(each[row : row + 1]) for each in arguments)))
-        changed[row, index[row]] = shares[0, : index.shape[1]]
-        changed[row] *= factor[0]
-    return changed
+        probabilities[row, index[row]] = shares[0]
+        probabilities[row] *= factor[0]
+    return probabilities[:, : len(surfaces)]
 
 
 def compile_comparison(samples: Sample) -> None:

@@ -82,9 +82,8 @@ def test_the_surface_of_a_class_is_not_in_free_space(surfaces: Surfaces, views: 
         ]
     )
     assert (free[0] < 0.01).all() and (free[1] > 0.03).all() and (free[2] == 0).all() and (free[3] < 0.01).all()
-    turned = [
-        (xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in half
-    ]  # without `around`, any frame will do
+    # Without `around`, any frame will do.
+    turned = [(xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in half]
     for each in (half, turned):
         np.testing.assert_array_equal(evidence(surfaces, PointClouds.pack(each), classes)[:, 3], 0)
 
