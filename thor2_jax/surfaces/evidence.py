@@ -27,7 +27,6 @@ __all__ = [
     "Sample",
     "compared",
     "compile_comparison",
-    "evidence",
     "fit_poses",
     "fit_rows",
     "sample_points",
@@ -83,26 +82,16 @@ class Sample(NamedTuple):
     is_empty: jax.Array
 
 
-def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
-    """Return how well each instance fits a class.
-
-    Args:
-        surfaces: surfaces of the classes.
-        clouds: [B, N] clouds in metres, in any frame (with `around`: in the camera frame); padding follows the points.
-        class_index: [B] int.
-
-    Returns:
-        [B, 4] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
-        correlations of chroma and of lightness, fraction of the surface in free space; zeros for an empty cloud.
-    """
-    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
-
-
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
     """Return the poses [B, 3, 4] of instances: a rotation and a shift from the camera to the class, metres.
 
     The pose of the search is refined by steps of the ICP algorithm with Cauchy weights and all points that are within
-    `NEAR` of the surface. The arguments are those of `evidence`; the pose of an empty cloud is zero.
+    `NEAR` of the surface. The pose of an empty cloud is zero.
+
+    Args:
+        surfaces: surfaces of the classes.
+        clouds: as `sample_points` takes them.
+        class_index: [B] int.
     """
     index = jnp.asarray(class_index)
     return _refined_poses(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
@@ -156,7 +145,11 @@ def with_evidence(
 
 @jax.jit
 def sample_points(clouds: PointClouds) -> Sample:
-    """Return what `evidence` compares of clouds [B, N] in metres."""
+    """Return what is compared of clouds.
+
+    Args:
+        clouds: [B, N] clouds in metres, in any frame (with `around`: in the camera frame); padding follows the points.
+    """
 
     def sample(row: tuple[jax.Array, ...]) -> Sample:
         points, colors, mask, rim, camera, around = row
@@ -177,7 +170,18 @@ def sample_points(clouds: PointClouds) -> Sample:
 
 @jax.jit
 def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the values of `evidence` for samples of B instances, and the poses [B, 3, 4] of the search."""
+    """Return how well each instance fits a class.
+
+    Args:
+        surfaces: surfaces of the classes.
+        samples: what is compared of B instances.
+        class_index: [B] int.
+
+    Returns:
+        The evidence [B, 4] float32 and the poses [B, 3, 4] of the search, zeros for an empty cloud. The evidence is the
+        logarithm of the mean point-to-plane distance divided by the roughness of the instance, the correlations of
+        chroma and of lightness, and the fraction of the surface in free space.
+    """
 
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)

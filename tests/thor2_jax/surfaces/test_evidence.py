@@ -15,7 +15,6 @@ from thor2_jax.surfaces.evidence import (
     SAMPLED,
     Sample,
     compared,
-    evidence,
     fit_poses,
     fit_rows,
     sample_points,
@@ -46,6 +45,10 @@ def views() -> list[Cloud]:
 
 OWN = np.repeat(np.arange(3), 3)
 """Class of each view."""
+
+
+def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
+    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
 
 
 def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
