@@ -186,7 +186,7 @@ def images(
         numbers = _real_numbers(bounds, (2,), dtype)
         if numbers is None or not -math.inf < numbers[0] < numbers[1] < math.inf:
             raise InputError(f"{name} is {bounds!r}; expected two finite {dtype} numbers, the smaller one first")
-    if np.shape(pixels) != (2,) or not all(map(is_positive_integer, pixels)):
+    if _real_numbers(pixels, (2,), dtype) is None or not all(map(is_positive_integer, pixels)):
         raise InputError(f"pixels is {pixels!r}; expected two positive integers")
     for name, value in (("variance", variance), ("exponent", exponent)):
         if isinstance(value, jax.core.Tracer):

@@ -268,13 +268,6 @@ class Diagrams:
     mask: jax.Array
 
 
-@jax.jit
-def _interleave(images: jax.Array, embeddings: jax.Array) -> jax.Array:
-    """Concatenate [..., S, P, P] and [..., S, R, J] slice by slice, to [..., S * (P * P + R * J)]."""
-    blocks = [a.reshape(*a.shape[:-2], -1) for a in (images, embeddings)]
-    return jnp.concatenate(blocks, axis=-1).reshape(*images.shape[:-3], -1)
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Descriptors:
@@ -302,12 +295,14 @@ class Descriptors:
         return self.embeddings.reshape(*self.overflow.shape, -1)
 
     @property
+    @jax.jit
     def tops2(self) -> jax.Array:
         """The shape and colour descriptor TOPS2, [B, S * (P * P + R * J)] (11,942 floats).
 
         It has one block [image | embedding] for each slice.
         """
-        return _interleave(self.images, self.embeddings)
+        blocks = [a.reshape(*a.shape[:-2], -1) for a in (self.images, self.embeddings)]
+        return jnp.concatenate(blocks, axis=-1).reshape(*self.images.shape[:-3], -1)
 
 
 @jax.tree_util.register_dataclass

@@ -164,7 +164,7 @@ def test_bad_heights_and_edges() -> None:
 BAD_OPTIONS: dict[str, list[Any]] = {
     "birth_range": [(1.0, 1.0), 3.0, ("0", "1")],
     "persistence_range": [(0.0, math.inf), (0.0, 1e39), (1.0, 1.0 + 1e-12)],
-    "pixels": [(8, 0), (8,), 8],
+    "pixels": [(8, 0), (8,), 8, (8, [6])],
     "variance": ["0.1", RAGGED, None, True, 0, np.float32(0), np.full(2, -1.0)],
     "exponent": [1j, -1.0],
     "diagrams": [np.zeros((3, 2)), *(thor2.Diagrams(*[births] * 3) for births in (np.zeros(3, int), [0.0, 1.0]))],

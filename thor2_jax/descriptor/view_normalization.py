@@ -385,8 +385,9 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
         axes: axes to mirror, letters of "xyz"; "" returns equal clouds. Static.
 
     Raises:
-        InputError: `axes` has another letter.
+        InputError: `axes` has another letter, or `normal` is not a batch of clouds.
     """
+    check_batch(normal)
     if not set(axes) <= set("xyz"):
         raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
     flip = jnp.array([letter in axes for letter in "xyz"])

@@ -96,7 +96,7 @@ class Evidence:
         self.contrast = contrast * known
         low = ((self.heights < FLAT) | ~depth.valid) & self.region & known
         gradient = np.asarray(cv2.morphologyEx(self.contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
-        smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
+        smooth = shrink(low & (gradient < SMOOTH * UNIT), 2)
         plain = _plain_parts(smooth, (self.contrast < UNIT) & on_support)
         beside = on_support | (~depth.valid & self.region)
         self.colored = open_round(beside & known & (self.contrast > UNIT) & ~plain)

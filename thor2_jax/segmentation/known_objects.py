@@ -99,7 +99,7 @@ def segment_known(
         objects = _divided(frame, features, labels, label, recognize, locate)
         divided = np.where(objects > 0, objects + divided.max(), divided)
     beside, known = _neighbours(divided), _Known(frame, divided, recognize)
-    things = {frozenset([number]) for number in range(1, int(divided.max()) + 1)}
+    things = {frozenset([number]) for number in beside}
     while merged := _merged(things, beside, known):
         things = merged
     result = np.zeros(labels.shape, np.int32)
@@ -176,11 +176,20 @@ class _Known:
     def look_at(self, candidates: Sequence[Parts]) -> None:
         """Recognize the new candidates in one call."""
         new = [each for each in dict.fromkeys(candidates) if each not in self.odds]
-        shown = [_shown(self._frame, self._parts, each) for each in new]
-        for each, (name, confidence) in zip(new, self._recognize(shown), strict=True):
+        for each, (name, confidence) in zip(new, self._recognize([*map(self._shown, new)]), strict=True):
             counts = name is not None and confidence >= LEAST
             self.name[each] = name if counts else None
             self.odds[each] = float(logit(min(confidence, MOST))) if counts else 0.0
+
+    def _shown(self, candidate: Parts) -> RGBDFrame:
+        """Return the section of the frame around a candidate, which has the label 1; other parts have higher labels."""
+        mask = _mask(self._parts, candidate)
+        here = window(mask, MARGIN)
+        parts, camera = self._parts[here], self._frame.intrinsics
+        labels = np.where(mask[here], 1, np.where(parts > 0, parts + 1, 0))
+        cx, cy = camera.cx - here[1].start, camera.cy - here[0].start
+        moved = dataclasses.replace(camera, cx=cx, cy=cy, width=None, height=None)
+        return RGBDFrame(self._frame.color[here], self._frame.depth[here], labels, moved)
 
 
 def _divided(
@@ -204,9 +213,8 @@ def _divided(
     while regions:
         region = regions.pop()
         parts = _parts(features, region)
-        count = int(parts.max())
-        known = _Known(frame, np.where((labels > 0) & ~region, labels + count, parts), recognize)
-        candidates = _candidates(count, _neighbours(parts))
+        known = _Known(frame, np.where((labels > 0) & ~region, labels + parts.max(), parts), recognize)
+        candidates = _candidates(_neighbours(parts))
         known.look_at(candidates)
         sizes = np.bincount(parts.ravel())
         best = max(candidates, key=lambda each: known.odds[each] * sizes[list(each)].sum())
@@ -279,9 +287,9 @@ def _neighbours(parts: NDArray[np.int32]) -> dict[int, set[int]]:
     return beside
 
 
-def _candidates(count: int, beside: dict[int, set[int]]) -> list[Parts]:
-    """Return the candidates in a region of `count` parts, the region itself first."""
-    region = frozenset(range(1, count + 1))
+def _candidates(beside: dict[int, set[int]]) -> list[Parts]:
+    """Return the candidates in a region, given the neighbours of its parts; the region itself is the first."""
+    region = frozenset(beside)
     level = {frozenset([part]) for part in region}
     candidates = {region, *level}
     for _ in range(MOST_JOINED - 1):
@@ -291,20 +299,7 @@ def _candidates(count: int, beside: dict[int, set[int]]) -> list[Parts]:
 
 
 def _mask(parts: NDArray[np.int32], candidate: Parts) -> Mask:
-    wanted = np.zeros(int(parts.max()) + 1, bool)
-    wanted[list(candidate)] = True
-    return wanted[parts]
-
-
-def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBDFrame:
-    """Return the section of a frame around a candidate; the candidate has the label 1, other parts higher labels."""
-    mask = _mask(parts, candidate)
-    here = window(mask, MARGIN)
-    labels = np.where(mask[here], 1, np.where(parts[here] > 0, parts[here] + 1, 0))
-    camera = frame.intrinsics
-    cx, cy = camera.cx - here[1].start, camera.cy - here[0].start
-    moved = dataclasses.replace(camera, cx=cx, cy=cy, width=None, height=None)
-    return RGBDFrame(frame.color[here], frame.depth[here], labels, moved)
+    return np.isin(np.arange(parts.max() + 1), list(candidate))[parts]
 
 
 def _merged(things: set[Parts], beside: dict[int, set[int]], known: _Known) -> set[Parts]:

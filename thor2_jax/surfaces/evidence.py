@@ -27,7 +27,6 @@ __all__ = [
     "Sample",
     "compared",
     "compile_comparison",
-    "evidence",
     "fit_poses",
     "fit_rows",
     "sample_points",
@@ -83,26 +82,16 @@ class Sample(NamedTuple):
     is_empty: jax.Array
 
 
-def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
-    """Return how well each instance fits a class.
-
-    Args:
-        surfaces: surfaces of the classes.
-        clouds: [B, N] clouds in metres, in any frame (with `around`: in the camera frame); padding follows the points.
-        class_index: [B] int.
-
-    Returns:
-        [B, 4] float32: logarithm of the mean point-to-plane distance divided by the roughness of the instance,
-        correlations of chroma and of lightness, fraction of the surface in free space; zeros for an empty cloud.
-    """
-    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
-
-
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
     """Return the poses [B, 3, 4] of instances: a rotation and a shift from the camera to the class, metres.
 
     The pose of the search is refined by steps of the ICP algorithm with Cauchy weights and all points that are within
-    `NEAR` of the surface. The arguments are those of `evidence`; the pose of an empty cloud is zero.
+    `NEAR` of the surface. The pose of an empty cloud is zero.
+
+    Args:
+        surfaces: surfaces of the classes.
+        clouds: as `sample_points` takes them.
+        class_index: [B] int.
     """
     index = jnp.asarray(class_index)
     return _refined_poses(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
@@ -156,7 +145,11 @@ def with_evidence(
 
 @jax.jit
 def sample_points(clouds: PointClouds) -> Sample:
-    """Return what `evidence` compares of clouds [B, N] in metres."""
+    """Return what is compared of clouds.
+
+    Args:
+        clouds: [B, N] clouds in metres, in any frame (with `around`: in the camera frame); padding follows the points.
+    """
 
     def sample(row: tuple[jax.Array, ...]) -> Sample:
         points, colors, mask, rim, camera, around = row
@@ -177,7 +170,18 @@ def sample_points(clouds: PointClouds) -> Sample:
 
 @jax.jit
 def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the values of `evidence` for samples of B instances, and the poses [B, 3, 4] of the search."""
+    """Return how well each instance fits a class.
+
+    Args:
+        surfaces: surfaces of the classes.
+        samples: what is compared of B instances.
+        class_index: [B] int.
+
+    Returns:
+        The evidence [B, 4] float32 and the poses [B, 3, 4] of the search, zeros for an empty cloud. The evidence is the
+        logarithm of the mean point-to-plane distance divided by the roughness of the instance, the correlations of
+        chroma and of lightness, and the fraction of the surface in free space.
+    """
 
     def fit(sample: Sample, index: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _fit(jax.tree.map(lambda field: field[index], surfaces), sample)
@@ -199,27 +203,26 @@ def compared(
 
     Every instance and name is compared on its own, so that other numbers of instances and names compile nothing.
     """
+    probabilities = np.pad(probabilities, ((0, 0), (0, max(N_COMPARED - len(surfaces), 0))))
     index = np.argsort(-probabilities, axis=1, kind="stable")[:, :N_COMPARED]
     largest = np.take_along_axis(probabilities, index, axis=1)
     logits = EXPONENT * np.log(np.maximum(largest, 1e-30))
-    is_compared, values = np.zeros(index.shape, bool), np.zeros((len(index), N_COMPARED, 4), np.float32)
+    is_compared, values = np.zeros(index.shape, bool), np.zeros((*index.shape, 4), np.float32)
     alone = [jax.tree.map(lambda a, row=row: a[row : row + 1], samples) for row in range(len(index))]
     best = np.full(len(index), -np.inf)
-    for k in range(index.shape[1]):
+    for k in range(N_COMPARED):
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
         # All are dispatched before the first result is awaited.
         fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
         values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
-    missing = ((0, 0), (0, N_COMPARED - index.shape[1]))
-    arguments = np.pad(largest, missing), probabilities.sum(axis=1), np.pad(is_compared, missing), values
-    changed = np.array(probabilities)
-    for row in range(len(changed)):
+    arguments = largest, probabilities.sum(axis=1), is_compared, values
+    for row in range(len(probabilities)):
         shares, factor = map(np.asarray, _changed(*(jnp.asarray(each[row : row + 1]) for each in arguments)))
-        changed[row, index[row]] = shares[0, : index.shape[1]]
-        changed[row] *= factor[0]
-    return changed
+        probabilities[row, index[row]] = shares[0]
+        probabilities[row] *= factor[0]
+    return probabilities[:, : len(surfaces)]
 
 
 def compile_comparison(samples: Sample) -> None:

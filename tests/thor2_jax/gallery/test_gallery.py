@@ -19,7 +19,7 @@ from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 from thor2_jax.networks.embedding import BACKGROUND, References
-from thor2_jax.surfaces.evidence import evidence, sample_points
+from thor2_jax.surfaces.evidence import fit_rows, sample_points
 from thor2_jax.types import PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
@@ -54,7 +54,7 @@ def gallery() -> Gallery:
 
 
 def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> None:
-    """Against `evidence` of the single object with a surface, in float64; all points of a view of a can fit it."""
+    """Against `fit_rows` of the single object with a surface, in float64; all points of a view of a can fit it."""
     mesh = builtin_objects()["soup_can_red"]
     surface = surfaces_of([mesh])
     bowl = dataclasses.replace(gallery.objects["bowl"], surface=surface.arrays)
@@ -63,7 +63,8 @@ def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> N
     scores = np.random.default_rng(0).uniform(0.1, 0.3, (3, 3)).astype(np.float32)
     changed = with_surface.compared(scores, sample_points(clouds))
     np.testing.assert_array_equal(changed[:, [0, 2]], scores[:, [0, 2]])
-    weights = np.asarray(evidence(surface, clouds, np.zeros(3, int)), np.float64) @ [-2.8, 1.5, 1.8, -15] + 2.1
+    values, _ = fit_rows(surface, sample_points(clouds), np.zeros(3, int))
+    weights = np.asarray(values, np.float64) @ [-2.8, 1.5, 1.8, -15] + 2.1
     expected = 0.2 * ((scores[:, 1].astype(np.float64) / 0.2) ** 1.5 * np.exp(weights)) ** (1 / 3)
     np.testing.assert_allclose(changed[:, 1], expected.clip(max=1), rtol=1e-3)
     assert changed[0, 1] > 2 * scores[0, 1]

@@ -23,10 +23,10 @@ from thor2_jax.networks.networks import EmbeddingSizes
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
 
 
-def random_embedding(seed: int = 0) -> Embedding:
-    embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES, seed=seed)
+def random_embedding() -> Embedding:
+    embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     basis = embedding.model.color_basis
-    basis[...] = jnp.asarray(np.random.default_rng(seed).normal(size=basis[...].shape), jnp.float32)
+    basis[...] = jnp.asarray(np.random.default_rng(0).normal(size=basis[...].shape), jnp.float32)
     return embedding
 
 

@@ -1,6 +1,7 @@
 """Pieces that are divided and merged by recognition: toy answers by the overlap with true masks."""
 
 from collections.abc import Callable, Sequence
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -71,13 +72,9 @@ def test_a_piece_with_one_known_object_or_one_answer_remains(known: NDArray[np.b
 
 
 def test_candidates_are_shown_where_they_are() -> None:
-    shown: list[RGBDFrame] = []
-
-    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        shown.extend(frames)
-        return [(None, 0.0)] * len(frames)
-
+    recognize = Mock(side_effect=lambda frames: [(None, 0.0)] * len(frames))
     segment_known(FRAME, TRUTH, recognize, nowhere)
+    shown = [frame for call in recognize.call_args_list for frame in call.args[0]]
     points = backproject(FRAME.depth_m, FRAME.intrinsics)[TRUTH == 1]
     whole = [frame for frame in shown if (frame.label_image == 1).sum() == len(points)]
     assert whole and all((frame.label_image > 1).any() for frame in whole)
@@ -131,18 +128,14 @@ def test_an_object_gets_all_pixels_on_its_surface(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("seen", [0, 3])
 def test_a_surface_with_few_of_the_points_changes_no_mask(seen: int) -> None:
-    recognized: list[int] = []
-
-    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        recognized.append(len(frames))
-        return [("0", 0.985)] * len(frames)
+    recognize = Mock(side_effect=lambda frames: [("0", 0.985)] * len(frames))
 
     def locate(frame: RGBDFrame) -> dict[int, Distances]:
         return {1: lambda points: np.where(np.arange(len(points)) < seen, 0.0, 1.0)}
 
     labels = segment_known(FRAME, ONE_PIECE, recognize, locate)
     assert ((labels > 0) != (ONE_PIECE > 0)).sum() <= seen
-    assert len(recognized) < 5
+    assert recognize.call_count < 5
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from thor2_jax.surfaces.evidence import (
     SAMPLED,
     Sample,
     compared,
-    evidence,
     fit_poses,
     fit_rows,
     sample_points,
@@ -46,6 +45,10 @@ def views() -> list[Cloud]:
 
 OWN = np.repeat(np.arange(3), 3)
 """Class of each view."""
+
+
+def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
+    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
 
 
 def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
@@ -82,9 +85,8 @@ def test_the_surface_of_a_class_is_not_in_free_space(surfaces: Surfaces, views: 
         ]
     )
     assert (free[0] < 0.01).all() and (free[1] > 0.03).all() and (free[2] == 0).all() and (free[3] < 0.01).all()
-    turned = [
-        (xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in half
-    ]  # without `around`, any frame will do
+    # Without `around`, any frame will do.
+    turned = [(xyz * np.array([1, -1, -1], np.float32), rgb) for xyz, rgb in half]
     for each in (half, turned):
         np.testing.assert_array_equal(evidence(surfaces, PointClouds.pack(each), classes)[:, 3], 0)
 
