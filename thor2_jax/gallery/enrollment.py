@@ -200,13 +200,16 @@ class ObjectGallery:
         self.gallery = Gallery("", trained=trained, search=search)
         self.lock_seconds = store.LOCK_SECONDS
 
-    def open(self, directory: Path, *, reembed: bool = False) -> None:
+    def open(
+        self, directory: Path, *, reembed: bool = False, report: Callable[[int, int], Any] = lambda done, total: None
+    ) -> None:
         """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
 
         Args:
             directory: directory of the gallery.
             reembed: embed all views again with the embedding of this run, whatever their embedding was, and rebuild a
                 lost index.
+            report: function that shows the progress, called with the number of objects embedded again and of all.
 
         Raises:
             InputError: as `refresh`.
@@ -214,7 +217,7 @@ class ObjectGallery:
         """
         self.directory = directory
         if reembed and directory.exists():
-            self._change(self._reembedded, reembed=True)
+            self._change(functools.partial(self._reembedded, report), reembed=True)
         else:
             store.check_index(directory)
             self.refresh()
@@ -248,11 +251,13 @@ class ObjectGallery:
             self.gallery = self._of_run(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
             return True
 
-    def _reembedded(self, gallery: Gallery) -> Gallery:
-        objects = {}
+    def _reembedded(self, report: Callable[[int, int], Any], gallery: Gallery) -> Gallery:
+        objects, total = dict[str, GalleryObject](), len(gallery.objects)
         for name, views in gallery.objects.items():
+            report(len(objects), total)
             again = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
             objects[name] = dataclasses.replace(again, date=views.date)
+        report(total, total)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
     def _change(self, change: Callable[[Gallery], Gallery], reembed: bool = False) -> None:

@@ -7,7 +7,7 @@ import typer
 
 from thor2_jax.printable import escape_characters
 from training.cli import options
-from training.cli.app import Table, app, console, finish
+from training.cli.app import Table, app, console, finish, show_progress
 
 
 @app.command()
@@ -22,6 +22,7 @@ def objects(
             "lost index.json.",
         ),
     ] = False,
+    quiet: options.QuietOption = False,
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrollment."""
     from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists, load_gallery
@@ -29,13 +30,18 @@ def objects(
 
     if gallery is not None:
         check_exists(gallery)
+    directory = model / GALLERY_DIRECTORY if gallery is None else gallery
     if reembed:
-        from thor2_jax.recognizer import Recognizer
+        from thor2_jax.gallery.enrollment import ObjectGallery
+        from thor2_jax.model.run_directory import load_run
+        from training.storage.jobs import of_stage
 
-        Recognizer.load(model, gallery=gallery, reembed=True)
+        run = load_run(model)
+        with show_progress(quiet) as progress:
+            report = of_stage(progress, "embed")
+            ObjectGallery(run.classes, run.embedding).open(directory, reembed=True, report=report)
     description = read_description(model)
     trained, embedding = tuple(description["classes"]), description.get("embedding")
-    directory = model / GALLERY_DIRECTORY if gallery is None else gallery
     stored = load_gallery(directory, None if embedding is None else str(embedding))
     known = dataclasses.replace(stored, trained=trained)
     table = Table("name", "views", "source", "enrolled")

@@ -196,12 +196,13 @@ def test_names_that_are_invalid_are_skipped_and_few_views_noted(tmp_path: Path, 
     assert report["instances"]["no_class"] == {"unknown": 1} and report["instances"]["scored"] == 1
 
 
-def test_a_lost_index_is_rebuilt_by_the_command(model: Path, printed: Command, refused: Command) -> None:
+def test_a_lost_index_is_rebuilt_by_the_command(model: Path, texts: Texts, refused: Command) -> None:
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
     for command in (("objects",), ("forget", "brick")):
         assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in refused(*command, "--model", model)
-    table = printed("objects", "--reembed", "--model", model, "--gallery", gallery)
+    table, progress = texts("objects", "--reembed", "--model", model, "--gallery", gallery)
+    assert progress.startswith("embed: 0 of 2\n") and "embed: 2 of 2" in progress
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table) for name in ("brick", "book"))
 
 
