@@ -13,31 +13,27 @@ from thor2_jax.printable import escape_characters
 
 __all__ = ["name_style", "plain_text", "png_bytes", "save_figure"]
 
-_DPI = 130
+_PNG: dict[str, Any] = {"format": "png", "dpi": 130, "bbox_inches": "tight"}
+"""Format of pictures; "tight", since matplotlib's layouts may cut off a label beside axes of equal scales."""
 
 _FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
 """Fonts for names; missing ones are skipped, and the first one comes with matplotlib."""
 
 
-def save_figure(figure: Figure, path: str | Path, *, fit: bool = False) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG, atomically.
-
-    Args:
-        figure: the figure.
-        path: path of the picture.
-        fit: resize the picture so that it contains everything that is drawn.
 
     Raises:
         OSError: the file cannot be written.
     """
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, format="png", bbox_inches="tight" if fit else None)
+        figure.savefig(temporary, **_PNG)
 
 
 def png_bytes(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     stream = io.BytesIO()
-    figure.savefig(stream, dpi=_DPI, format="png")
+    figure.savefig(stream, **_PNG)
     return stream.getvalue()
 
 

@@ -43,11 +43,11 @@ class ExplanationPicture:
 
 
 def _figure(width: float = 5.2, height: float = 4.4, rows: int = 1, columns: int = 1, **options: Any) -> Any:
-    """Return a figure, whose size is in inches, and its axes; the other arguments are a layout and those of `subplots`.
+    """Return a figure, whose size is in inches, and its axes; the other arguments are those of `subplots`.
 
     With 130 pixels per inch, a picture of the default size is legible on a telephone, too.
     """
-    figure = Figure(figsize=(width, height), layout=options.pop("layout", "constrained"))
+    figure = Figure(figsize=(width, height), layout="compressed")
     return figure, figure.subplots(rows, columns, **options)
 
 
@@ -104,7 +104,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     shown[known] = colored[:, :3]
     wide = color.shape[1] > 1.5 * color.shape[0]
     shape = (5.4, 2, 1) if wide else (3.8, 1, 2)
-    figure, (first, second) = _figure(5.2, *shape, layout="compressed")
+    figure, (first, second) = _figure(5.2, *shape)
     first.imshow(color)
     second.imshow(shown)
     first.set_title("the object", fontsize=10)
@@ -121,7 +121,7 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
 
 
 def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
-    figure, axes = _figure(layout="compressed")  # Otherwise the label of a flat cloud is cut off.
+    figure, axes = _figure()
     instance = explanation.instance
     plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
     axes.locator_params(axis="x", nbins=3)  # More numbers of a narrow cloud overlap.

@@ -142,7 +142,7 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     axes = figure.add_axes((0, 0, 1, 1))
     plot.confusion(axes, counts, classes)
     axes.set_xlabel(f"recognized by {name} as")
-    save_figure(figure, path, fit=True)  # labels may be longer than a small matrix
+    save_figure(figure, path)
 
 
 def draw_reliability(bins: Mapping[str, Sequence[Any]], name: str, path: str | Path) -> None:

@@ -24,7 +24,7 @@ from thor2_jax.explanation import attributions, pictures
 from thor2_jax.explanation.changes import CHANGES, Change, apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions, surface_fits
-from thor2_jax.explanation.pictures import change_text, main_pictures
+from thor2_jax.explanation.pictures import change_text
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
@@ -342,14 +342,17 @@ def test_errors_name_the_argument(recognizer: Recognizer) -> None:
     assert_refused("convention", explain, Recognizer(untrained_run(CLASSES, config=released)), FRAME, 3)
 
 
-def test_texts_of_a_tall_photo_and_of_a_flat_cloud_are_inside(explanation: Explanation) -> None:
-    """The titles touched the border of a photo with a ratio of sides of 1.2, and the label of an axis was cut off."""
+def test_texts_of_pictures_are_inside(explanation: Explanation) -> None:
+    """Titles touched the border of a tall photo, and labels of a flat cloud and of slices were cut off."""
     points = explanation.instance.points
     flat = (points - points.min(axis=0)) / np.ptp(points, axis=0) * [0.144, 0.03744, 0.03] - [0.5, 0.055, -1]
     instance = dataclasses.replace(explanation.instance, points=flat.astype(np.float32))
     labels = np.where(np.arange(len(FRAME.labels))[:, None] < 58, FRAME.labels, 0)
     tall = dataclasses.replace(FRAME, labels=labels)
-    photo, cloud, *_ = main_pictures(dataclasses.replace(explanation, instance=instance), tall)
-    for picture, border in ((photo, np.s_[:2]), (cloud, np.s_[:, :2])):
+    aligned = np.linspace([0, 0, 0], [0.27, 0.1, 0.28], len(points), dtype=np.float32)
+    described = dataclasses.replace(explanation.described, points=aligned)
+    changed = dataclasses.replace(explanation, instance=instance, described=described)
+    for picture in pictures.pictures(changed, tall):
         with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
-            assert (np.asarray(image)[border] == 255).all(), picture.title
+            pixels = np.asarray(image)
+            assert all((border == 255).all() for border in (pixels[:2], pixels[:, :2])), picture.title
