@@ -99,7 +99,7 @@ def fit_image_network(task: FitTask) -> StoredBaseline:
     weights = {} if task.weights is None else architecture.load_weights(model, task.weights)
     samples, label, view = _read_samples(task, architecture.size)
     held_out = task.held_out(label, view)
-    directory, rate = ("pretrained", PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
+    directory, rate = ("-".join(weights.values()), PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
     n_views = len(np.unique(np.stack([label, view])[:, ~held_out], axis=1).T)
 
     def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:

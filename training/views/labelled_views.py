@@ -42,11 +42,13 @@ class LabelledInstances:
         views: object -> its usable instances, at least one per object.
         skipped: for each unusable instance, the reason.
         crops: object -> the crops of its usable instances, all of one size; None if no crops are needed.
+        left_out: objects that `WithoutClasses` will omit.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
     skipped: Sequence[str] = ()
     crops: Mapping[str, Sequence[Crop]] | None = None
+    left_out: Sequence[str] = ()
 
     @functools.cached_property
     def digest(self) -> str:
@@ -106,8 +108,7 @@ def read_instances(
             raise InputError(f"frames: {skipped[0][1]}")
         wanted = "an object" if label_name is None else repr(label_name)
         raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
-    reasons = [reason for _, reason in skipped]
-    return LabelledInstances(views, reasons, None if crop_size is None else crops)
+    return LabelledInstances(views, [reason for _, reason in skipped], None if crop_size is None else crops)
 
 
 class WithLabelledViews:
@@ -133,7 +134,6 @@ class WithLabelledViews:
         shards = self._rendered.shards
         clouds = np.bincount([shard.label for shard in shards], [shard.views for shard in shards])
         wanted = int(max(clouds, default=0)) or CLOUDS
-        self._first = len(shards)
         self._copies = {name: min(MAX_COPIES, max(wanted // len(each) - 1, 0)) for name, each in views.items()}
         sizes = {name: len(each) * (1 + self._copies[name]) for name, each in views.items()}
         self.shards = (*shards, *(SourceShard(self.classes.index(name), size) for name, size in sizes.items()))
@@ -161,8 +161,9 @@ class WithLabelledViews:
 
     @property
     def surfaces(self) -> Surfaces | None:
-        """Surfaces of the rendered views; None if a class has labelled views only."""
-        return self._rendered.surfaces if self._rendered.classes == self.classes else None
+        """Surfaces of the rendered views; None if a class that is not left out has labelled views only."""
+        with_surfaces = {*self._rendered.classes, *self._instances.left_out}
+        return self._rendered.surfaces if with_surfaces.issuperset(self.classes) else None
 
     def read(self, index: int) -> NormalizedViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.
@@ -170,7 +171,7 @@ class WithLabelledViews:
         Raises:
             InputError: an instance is too long; also as the source of the rendered views.
         """
-        if index < self._first:
+        if index < len(self._rendered.shards):
             return self._rendered.read(index)
         label = self.shards[index].label
         name = self.classes[label]
@@ -188,7 +189,7 @@ class WithLabelledViews:
         Raises:
             InputError: as the source of the rendered views.
         """
-        if index < self._first:
+        if index < len(self._rendered.shards):
             return self._rendered.read_crops(index, size)
         assert self._instances.crops is not None
         name = self.classes[self.shards[index].label]

@@ -304,8 +304,7 @@ class WithoutClasses:
         self.classes = tuple(name for name in source.classes if name not in names)
         new = {source.classes.index(name): label for label, name in enumerate(self.classes)}
         self._kept = [index for index, shard in enumerate(source.shards) if shard.label in new]
-        kept = (source.shards[index] for index in self._kept)
-        self.shards = tuple(SourceShard(new[shard.label], shard.views) for shard in kept)
+        self.shards = tuple(SourceShard(new[each.label], each.views) for each in source.shards if each.label in new)
         self._source, self._names = source, sorted(set(names))
         self._rows = np.array(list(new))
 

@@ -128,10 +128,12 @@ def write_weights(folder: Path, seed: int = 0) -> Path:
 
 
 def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
-    weights = write_weights(tmp_path / "weights")
-    (file,) = pretrained_files(SMALL)
+    """Also after a training with others that could not be written."""
+    weights, (file,) = tmp_path / "weights", pretrained_files(SMALL)
     folder = write_run(tmp_path / "run", folds=1, epochs=1)
-    train_baselines(folder, SOURCE, [SMALL], weights=weights)
+    with mock.patch.object(StoredBaseline, "write", side_effect=OSError), pytest.raises(OSError):
+        train_baselines(folder, SOURCE, [SMALL], weights=write_weights(weights, seed=2))
+    train_baselines(folder, SOURCE, [SMALL], weights=write_weights(weights))
     stored = StoredBaseline.read(folder / "baselines" / f"{SMALL}.safetensors", NAMES)
     assert list(stored.weights) == [f"{file}.safetensors"] and stored.temperature is None
     given = load_file(weights / f"{file}.safetensors")["blocks.0.mlp.fc1.weight"].T
@@ -202,10 +204,9 @@ def test_inputs_are_scaled_and_the_background_is_zero() -> None:
     color, normals = (np.asarray(values) for values in network_inputs(crops.color, crops.normals))
     mask = crops.normals.any(axis=-1)
     assert not color[~mask].any() and not normals[~mask].any()
-    expected = (np.array([200, 30, 30]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-    np.testing.assert_allclose(color[mask], np.tile(expected, (mask.sum(), 1)), atol=1e-5)
-    expected = (np.array([0.5, 0.5, 0]) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-    np.testing.assert_allclose(normals[mask], np.tile(expected, (mask.sum(), 1)), atol=1e-5)
+    for values, pixel in ((color, np.array([200, 30, 30]) / 255), (normals, np.array([0.5, 0.5, 0]))):
+        expected = (pixel - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+        np.testing.assert_allclose(values[mask], np.tile(expected, (mask.sum(), 1)), atol=1e-5)
 
 
 def test_crop_size_is_that_of_the_largest_reader() -> None:

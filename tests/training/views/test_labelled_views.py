@@ -58,14 +58,14 @@ def test_labelled_instances_join_the_rendered_views() -> None:
 
 def test_surfaces_need_a_mesh_of_every_class() -> None:
     bowl_and_mug = rendered()
-    bowl_and_mug.surfaces = surfaces_of(builtin_objects()[name] for name in ("white_bowl", "mug_blue"))
-    views = {"mug": [instance(100)]}
-    for more, expected in (({}, bowl_and_mug.surfaces), ({"pen": [instance(101)]}, None)):
-        source = WithLabelledViews(LabelledInstances(views | more), CONFIG, bowl_and_mug)
+    both = bowl_and_mug.surfaces = surfaces_of(builtin_objects()[name] for name in ("white_bowl", "mug_blue"))
+    for name, left_out, expected in (("mug", "", both), ("pen", "", None), ("pen", "pen", both)):
+        labelled = LabelledInstances({name: [instance(100)]}, left_out=[left_out])
+        source = WithLabelledViews(labelled, CONFIG, bowl_and_mug)
         jax.tree.map(np.testing.assert_array_equal, source.surfaces, expected)
-    assert WithLabelledViews(LabelledInstances(views), CONFIG).surfaces is None
-    mug = WithoutClasses(bowl_and_mug, ["bowl"]).surfaces
-    jax.tree.map(np.testing.assert_array_equal, mug, jax.tree.map(lambda a: a[1:], bowl_and_mug.surfaces))
+    assert WithLabelledViews(labelled, CONFIG).surfaces is None
+    mug = WithoutClasses(source, ["bowl", "pen"]).surfaces
+    jax.tree.map(np.testing.assert_array_equal, mug, jax.tree.map(lambda a: a[1:], both))
     assert WithoutClasses(rendered(), ["bowl"]).surfaces is None
 
 
