@@ -19,6 +19,7 @@ from uvicorn.config import LOGGING_CONFIG
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
 
+from thor2_jax.errors import InputError
 from thor2_jax.processes import end_with_parent, ended_by_signals, signals_blocked
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
@@ -117,10 +118,18 @@ class _Supervisor(Multiprocess):
 
 
 def _create_worker(settings: Settings, workers: int) -> FastAPI:
-    """Create the application of one process; a worker finishes the accepted requests when its parent has ended."""
+    """Create the application of one process; a worker finishes the accepted requests when its parent has ended.
+
+    Raises:
+        InputError, OSError: as `create_app`, in a single process.
+        SystemExit: the same in a worker, which replaces another one after the run has changed.
+    """
     end_with_parent(signal.SIGTERM)
     with ended_by_signals():  # uvicorn's handler would wait for the compilation.
-        return create_app(settings, workers)
+        try:
+            return create_app(settings, workers)
+        except (InputError, OSError) as error:
+            raise error if workers == 1 else SystemExit(f"error: a worker cannot start: {error}") from None
 
 
 class TimedConnection(HttpToolsProtocol):

@@ -202,22 +202,19 @@ class _Handler(BaseHTTPRequestHandler):
         elif self.path in _FILES:
             file, kind = _FILES[self.path]
             content = file.read_bytes()
-            self._start(kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
+            self._start(kind, {"Content-Length": str(len(content))})
             self.wfile.write(content)
         else:
             self.send_error(404)
 
-    def _start(self, kind: str) -> None:
+    def _start(self, kind: str, headers: dict[str, str]) -> None:
         self.send_response(200)
-        self.send_header("Content-Type", kind)
-        for name, value in _HEADERS.items():
+        for name, value in {"Content-Type": kind, **_HEADERS, **headers}.items():
             self.send_header(name, value)
+        self.end_headers()
 
     def _send_events(self) -> None:
-        self._start("text/event-stream")
-        self.end_headers()
+        self._start("text/event-stream", {})
         number = 0
         while not self.server.is_stopping.is_set():
             message = self.server.broadcast.wait(number, KEEP_ALIVE)

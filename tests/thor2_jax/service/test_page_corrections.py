@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from page_actions import answered, assert_fits, changed_answers, wait_for_answer
+from page_actions import answered, assert_fits, changed_answers, upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
@@ -162,6 +162,8 @@ def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#notice-text")).to_contain_text("Another change")
     expect(page.get_by_role("button", name="Undo")).to_be_hidden()
+    upload(page, {})  # The same frame again, by a model without the object.
+    expect(page.locator("#status")).to_contain_text("recognizes 2 objects: a, b. Click an object")
 
 
 def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: Open, files: Files) -> None:

@@ -36,6 +36,9 @@ def test_missing_run_directory(workers: int, tmp_path: Path, serve: Command, cap
     with caplog.at_level("INFO"):
         assert "model: " in serve("--model", tmp_path, "--port", "0", "--workers", workers)
     assert workers == 1 or "listening at" not in caplog.text  # that is logged after the model is loaded
+    # The second one is a worker that replaces another one after the directory was removed.
+    with pytest.raises(InputError if workers == 1 else SystemExit, match="model: "):
+        server._create_worker(Settings(tmp_path), workers)
 
 
 def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:

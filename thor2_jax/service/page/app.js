@@ -89,6 +89,7 @@ async function recognize(title, fileSource, fields, selected = () => null, histo
     loaded ??= await load();
     let files = await fileSource();
     const answer = await whenStarted(() => service.explain(files, signal), signal);
+    await readModel(); // Other clients may have changed its objects.
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
     const { width, height } = answer.label_map;
     if (!files.labels && width === bitmap.width) {
@@ -120,7 +121,7 @@ function show(answer, bitmap, selected) {
   const unknown = instances.length - named.length;
   const empty = history ? "there are no masks" : "the label image is 0 everywhere";
   if (!instances.length) setStatus(`${title}: no objects: ${empty}.`);
-  else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown. ${unknownHint()}` : "."}`);
+  else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown. ${unknownHint(instances)}` : "."}`);
   byId("chooser").classList.add("compact");
   byId("upload").open = false;
   byId("result").hidden = false;
@@ -138,16 +139,20 @@ function show(answer, bitmap, selected) {
   if (byId("overlay").getBoundingClientRect().bottom > innerHeight) byId("status").scrollIntoView();
 }
 
-/** Return a description of the model's objects, and of how to enroll others. */
-function unknownHint() {
+/** Return a description of the model's objects, and of how to enroll the others of a frame. */
+function unknownHint(instances) {
   const { knows, teaches } = loaded.model;
   const how = teaches ? "Click an object to name it." : "Enroll objects by thor2 enroll, or here after thor2 serve --teach.";
-  return `This model recognizes ${knows}${knows.endsWith(".") ? "" : "."} ${how}`;
+  const hint = !teaches || instances.some(isInvited) ? ` ${how}` : "";
+  return `This model recognizes ${knows}${knows.endsWith(".") ? "" : "."}${hint}`;
 }
+
+/** Return whether the page asks for the name of an instance. */
+const isInvited = (instance) => instance.name === null && loaded.model.teaches && canBeNamed(instance);
 
 function objectButton(instance, color) {
   const { label, name, occluded, unrecognized } = instance;
-  const invites = name === null && loaded.model.teaches && canBeNamed(instance);
+  const invites = isInvited(instance);
   const facts = invites ? "Name this object" : unrecognized ?? (occluded ? "partly occluded" : "");
   const swatch = element("span", { className: "swatch" }, label);
   swatch.style.background = rgb(color);
@@ -222,6 +227,11 @@ async function load() {
   }
 }
 
+async function readModel() {
+  loaded.model = await service.model();
+  showClasses(loaded.model);
+}
+
 function showClasses({ classes, knows }) {
   byId("model-title").textContent = `This model recognizes ${knows}`;
   byId("classes").replaceChildren(...classes.map((name) => element("li", {}, name)));
@@ -287,9 +297,7 @@ connectWhy(() => frame.files, showProblem);
 connectNaming(
   () => frame.files,
   async (files) => {
-    loaded.model = await service.model();
-    showClasses(loaded.model);
-    if (frame?.files !== files) return;
+    if (frame?.files !== files) return readModel();
     await recognize(frame.title, async () => files, frame.fields, () => overlay.selected, frame.history);
   },
   showProblem,
