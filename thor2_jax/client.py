@@ -5,7 +5,7 @@
 >>> client.recognize(**frame)                                                       # doctest: +SKIP
 [Recognition(label=1, name='mug', confidence=0.98, ...)]
 
-With `thor2 serve --segment`, frames need no labels; `recognize_frame` also returns the labels of the segmentation:
+A service with a segmenter needs no labels; `recognize_frame` also returns the labels of the segmentation:
 
 >>> del frame["labels"]                                                             # doctest: +SKIP
 >>> recognitions, labels = client.recognize_frame(**frame)                          # doctest: +SKIP

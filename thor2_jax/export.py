@@ -40,7 +40,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         platforms: platforms to run on, from `PLATFORMS`.
 
     Returns:
-        Serialized `jax.export.Exported`: a function of the fields of `PointClouds` (points [B, N, 3], colors [B, N, 3],
+        Serialized `jax.export.Exported`: a function of six fields of `PointClouds` (points [B, N, 3], colors [B, N, 3],
         mask [B, N], camera [B, 3], boundary [B, N], rim [B, N]) that returns a dictionary with the class probabilities
         [B, C] of each classifier and overflow [B]. An embedding that recognizes the classes is the classifier
         "embedding"; its probabilities sum to the probability that the object is one of the classes.

@@ -147,7 +147,10 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
     @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
-        """Recognize every instance of a frame and return its cloud, persistence images and colours, too."""
+        """Recognize every instance of a frame and return its cloud, persistence images and colours, too.
+
+        A frame without labels is segmented.
+        """
         async with service.admit(request, partial(read_form, form=schemas.FRAME_FORM)) as (admitted, files):
             arguments = *await service.recognize(files, admitted, with_label_map=True), admitted.milliseconds()
             content = await run_in_threadpool(lambda: explained_frame(*arguments).model_dump_json())

@@ -277,9 +277,7 @@ def _form(properties: dict[str, Any], *optional: str) -> dict[str, Any]:
 _FRAME: dict[str, Any] = {
     "color": _file("8-bit RGB, PNG or JPEG."),
     "depth": _file("16-bit PNG in units of 1 / depth_scale metres (by default mm); 0 and 65535: no depth."),
-    "labels": _file(
-        "One-channel or indexed PNG of instance numbers; 0 is background. Without it, the frame is segmented."
-    ),
+    "labels": _file("One-channel or indexed PNG of instance numbers; 0 is background."),
     "intrinsics": {
         "type": "string",
         "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre); "
@@ -298,10 +296,7 @@ _ENROLLMENT: dict[str, Any] = {
     **_FRAME,
     "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
     "instance": _INSTANCE,
-    "extend": {
-        "type": "boolean",
-        "description": "Add the view to an existing object, even if it has an equal one.",
-    },
+    "extend": {"type": "boolean", "description": "Add the view to an existing object, unless it has an equal one."},
     "replace": {"type": "boolean", "description": "Discard the views of an existing object."},
 }
 

@@ -116,9 +116,9 @@ class FrameOptions:
         list[Path] | None,
         typer.Argument(metavar="FRAME", help="Frames: folders with color, depth, mask, intrinsics; or their parents."),
     ] = None
-    color: Annotated[Path | None, typer.Option(help="Colour image, PNG or JPEG, in place of FRAME.")] = None
-    depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None
-    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None
+    color: Annotated[Path | None, typer.Option(help="Colour image, PNG, JPEG or TIFF, in place of FRAME.")] = None
+    depth: Annotated[Path | None, typer.Option(help="Depth image: PNG, TIFF, NPY or EXR.")] = None
+    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG or TIFF; 0 is background.")] = None
     intrinsics: Annotated[
         Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
     ] = None

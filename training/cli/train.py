@@ -159,7 +159,7 @@ def train(
 
     options.check_alone("quick", quick, paper=paper)
     if (given.meshes is None) == (given.dataset is None) and (given.meshes is not None or not frames):
-        raise InputError("give one of --meshes and --dataset, --frames, or both")
+        raise InputError("give --meshes, --dataset or --frames; only --frames goes with one of the others")
     scale = options.given_values(given).get("mesh_scale")
     steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
     options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)

@@ -54,7 +54,7 @@ def watch(
         kinds = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in kinds.items() if value is not None]
         if len(given) != 1:
-            raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(kinds)}")
+            raise InputError(f"sources given: {', '.join(given) or 'none'}; expected one of {', '.join(kinds)}")
         topics: dict[str, Any] = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic}
         options.check_belongs("--bag", bag, **topics)
         given_frames = options.FrameOptions(None if folder is None else [folder], bag=bag, **topics)

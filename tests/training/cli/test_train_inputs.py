@@ -87,7 +87,7 @@ def test_invalid_inputs(
     Path("names.json").write_text(json.dumps({"mug": "no_such_scan"}))
     Path("case.json").write_text(json.dumps({"Box": "box", "box": "brick"}))
     for arguments, expected in (
-        ("", "give one of --meshes and --dataset, --frames, or both"),
+        ("", "give --meshes, --dataset or --frames"),
         ("--meshes absent", "absent: no such folder"),
         ("--meshes meshes --names names.json", "no_such_scan"),
         ("--meshes meshes --names case.json", "'Box' and 'box' differ only by case"),

@@ -71,8 +71,8 @@ def test_a_damaged_recording_ends_with_its_line(
 def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = write_frame_files(tmp_path / "frame", FRAMES[0])
     for arguments, expected in (
-        ("", "no source is given"),
-        ("--bag a.bag --realsense", "--bag and --realsense is given"),
+        ("", "sources given: none"),
+        ("--bag a.bag --realsense", "sources given: --bag, --realsense"),
         ("--folder a --color-topic /c", "--color-topic is /c; it belongs to --bag"),
         ("--folder absent", "not a directory"),
         ("--bag absent", "No such file"),
