@@ -39,7 +39,7 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
-ROOMS = "descriptor frames model networks surfaces".split()
+ROOMS = "adaptation descriptor frames gallery model networks segmentation surfaces tracking".split()
 FOLDERS = ("colornet", "thor2_jax", *(f"thor2_jax/{room}" for room in ROOMS))
 """Directories whose modules are mutated."""
 

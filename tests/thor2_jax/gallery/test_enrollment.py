@@ -111,13 +111,14 @@ def test_the_default_thresholds_of_each_source() -> None:
     The scores .3118 and .255 have the odds (.3118 / .2)^3 and (.255 / .2)^3, hence .791 and .675. A class with a view
     has .789 = (.625 + m) / (1 + m), where m = (1 - .625) .675 / (1 - .675).
     """
-    calibrated = taught(dataclasses.replace(run(), record={"calibration": CALIBRATION}))
-    calibrated.enroll("b", [BRICK], extend=True)
+    calibrated, plain = taught(dataclasses.replace(run(), record={"calibration": CALIBRATION})), taught(run())
+    for recognizer in (calibrated, plain):
+        recognizer.enroll("b", [BRICK], extend=True)
     calibrated.enroll("c", [BRICK], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
     assert calibrated.thresholds().round(4).tolist() == [0.625, 0.7892, 0.791, 0.675, 0.675]
     assert calibrated.thresholds("gallery")[1:].tolist() == [0.675, 0.791, 0.675, 0.675]
-    assert taught(run()).thresholds().tolist() == [0, 0, 0, 0.791, 0.675]
+    assert plain.thresholds().tolist() == [0, 0, 0, 0.791, 0.675]
     explicit = taught(run(), unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
     assert thor2.Recognizer(run()).model.thresholds().tolist() == [0, 0, 0]

@@ -19,7 +19,7 @@ from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 from thor2_jax.networks.embedding import BACKGROUND, References
-from thor2_jax.surfaces.evidence import fit_rows, sample_points
+from thor2_jax.surfaces.evidence import compared, sample_points
 from thor2_jax.types import PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
@@ -47,35 +47,32 @@ def enrolled(center: int, count: int = 6) -> GalleryObject:
 
 @pytest.fixture(scope="module")
 def gallery() -> Gallery:
-    gallery = Gallery("fingerprint")
-    for center, name in enumerate(("mug", "bowl", "box")):
-        gallery = gallery.with_object(name, enrolled(center, 4 + 20 * center))
-    return gallery
+    return Gallery("fingerprint", {name: enrolled(k, 4 + 20 * k) for k, name in enumerate(("mug", "bowl", "box"))})
 
 
 def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> None:
-    """Against `fit_rows` of the single object with a surface, in float64; all points of a view of a can fit it."""
+    """Against `compared` for the two objects with a surface, in float64; all points of a view of a can fit it."""
     mesh = builtin_objects()["soup_can_red"]
     surface = surfaces_of([mesh])
-    bowl = dataclasses.replace(gallery.objects["bowl"], surface=surface.arrays)
-    with_surface = dataclasses.replace(gallery, objects={**gallery.objects, "bowl": bowl})
+    objects = {name: dataclasses.replace(views, surface=surface.arrays) for name, views in gallery.objects.items()}
+    with_surfaces = dataclasses.replace(gallery, objects={**objects, "mug": gallery.objects["mug"]})
     clouds = PointClouds.pack([view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre)), *random_clouds(0, [500, 0])])
     scores = np.random.default_rng(0).uniform(0.1, 0.3, (3, 3)).astype(np.float32)
-    changed = with_surface.compared(scores, sample_points(clouds))
-    np.testing.assert_array_equal(changed[:, [0, 2]], scores[:, [0, 2]])
-    values, _ = fit_rows(surface, sample_points(clouds), np.zeros(3, int))
-    weights = np.asarray(values, np.float64) @ [-2.8, 1.5, 1.8, -15] + 2.1
-    expected = 0.2 * ((scores[:, 1].astype(np.float64) / 0.2) ** 1.5 * np.exp(weights)) ** (1 / 3)
-    np.testing.assert_allclose(changed[:, 1], expected.clip(max=1), rtol=1e-3)
+    changed = with_surfaces.compared(scores, sample_points(clouds))
+    np.testing.assert_array_equal(changed[:, 0], scores[:, 0])
+    odds = (scores[:, 1:].astype(np.float64) / 0.2) ** 3
+    known = compared(odds / (1 + odds.sum(axis=1, keepdims=True)), [surface] * 2, sample_points(clouds))
+    expected = 0.2 * (known / (1 - known.sum(axis=1, keepdims=True))) ** (1 / 3)
+    expected[0] /= expected[0].max()  # it is above 1
+    np.testing.assert_allclose(changed[:, 1:], expected, rtol=1e-3)
     assert changed[0, 1] > 2 * scores[0, 1]
-    assert with_surface.unknown_below[1] == 0.881 and with_surface.unknown_below[2] == gallery.unknown_below[2]
+    assert with_surfaces.unknown_below[1] == 0.881 and with_surfaces.unknown_below[0] == gallery.unknown_below[0]
 
 
 def test_thresholds_grow_with_the_views_of_each_object() -> None:
-    gallery = Gallery("fingerprint")
-    for views in (1, 2, 3, 4, 5, 7, 10, 120):
-        clouds = CompactClouds.of([view(0)] * views)
-        gallery = gallery.with_object(f"{views}", dataclasses.replace(enrolled(0), clouds=clouds))
+    clouds = {views: CompactClouds.of([view(0)] * views) for views in (1, 2, 3, 4, 5, 7, 10, 120)}
+    objects = {f"{views}": dataclasses.replace(enrolled(0), clouds=clouds[views]) for views in clouds}
+    gallery = Gallery("fingerprint", objects)
     # Between two numbers of views, the logarithm: .25 + .04 log(2) / log(3), and so on.
     for version, reference_views, scores in (
         (0, None, {1: 0.25, 2: 0.2752, 3: 0.29, 4: 0.3013, 5: 0.31, 7: 0.3294, 10: 0.35, 120: 0.43}),
@@ -126,6 +123,9 @@ def test_scores_of_views_and_looks_against_a_gaussian_process() -> None:
     np.testing.assert_allclose(gallery.scores(looks), mean, atol=2e-3)
     assert gallery.scores(looks[:0]).shape == (0, 2) and gallery.scores(queries).dtype == np.float32
     assert Gallery("").scores(queries).shape == (25, 0)
+    # Amid the background, the value of the only class is negative.
+    few = Gallery("f", references=references(("class", 5))).with_object("mug", enrolled(0, 4))
+    assert few.scores(views_around(9, 5, seed=1)).max() < 0.01
 
 
 def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,10 +46,9 @@ def test_a_class_that_one_classifier_rules_out_loses() -> None:
     np.testing.assert_allclose(fused_probabilities({"tops": first, "tops2": second}), [[0, 1, 0]], atol=1e-6)
 
 
-def test_the_first_classifier_wins_a_tie_and_one_is_enough() -> None:
+def test_the_first_classifier_wins_a_tie() -> None:
     first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
     np.testing.assert_array_equal(fused_probabilities({"tops": first, "tops2": second}, "max"), first)
-    np.testing.assert_allclose(fused_probabilities({"tops2": second}), second)
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])
@@ -78,15 +77,15 @@ def test_the_largest_probability_is_the_confidence() -> None:
 
 
 def test_extreme_probabilities_have_a_score_below_one() -> None:
-    np.testing.assert_array_equal(answer_features(np.array([[1.0, 0.0]]), np.zeros((1, 2))), [[8, -8]])
+    above = np.array([[1 + 1e-7, 0.0]] * 2)  # rounding errors can bring a sum above 1
+    np.testing.assert_array_equal(answer_features(above, above * [[0], [1]]), [[8, -8], [8, 8]])
     steep = dataclasses.replace(CALIBRATION, correct_factor=100.0, known_factor=100.0)
     score = steep.score(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]))
     assert 0.999 < score[0] < 1
 
 
 def test_records_without_a_third_function_are_read() -> None:
-    record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
-    calibration = Calibration(**record)
+    calibration = Calibration(**{name: value for name, value in RECORD.items() if not name.startswith("score")})
     np.testing.assert_allclose(calibration.confidence(FUSED, EMBEDDED), CALIBRATION.score(FUSED, EMBEDDED))
 
 

@@ -28,11 +28,11 @@ ANSWERS = [Recognition(1, "mug", 0.75), Recognition(2, "bowl", 0.5), Recognition
 
 
 def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
-    scene, tables = frame(), ResultTables(["table/000007"], ["bowl", "mug"])
-    tables.add("table/000007", scene, detections_of(scene, ANSWERS), 0.25)
+    scene, tables = frame(), ResultTables(["8/7", "9/7"], ["bowl", "mug"])
+    tables.add("9/7", scene, detections_of(scene, ANSWERS), 0.25)
     tables.write(coco=tmp_path / "results.json")
     dataset = COCO()
-    images, categories = [{"id": 1, "height": 40, "width": 60}], [{"id": 1}, {"id": 2}]
+    images, categories = [{"id": 2, "height": 40, "width": 60}], [{"id": 1}, {"id": 2}]
     dataset.dataset = {"images": images, "annotations": [], "categories": categories}
     dataset.createIndex()
     loaded = dataset.loadRes(str(tmp_path / "results.json"))
@@ -42,9 +42,9 @@ def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
         mask = scene.label_image == label
         entry = annotations[category]
         np.testing.assert_array_equal(loaded.annToMask(entry).astype(bool), mask)
-        assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 1
+        assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 2
         np.testing.assert_array_equal(entry["bbox"], coco_mask.toBbox(entry["segmentation"]))
-        assert entry["frame"] == "table/000007" and entry["category_name"] == ANSWERS[label - 1].name
+        assert entry["frame"] == "9/7" and entry["category_name"] == ANSWERS[label - 1].name
     assert annotations[2]["bbox"] == [10, 5, 20, 15]
 
 

@@ -38,4 +38,5 @@ def test_a_match_has_the_largest_total_overlap() -> None:
     pairs = match(first, second)
     assert total(pairs) == pytest.approx(best) and best > 0.5
     assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
-    assert match([], second) == match(first, []) == []
+    here, beside = occupied_voxels(patch(0.0)), occupied_voxels(patch(0.075, 0.075))
+    assert match([], second) == match(first, []) == match([here], [beside]) == [] and overlap(here, beside) > 0.1

@@ -23,6 +23,8 @@ run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), 
 class ToyRecognizer(Recognizer):
     """Answers by the mean colour of an instance, whose channels are class probabilities in 1/255."""
 
+    overflow = 0
+
     def __init__(self) -> None:
         super().__init__(run())
         self.described: list[PreparedInstance] = []
@@ -32,7 +34,7 @@ class ToyRecognizer(Recognizer):
         usable = [each for each in given if each.reason is None]
         self.described += usable
         p = np.array([each.colors.mean(axis=0) / 255 for each in usable])
-        return given, Inference(np.zeros(len(p), int), {"tops": p, "tops2": p})
+        return given, Inference(np.full(len(p), self.overflow), {"tops": p, "tops2": p})
 
 
 SURE_A, UNSURE_B = (230, 15, 10), (100, 125, 30)
@@ -60,6 +62,9 @@ def test_a_view_of_fewer_points_has_a_smaller_weight() -> None:
     first *= 0.5 ** (1 / 30)  # a view loses half of its weight in 30 further ones
     mean = np.exp(np.average(np.log([SURE_A, UNSURE_B]), axis=0, weights=[first, second]))
     assert second < first / 2 and answer.confidence == pytest.approx(mean[0] / mean.sum(), abs=1e-4)
+    recognizer.overflow = 10_000  # a view outside the grid does not count
+    (overflowed,) = tracker.update(frame_of_squares({1: (10, 10, UNSURE_B)}))
+    assert (overflowed.name, overflowed.confidence) == (None, pytest.approx(answer.confidence))
     whole, hidden = (dataclasses.replace(recognizer.described[0], occluded=occluded) for occluded in (False, True))
     assert view_weight(hidden) == view_weight(whole) / 2
 
@@ -120,13 +125,10 @@ def test_a_track_ends_when_its_object_is_gone() -> None:
     tracker = Tracker(ToyRecognizer())
     empty, full = frame_of_squares({}), frame_of_squares({1: (10, 10, SURE_A)})
     assert tracker.update(empty) == [] and tracker.tracks() == []
-    assert tracker.update(full)[0].track == 1
-    for _ in range(9):
-        tracker.update(empty)
-    assert tracker.update(full)[0].track == 1
-    for _ in range(10):
-        tracker.update(empty)
-    assert tracker.update(full)[0].track == 2
+    for n_missed, number in ((0, 1), (9, 1), (10, 2)):
+        for _ in range(n_missed):
+            tracker.update(empty)
+        assert tracker.update(full)[0].track == number
     (unusable,) = tracker.update(frame_of_squares({3: (5, 5, SURE_A)}, 3))
     assert (unusable.label, unusable.track, unusable.name) == (3, None, None) and unusable.reason
 

@@ -74,13 +74,14 @@ def test_the_view_that_tells_the_classes_apart_is_chosen() -> None:
 
 
 def test_the_expected_entropy_is_a_mean_over_classes() -> None:
-    """With one view of each class, every candidate leads to the answer of that view."""
-    p, answers = np.array([0.6, 0.4]), np.array([[0.9, 0.1], [0.3, 0.7]])
+    """With one view of a class, every candidate leads to the answer of that view. A class without views is left out."""
+    p, answers = np.array([0.5, 0.1, 0.4]), np.array([[0.8, 0.1, 0.1], [0.3, 0.1, 0.6]])
     rotation = poses(np.zeros(3))[0][:3, :3]
-    views = ViewTable(np.arange(2), np.stack([rotation, rotation]), answers)
+    views = ViewTable(np.array([0, 2]), np.stack([rotation, rotation]), answers)
     chosen = next_view(p, CENTRE, poses()[0], poses()[2:4], views)
     posteriors = p * answers / (p * answers).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(chosen.expected, p @ [entropy(row) for row in posteriors], rtol=1e-6)
+    mean = p[[0, 2]] @ [entropy(row) for row in posteriors] / 0.9
+    np.testing.assert_allclose(chosen.expected, mean, rtol=1e-6)
     views = ViewTable(np.zeros(1, int), rotation[None], np.array([[0.6, 0.4]]))
     without = next_view([0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], views)
     np.testing.assert_allclose(without.expected, without.entropy)  # no view of the only plausible class
