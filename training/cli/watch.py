@@ -82,8 +82,9 @@ def watch(
         view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
         n_shown = 0
         try:
-            for n_shown, recorded in enumerate(frames, 1):  # noqa: B007 -- used after the loop
+            for recorded in frames:
                 view.show(recorded)
+                n_shown += 1
         except (InputError, OSError) as error:
             view.publish_state("failed", str(error))
             time.sleep(NOTICE_SECONDS)
