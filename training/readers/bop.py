@@ -45,16 +45,16 @@ class BOP(LabelledFrames):
             names: YAML or JSON file, obj_id -> name. Default: obj_000001 and so on.
 
         Raises:
-            InputError: there are no frames, or `names` is damaged.
+            InputError: there are no frames, a scene has none, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
         path = self.dataset_folder(named_path(path))
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
         self.sources = [image for scene in scenes for image in _images(scene / "rgb")]
         self.identifiers = [f"{_scene(image).name}/{image.stem}" for image in self.sources]
-        if not self.sources:
+        if lacking := [scene for scene in scenes or [path] if not _images(scene / "rgb")]:
             raise InputError(
-                f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
+                f"dataset: {lacking[0]} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
         self._names_file = names
         self._names = None if names is None else read_object_names(as_path(names, "names"))

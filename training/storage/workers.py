@@ -43,7 +43,7 @@ class WorkerPool(Protocol):
     """Function that maps another function over items, several at a time, and yields the results in their order."""
 
     def __call__(self, function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
-        """Apply `function`, which must be picklable like the items; closing the generator ends the running tasks."""
+        """Apply `function`, which must be picklable like the items; a closed generator begins no more tasks."""
 
 
 def _map_ordered(

@@ -90,6 +90,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: C
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
     error = refused(*command, "--out", tmp_path / "other")  # without names, all objects are unknown
     assert "obj_000013, obj_000014, the runs have bowl, mug" in error and not (tmp_path / "other").exists()
+    (tmp_path / "test" / "000049" / "rgb").rename(tmp_path / "rgb")
+    assert "000049 has no scene_camera.json beside rgb" in refused(*command)
 
 
 def test_a_scene_without_ground_truth_can_be_segmented(tmp_path: Path) -> None:
