@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import logging
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,15 @@ UNSUPPORTED_EXTENSIONS = {
 }
 """Extensions of glTF that trimesh ignores, so that it fails, or reads other vertices or colours."""
 
+MISREAD_TEXT = {
+    ".obj": rb"(?m)^v(?=(?:[ \t]+\S+){6})(?:[ \t]+\S+){3,5}[ \t]+(?:[2-9]|\d\d+)(?:\.\d*)?\s",
+    ".ply": rb"TextureFile(?s:.*)TextureFile|property\s+(?:ushort|uint16)\s+red",
+}
+"""Vertex colours above 1 in an OBJ; several textures or colours of 16 bits in a PLY: trimesh misreads their colours."""
+
+FLOAT, UNSIGNED_SHORT = 5126, 5123
+"""Types of numbers in glTF."""
+
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
@@ -70,6 +80,12 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours; export the mesh with its colours")
     uv, texture = _texture(visual, faces)
+    colors = visual.vertex_attributes.get("color", geometry.vertex_attributes.get("color"))
+    if colors is not None and texture.size == 3:  # a plain colour multiplies the vertex colours
+        colors = colors[:, :3] / (1 if colors.dtype.kind == "f" else np.iinfo(colors.dtype).max)
+        corners = np.rint((colors * texture[0, 0]).clip(0, 255)).astype(np.uint8)[faces]
+        if (corners != texture[0, 0]).any():
+            return TexturedMesh(vertices, faces, corner_colors=corners)
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
@@ -106,18 +122,36 @@ def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32]
     return uv, texture
 
 
+def _check_text(path: Path) -> None:
+    """Raise InputError if an OBJ (its first megabytes) or the header of a PLY has colours that trimesh misreads."""
+    content = read_file(path)[: 2**24].partition(b"end_header")[0]
+    if re.search(MISREAD_TEXT[path.suffix.lower()], content):
+        raise InputError(
+            "its colours cannot be read; expected one texture, or colours of 8 bits (from 0 to 1 in an OBJ)"
+        )
+
+
 def _check_glb(path: Path) -> None:
-    """Raise InputError if a GLB uses an extension of glTF that is not supported, or holds a damaged base texture."""
+    """Raise InputError if a GLB uses parts of glTF that are not supported, or holds a damaged base texture."""
     content = read_file(path)
     if not content.startswith(b"glTF"):
         raise InputError("it is not a GLB file; export or copy it again")
     end = 20 + int.from_bytes(content[12:16], "little")
     header = json.loads(content[20:end])
-    if unsupported := UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ())):
+    unsupported = UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ()))
+    for primitive in (each for mesh in header.get("meshes", ()) for each in mesh["primitives"]):
+        types = {name: header["accessors"][number]["componentType"] for name, number in primitive["attributes"].items()}
+        if types.get("TEXCOORD_0", FLOAT) != FLOAT:
+            unsupported.add("texture coordinates that are integers")
+        if types.get("COLOR_0") == UNSIGNED_SHORT and "material" not in primitive:
+            unsupported.add("vertex colours of 16 bits without a material")
+    if unsupported:
         uses = f"it uses {', '.join(sorted(unsupported))}"
         raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
     for material in header.get("materials", ()):
         base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if base is not None and base.get("texCoord"):
+            raise InputError("its texture uses a second set of texture coordinates; export the mesh with one set")
         if base is None or "source" not in (texture := header["textures"][base["index"]]):
             continue
         image = header["images"][texture["source"]]
@@ -195,8 +229,8 @@ def _read(path: Path) -> TexturedMesh:
                 missing.append(name)
                 raise
 
-    if path.suffix.lower() == ".glb":
-        _check_glb(path)  # before trimesh fails with another message
+    check = _check_glb if path.suffix.lower() == ".glb" else _check_text
+    check(path)  # before trimesh fails with another message
     # Processing would silently drop vertices that are not finite.
     scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
     if missing:

@@ -1,7 +1,9 @@
 """Meshes and tables of names: files written by trimesh, known colours, and invalid files."""
 
+import functools
 import json
 import logging
+import operator
 import os
 from pathlib import Path
 from typing import Any
@@ -50,6 +52,16 @@ FACTOR = np.array([128, 255, 51, 255], np.uint8)
 SCALED = np.rint(np.array(QUADRANTS) * FACTOR[:3] / 255).tolist()
 CORNERS = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
 BETWEEN = [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
+WITHOUT_GREEN = [[red, 0, 0] for red, _, _ in BETWEEN]
+
+
+def colored_material(material: PBRMaterial) -> trimesh.Trimesh:
+    """Return a quad with vertex colours and a material without a texture, as Blender exports it."""
+    quad = textured_quad(material)
+    quad.visual.vertex_attributes["color"] = np.insert(CORNERS, 3, 255, axis=1)
+    return quad
+
+
 QUADS: dict[str, tuple[Any, str, Any]] = {
     "texture of a GLB": (textured_quad(PBR), "glb", QUADRANTS),
     "texture of an OBJ": (textured_quad(SIMPLE), "obj", QUADRANTS),
@@ -57,6 +69,8 @@ QUADS: dict[str, tuple[Any, str, Any]] = {
     "texture and factor": (textured_quad(PBRMaterial(**TEXTURE, baseColorFactor=FACTOR)), "glb", SCALED),
     "vertices of a GLB": (colored(QUAD, CORNERS), "glb", BETWEEN),
     "vertices of a PLY": (colored(QUAD, CORNERS), "ply", BETWEEN),
+    "vertices with a material": (colored_material(PBRMaterial()), "glb", BETWEEN),
+    "vertices and factor": (colored_material(PBRMaterial(baseColorFactor=[255, 0, 255, 255])), "glb", WITHOUT_GREEN),
 }
 
 
@@ -152,17 +166,27 @@ def test_vertices_without_faces_are_dropped(tmp_path: Path) -> None:
         np.testing.assert_allclose(load_mesh(tmp_path / "quad.ply").centre, [0.05, 0.05, 0])
 
 
-@pytest.mark.parametrize("name", ["KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"])
-def test_unsupported_extensions_of_gltf(tmp_path: Path, name: str) -> None:
+EXTENSIONS = ("KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        *((("extensionsUsed",), [name], f"it uses {name}") for name in EXTENSIONS),
+        (("accessors", 2, "componentType"), 5123, "integers"),
+        (("materials", 0, "pbrMetallicRoughness", "baseColorTexture", "texCoord"), 1, "second set"),
+    ],
+)
+def test_unsupported_parts_of_gltf(tmp_path: Path, path: tuple[Any, ...], value: Any, message: str) -> None:
     """The buffer has no content, as in the files of gltfpack."""
 
-    def compress(tree: dict[str, Any]) -> None:
-        tree["extensionsUsed"] = [name]
+    def change(tree: dict[str, Any]) -> None:
+        functools.reduce(operator.getitem, path[:-1], tree)[path[-1]] = value
         for view in tree["bufferViews"]:
             view["buffer"] = 1
 
-    textured_quad(PBR).export(tmp_path / "quad.glb", tree_postprocessor=compress)
-    check_refused(tmp_path / "quad.glb", f"it uses {name}")
+    textured_quad(PBR).export(tmp_path / "quad.glb", tree_postprocessor=change)
+    check_refused(tmp_path / "quad.glb", message)
 
 
 def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
@@ -176,6 +200,15 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
     check_refused(tmp_path / "quad.glb", "no texture coordinates")
     (tmp_path / "quad.glb").write_bytes(content.replace(b"\x89PNG", b"\0PNG"))
     check_refused(tmp_path / "quad.glb", "its texture is damaged")
+
+
+def test_vertex_colours_that_trimesh_misreads(tmp_path: Path) -> None:
+    rows = "".join(f"v {x} {y} {z} {x * 2000} 0 0\n" for x, y, z in QUAD)
+    (tmp_path / "quad.obj").write_text(rows + "f 1 2 3 4\n")
+    check_refused(tmp_path / "quad.obj", "from 0 to 1")
+    for old, new in ((b"uchar red", b"ushort red"), (b"1.0\n", b"1.0\ncomment TextureFile a\ncomment TextureFile b\n")):
+        (tmp_path / "quad.ply").write_bytes(ASCII_PLY.replace(old, new, 1))
+        check_refused(tmp_path / "quad.ply", "colours cannot be read")
 
 
 def test_mirrored_parts_stay_the_right_way_out(tmp_path: Path) -> None:
