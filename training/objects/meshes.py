@@ -112,8 +112,7 @@ def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32]
         raise InputError("a texture, but no texture coordinates; export the mesh with them")
     if image.mode.startswith(("I", "F")):  # Pillow would convert it to white
         raise InputError(f"a texture with pixels of mode {image.mode}; expected 8 bits per channel; convert it")
-    is_simple = isinstance(material, SimpleMaterial)
-    if is_simple and not material.kwargs and np.array_equal(image, empty_material().image):
+    if isinstance(material, SimpleMaterial) and not material.kwargs and np.array_equal(image, empty_material().image):
         raise InputError("texture coordinates, but no material with a texture or a colour")
     uv = np.reshape(np.asarray(visual.uv, np.float32)[faces], (len(faces), 3, 2))
     texture = np.asarray(image.convert("RGB"))
@@ -126,9 +125,7 @@ def _check_text(path: Path) -> None:
     """Raise InputError if an OBJ (its first megabytes) or the header of a PLY has colours that trimesh misreads."""
     content = read_file(path)[: 2**24].partition(b"end_header")[0]
     if re.search(MISREAD_TEXT[path.suffix.lower()], content):
-        raise InputError(
-            "its colours cannot be read; expected one texture, or colours of 8 bits (from 0 to 1 in an OBJ)"
-        )
+        raise InputError("its colours cannot be read; expected one texture, or 8-bit colours (0 to 1 in an OBJ)")
 
 
 def _check_glb(path: Path) -> None:
@@ -150,10 +147,10 @@ def _check_glb(path: Path) -> None:
         raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
     for material in header.get("materials", ()):
         base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        if base is not None and base.get("texCoord"):
-            raise InputError("its texture uses a second set of texture coordinates; export the mesh with one set")
         if base is None or "source" not in (texture := header["textures"][base["index"]]):
             continue
+        if base.get("texCoord"):
+            raise InputError("its texture uses a second set of texture coordinates; export the mesh with one set")
         image = header["images"][texture["source"]]
         if "bufferView" in image:  # trimesh loads the mesh without a damaged image, as white
             view = header["bufferViews"][image["bufferView"]]
