@@ -49,7 +49,8 @@ MISREAD_TEXT = {
     ".obj": rb"(?m)^v(?=(?:[ \t]+\S+){6})(?:[ \t]+\S+){3,5}[ \t]+(?:[2-9]|\d\d+)(?:\.\d*)?\s",
     ".ply": rb"TextureFile(?s:.*)TextureFile|property\s+(?:ushort|uint16)\s+red",
 }
-"""Vertex colours above 1 in an OBJ; several textures or colours of 16 bits in a PLY: trimesh misreads their colours."""
+"""Vertex colours above 1 in an OBJ; several textures or colours of 16 bits in the header of a PLY: trimesh misreads
+their colours. The first megabytes of a file are searched."""
 
 FLOAT, UNSIGNED_SHORT = 5126, 5123
 """Types of numbers in glTF."""
@@ -122,13 +123,6 @@ def _texture(visual: Any, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32]
     if (factor < 255).any():
         texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
     return uv, texture
-
-
-def _check_text(path: Path) -> None:
-    """Raise InputError if an OBJ (its first megabytes) or the header of a PLY has colours that trimesh misreads."""
-    content = read_file(path)[: 2**24].partition(b"end_header")[0]
-    if re.search(MISREAD_TEXT[path.suffix.lower()], content):
-        raise InputError("its colours cannot be read; expected one texture, or 8-bit colours (0 to 1 in an OBJ)")
 
 
 def _check_glb(path: Path) -> None:
@@ -231,8 +225,10 @@ def _read(path: Path) -> TexturedMesh:
                 missing.append(name)
                 raise
 
-    check = _check_glb if path.suffix.lower() == ".glb" else _check_text
-    check(path)  # before trimesh fails with another message
+    if path.suffix.lower() == ".glb":
+        _check_glb(path)  # before trimesh fails with another message
+    elif re.search(MISREAD_TEXT[path.suffix.lower()], read_file(path)[: 2**24].partition(b"end_header")[0]):
+        raise InputError("its colours cannot be read; expected one texture, or 8-bit colours (0 to 1 in an OBJ)")
     # Processing would silently drop vertices that are not finite.
     scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
     if missing:
