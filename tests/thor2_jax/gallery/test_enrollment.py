@@ -209,6 +209,14 @@ def test_a_view_that_is_given_twice_counts_once() -> None:
     jax.tree.map(np.testing.assert_array_equal, vars(recognizer.gallery.objects["new"].clouds), vars(expected))
 
 
+def test_views_that_another_change_has_added_count_once() -> None:
+    recognizer, other = taught(run()), taught(run())
+    recognizer.enroll("new", [BRICK, BOOK])
+    other.enroll("new", [BRICK, (CLUTTER, 3)])
+    recognizer.objects.add({"new": other.gallery.objects["new"]}, extend=True)
+    assert len(recognizer.gallery.objects["new"].clouds) == 3
+
+
 def test_a_first_surface_comes_with_views_that_are_stored() -> None:
     objects, views = taught(untrained_run((), ())).objects, [instance_view(CLUTTER, 1, 2.5)]
     surface = Surfaces.empty().arrays
