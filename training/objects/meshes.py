@@ -33,9 +33,6 @@ MAX_SIDE = 2.0
 MIN_SIDE = 0.001
 """Range of an object's longest side, metres; refuses scans in millimetres and keeps the camera outside the object."""
 
-MAX_DISTANCE = 10_000.0
-"""Largest coordinate of an object's centre, metres: farther away, the float32 of ray casting is coarser than 1 mm."""
-
 UNSUPPORTED_EXTENSIONS = {
     "EXT_meshopt_compression",
     "KHR_draco_mesh_compression",
@@ -169,8 +166,8 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
 
     Raises:
         InputError: the file is missing, unreadable or of another format; it has no faces or no colours; its vertices or
-            texture coordinates are not finite or too large; its size in metres is not that of an object, or it is far
-            from its origin; its colours would be misread; or `scale` is not a positive number.
+            texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
+            not a positive number.
     """
     if not 0 < scale < np.inf:
         raise InputError(f"mesh_scale is {scale:g}; expected a positive number, such as 0.001 for millimetres")
@@ -184,8 +181,6 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
             f"mesh {path}: longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the "
             f"mesh, for instance by --mesh-scale {scale * factor:g}"
         )
-    if (farthest := np.abs(mesh.centre).max()) > MAX_DISTANCE:
-        raise InputError(f"mesh {path}: {farthest:g} metres from its origin; move it there, below {MAX_DISTANCE:g}")
     return mesh
 
 

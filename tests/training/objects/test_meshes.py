@@ -128,7 +128,6 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
         (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
         (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
         (colored(QUAD * 1000), "longest side 100 .*millimetres"),
-        (colored(QUAD + 1e5), "100000 metres from its origin"),
         (colored(QUAD * 1e-4), "longest side 1e-05;.*--mesh-scale 1000$"),
         (colored(QUAD + [[np.nan], [0], [0], [0]]), "1 vertices are not finite"),
         (colored(QUAD + [[np.inf], [0], [0], [0]]), "1 vertices are not finite"),
