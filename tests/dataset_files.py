@@ -22,11 +22,12 @@ K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
 """Intrinsics of YCB-Video with the principal point moved into the small images."""
 
 
-def images(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def images(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
     color = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
     depth = rng.integers(300, 2500, SHAPE, dtype=np.uint16)
-    return color, depth, rng.integers(0, 3, SHAPE, dtype=np.uint8)
+    small = color, depth, rng.integers(0, 3, SHAPE, dtype=np.uint8)
+    return tuple(np.resize(image, (*shape, *image.shape[2:])) for image in small)
 
 
 def band(start: int, stop: int) -> np.ndarray:
@@ -131,7 +132,7 @@ def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") ->
 def write_uwis(root: Path, video: str, stem: str, poses: str, seed: int = 0) -> Path:
     folder = root / video / "images"
     folder.mkdir(parents=True, exist_ok=True)
-    for kind, image in zip(("rgb", "depth", "labels"), images(seed), strict=True):
+    for kind, image in zip(("rgb", "depth", "labels"), images(seed, (720, 1280)), strict=True):
         Image.fromarray(image).save(folder / f"{stem}_{kind}.png")
     (folder / f"{stem}_poses.yaml").write_text(poses)
     return folder

@@ -13,7 +13,7 @@ from training.readers.labelled import LabelledFrames, named_labels
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
-INTRINSICS = Intrinsics(920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406)
+INTRINSICS = Intrinsics(920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406, width=1280, height=720)
 """The camera of all videos."""
 
 NOT_SCORED = frozenset({"ice_cream", "hot_sauce", "chips_can"})

@@ -28,9 +28,9 @@ VIDEOS = {
 MUG = "mug:\n  label: 1\n  pose: [1, 0, 0]\n"
 
 
-def assert_images_of(item: LabelledFrame, seed: int) -> None:
-    for image, expected in zip((item.frame.color, item.frame.depth, item.frame.labels), images(seed), strict=True):
-        np.testing.assert_array_equal(image, expected)
+def assert_images_of(item: LabelledFrame, expected: tuple[np.ndarray, ...]) -> None:
+    for image, values in zip((item.frame.color, item.frame.depth, item.frame.labels), expected, strict=True):
+        np.testing.assert_array_equal(image, values)
 
 
 def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
@@ -46,9 +46,9 @@ def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [item.truth for item in items] == [{1: "mug"}, {1: "mug"}, {1: "mug", 77: "spoon"}]
     assert list(dataset.names()) == ["mug", "mug", "mug", "spoon"]
     for item, seed in zip(items, (2, 1, 0), strict=True):
-        assert_images_of(item, seed)
+        assert_images_of(item, images(seed, (720, 1280)))
         camera = 920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406
-        assert item.frame.intrinsics == Intrinsics(*camera, 1000)
+        assert item.frame.intrinsics == Intrinsics(*camera, 1000, 1280, 720)
     listed = {"environment": "lounge", "category": "food", "occlusion": "high", "light": "2"}
     assert [item.attributes for item in items] == [listed, listed, {"environment": "lounge"}]
 
@@ -75,7 +75,7 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
     items = list(dataset)
     assert [item.truth for item in items] == [{}, {1: "mug", 200: "bowl"}]
     for item, seed in zip(items, (2, 1), strict=True):
-        assert_images_of(item, seed)
+        assert_images_of(item, images(seed))
         assert item.attributes == {} and item.frame.intrinsics.fy == 601
 
 
