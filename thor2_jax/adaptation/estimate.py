@@ -260,8 +260,7 @@ class OnlineAdaptation:
         usable = [each for each in instances if each.reason is None and len(each.points) <= CAPACITY]
         self._recent.extend(usable)
         self._new += len(usable)
-        is_busy = self._thread is not None and self._thread.is_alive()
-        if is_busy or self._new < EVERY:
+        if self._new < EVERY or (self._thread is not None and self._thread.is_alive()):
             return
         self._new = 0
         self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)

@@ -1,7 +1,6 @@
 """Conversion of recognition results into the JSON records of the API."""
 
 import base64
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -54,9 +53,7 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
 
 def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:
     """Return the JSON record of an estimate of the camera's colour transform; None without an estimate."""
-    if adaptation is None:
-        return None
-    return schemas.AdaptationAnswer(instances=adaptation.instances, **dataclasses.asdict(adaptation.transform))
+    return None if adaptation is None else schemas.AdaptationAnswer(**vars(adaptation), **vars(adaptation.transform))
 
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:

@@ -194,7 +194,7 @@ class Service:
         Args:
             http: the request.
             read_body: function that waits for its whole body; called only if the request is admitted.
-            min_seconds: shortest time until the deadline, if that of the settings is shorter.
+            min_seconds: shortest time until the deadline, if that of the settings is shorter; its body has the latter.
 
         Raises:
             RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
@@ -204,15 +204,15 @@ class Service:
         self.check_ready()
         if self._in_progress >= self.settings.queue:
             raise RequestError(429, None, f"The queue is full: {self.settings.queue} requests are in progress.")
-        seconds = max(self.settings.deadline, min_seconds)
-        request = AdmittedRequest(seconds)
+        request = AdmittedRequest(max(self.settings.deadline, min_seconds))
         self._in_progress += 1
         self._accepted += 1
         self.metrics.in_progress.inc()
         try:
-            async with asyncio.timeout(seconds) as limit:
+            async with asyncio.timeout(self.settings.deadline) as limit:
                 with timed(request.seconds, "upload"):
                     body = await read_body(http)
+                limit.reschedule(request.deadline)  # The clock of the event loop is `time.monotonic`.
                 watch = asyncio.create_task(_end_if_disconnected(http, limit))
                 try:
                     yield request, body

@@ -10,6 +10,7 @@ import functools
 import logging
 import os
 import signal
+import socket
 import tempfile
 
 import uvicorn
@@ -35,6 +36,9 @@ HEAD_SECONDS = 5.0
 
 EARLY_ANSWER_SECONDS = 30.0
 """This limit after a response that preceded the end of its request, since many clients send everything first."""
+
+UNREAD_MS = 60_000
+"""Time limit for a client that reads nothing of a response, which is in memory until then, in milliseconds."""
 
 MAX_HEAD = 2**20
 """Largest number of bytes received between the first byte of a request head and its end."""
@@ -133,7 +137,7 @@ def _create_worker(settings: Settings, workers: int) -> FastAPI:
 
 
 class TimedConnection(HttpToolsProtocol):
-    """uvicorn connection that is closed if a request head arrives too slowly or is too large.
+    """uvicorn connection that is closed if a request head arrives too slowly or is too large, or nothing is read.
 
     Requests with complete heads are answered before the connection is closed. Bodies are limited by `decoding`.
     """
@@ -144,6 +148,7 @@ class TimedConnection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timer of the first request head."""
         super().connection_made(transport)
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
         self._timer = self.loop.call_later(HEAD_SECONDS, self.shutdown)
 
     def data_received(self, data: bytes) -> None:

@@ -25,10 +25,10 @@ UPLOAD = HEAD % (b"POST", b"", b"Content-Length: 1000\r\n")
 
 async def application(scope: Any, receive: Any, send: Any) -> None:
     """Answer without reading the body."""
-    if scope["path"] == "/slow":
-        await asyncio.sleep(WORK)
-    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"4")]})
-    await send({"type": "http.response.body", "body": b"done"})
+    await asyncio.sleep(WORK if scope["path"] == "/slow" else 0)
+    count = 2**23 if scope["path"] == "/large" else 1
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % (4 * count))]})
+    await send({"type": "http.response.body", "body": b"done" * count})
 
 
 @contextlib.contextmanager
@@ -102,9 +102,14 @@ def test_body_may_arrive_after_its_answer(connection: socket.socket) -> None:
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
 def test_endless_head_closes_the_connection(connection: socket.socket, start: bytes) -> None:
     with pytest.raises(ConnectionError):
-        connection.sendall(start)
-        for _ in range(64):
-            connection.sendall(b"x" * 2**20)
+        connection.sendall(start + b"x" * 2**26)
+
+
+def test_answer_that_is_not_read_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "UNREAD_MS", round(1000 * WORK))
+    with serve(HEAD % (b"GET", b"large", b"")) as (_, (connection,)), pytest.raises(ConnectionError):
+        while not threading.Event().wait(WORK):
+            connection.sendall(b"\r\n")
 
 
 def test_many_pipelined_requests(connection: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
