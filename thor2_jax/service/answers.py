@@ -53,7 +53,9 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
 
 def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:
     """Return the JSON record of an estimate of the camera's colour transform; None without an estimate."""
-    return None if adaptation is None else schemas.AdaptationAnswer(**vars(adaptation), **vars(adaptation.transform))
+    if adaptation is None:
+        return None
+    return schemas.AdaptationAnswer(instances=adaptation.instances, **vars(adaptation.transform))
 
 
 def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:

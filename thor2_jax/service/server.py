@@ -38,7 +38,7 @@ EARLY_ANSWER_SECONDS = 30.0
 """This limit after a response that preceded the end of its request, since many clients send everything first."""
 
 UNREAD_MS = 60_000
-"""Time limit for a client that reads nothing of a response, which is in memory until then, in milliseconds."""
+"""Time limit, on Linux, for a client that reads nothing of a response, which is in memory until then; milliseconds."""
 
 MAX_HEAD = 2**20
 """Largest number of bytes received between the first byte of a request head and its end."""
@@ -148,7 +148,8 @@ class TimedConnection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timer of the first request head."""
         super().connection_made(transport)
-        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # only on Linux
+            transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
         self._timer = self.loop.call_later(HEAD_SECONDS, self.shutdown)
 
     def data_received(self, data: bytes) -> None:
