@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from small_runs import random_classifier
 
+from thor2_jax.figures import _PNG
 from thor2_jax.networks.embedding import BACKGROUND, Embedding, References
 from thor2_jax.networks.networks import MLP, EmbeddingSizes, input_size
 from training import train_run
@@ -33,7 +34,7 @@ def blank_pictures(module_patch: pytest.MonkeyPatch) -> None:
 def drawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let figures be drawn, with a fifth of their pixels."""
     monkeypatch.setattr(Figure, "savefig", SAVEFIG)
-    monkeypatch.setattr("thor2_jax.figures._DPI", 60)
+    monkeypatch.setitem(_PNG, "dpi", 60)
 
 
 @pytest.fixture(scope="session")
