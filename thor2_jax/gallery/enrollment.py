@@ -333,7 +333,8 @@ class ObjectGallery:
                 # Another change may have added the same views, or some of them, since `new_views`.
                 new = _new_views(views.clouds, views.surface, gallery.objects.get(name) if extend else None)
                 if 0 < len(new) < len(views.clouds):
-                    clouds = CompactClouds.of([[*views.clouds.views()][number] for number in new.values()])
+                    given = [*views.clouds.views()]
+                    clouds = CompactClouds.of([given[number] for number in new.values()])
                     views = enrolled_views(self.embedding, clouds, views.source, views.surface)
                 if new:
                     gallery = gallery.with_object(name, views, extend=extend, replace=replace)

@@ -46,9 +46,10 @@ def test_a_class_that_one_classifier_rules_out_loses() -> None:
     np.testing.assert_allclose(fused_probabilities({"tops": first, "tops2": second}), [[0, 1, 0]], atol=1e-6)
 
 
-def test_the_first_classifier_wins_a_tie() -> None:
+def test_the_first_classifier_wins_a_tie_and_one_is_enough() -> None:
     first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
     np.testing.assert_array_equal(fused_probabilities({"tops": first, "tops2": second}, "max"), first)
+    np.testing.assert_allclose(fused_probabilities({"tops2": second}), second)
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])

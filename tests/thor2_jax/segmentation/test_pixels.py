@@ -1,8 +1,19 @@
-"""Floods at the edge of two colours; scenes on a table test the other operations on pixels."""
+"""Floods and nearest pixels, compared with NumPy and SciPy; scenes on a table test the other operations on pixels."""
 
 import numpy as np
+from scipy import ndimage
 
-from thor2_jax.segmentation.pixels import watershed
+from thor2_jax.segmentation.pixels import nearest_known, watershed
+
+MASK = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(60, 90)), 2) > 0
+
+
+def test_the_nearest_known_pixel_is_nearest() -> None:
+    nearest = np.argwhere(MASK)[nearest_known(MASK)]
+    distance = np.linalg.norm(nearest - np.stack(np.indices(MASK.shape), axis=-1), axis=-1)
+    exact = ndimage.distance_transform_edt(~MASK)
+    assert np.all(distance[MASK] == 0) and exact.max() > 5
+    assert np.all(distance <= 1.1 * exact)  # OpenCV adds up steps to the neighbours of a pixel
 
 
 def test_a_flood_ends_at_the_edge_of_two_colors() -> None:

@@ -113,13 +113,17 @@ def test_a_request_head_that_is_too_large_ends_its_connection(server: Any) -> No
             assert connection.recv(1) == b""
 
 
-def test_body_that_never_arrives(service: Service, teaching_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("request_of", ["describe", "why"])
+def test_body_that_never_arrives(
+    request_of: str, service: Service, teaching_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The connection times out without affecting others, also before explanations, whose deadline is longer."""
     monkeypatch.setattr(service, "settings", dataclasses.replace(service.settings, deadline=0.5))
     url = httpx.URL(teaching_url)
+    kind = {"describe": b"application/json", "why": b"multipart/form-data; boundary=x"}[request_of]
     with socket.create_connection((url.host, url.port), timeout=HANG) as slow:
-        headers = b"Host: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\nContent-Length: 9\r\n\r\n"
-        slow.sendall(b"POST /v1/why HTTP/1.1\r\n" + headers)
+        headers = b"Host: localhost\r\nContent-Type: %b\r\nContent-Length: 9\r\n\r\n" % kind
+        slow.sendall(b"POST /v1/%b HTTP/1.1\r\n" % request_of.encode() + headers)
         assert b" 408 " in slow.recv(4096).split(b"\r\n")[0]
 
 
