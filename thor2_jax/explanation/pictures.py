@@ -47,7 +47,7 @@ def _figure(width: float = 5.2, height: float = 4.4, rows: int = 1, columns: int
 
     With 130 pixels per inch, a picture of the default size is legible on a telephone, too.
     """
-    figure = Figure(figsize=(width, height), layout="compressed")
+    figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, **options)
 
 
