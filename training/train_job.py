@@ -161,7 +161,7 @@ def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
     }
     requested = {
         "seed": job.protocol.fit.seed,
-        "dataset": job.protocol.render_job(_find_meshes(job)).record(),
+        "dataset": job.protocol.render_job(_kept_meshes(job)).record(),
         "frames": labelled.digest if labelled else None,
         "leave_out": sorted(set(job.leave_out)),
     }
@@ -178,10 +178,14 @@ def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
     return True
 
 
-def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
-    if not isinstance(job.meshes, Path):
-        return dict(job.meshes or {})
-    return scaled_meshes(find_meshes(job.meshes, job.names), job.mesh_scale)
+def _find_meshes(job: TrainJob) -> Mapping[str, Path | TexturedMesh]:
+    return find_meshes(job.meshes, job.names) if isinstance(job.meshes, Path) else job.meshes or {}
+
+
+def _kept_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
+    """Return the meshes that are rendered, in metres; those that are left out are not read."""
+    kept = {name: mesh for name, mesh in _find_meshes(job).items() if name not in job.leave_out}
+    return scaled_meshes(kept, job.mesh_scale)
 
 
 def _read_frames(job: TrainJob) -> LabelledInstances | None:
@@ -243,19 +247,19 @@ def _open_views(
     Returns:
         The views, and the labelled instances of each class without a mesh.
     """
-    meshes, instances = _find_meshes(job), labelled.views if labelled else {}
+    instances = labelled.views if labelled else {}
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
-    names = source.classes if source else tuple(meshes)
+    names = source.classes if source else tuple(_find_meshes(job))
     _check_names(job, names, instances)
     if "thor" in job.baselines:
         types_of_views(source.record["job"] if source else vars(job.protocol))  # raises if there are too few
-    if meshes:
+    if meshes := _kept_meshes(job):
         rendering, workers, size = job.protocol.render_job(meshes), local_workers(job.workers), job.crop_size
         # Folds and batches are checked later again, since some views may have too few points.
         folds, n_rendered = job.protocol.folds, len(rendering.angles)
         for name in meshes:
             n_views = n_rendered + len(instances.get(name, ()))
-            if n_views < folds and name not in job.leave_out:
+            if n_views < folds:
                 raise InputError(f"folds is {folds}; expected at most {n_views}, the number of views of class {name!r}")
         n_clouds = len(meshes) * n_rendered * rendering.copies + sum(map(len, instances.values())) * (1 + MAX_COPIES)
         _check_batch_size(job.protocol, n_clouds)

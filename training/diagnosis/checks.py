@@ -168,7 +168,7 @@ def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float 
     sides = {}
     for name, path in meshes.items():
         try:
-            sides[name] = read_mesh(path).longest_side * scale
+            sides[name] = read_mesh(path, scale).longest_side
         except InputError as error:
             diagnosis.add("mesh", f"A mesh cannot be used: {error}.", "Repair it, or leave it out.")
     if not sides:

@@ -216,18 +216,19 @@ class Distractors:
         return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
 
     def check(self, classes: Sequence[str]) -> None:
-        """Raise InputError if a distractor has the name of a class."""
+        """Raise InputError if a mesh is unreadable, or a distractor has the name of a class."""
         if shared := sorted(set(self.meshes) & set(classes)):
             raise InputError(
                 f"distractors: {shared[0]!r} is also a class; expected other objects; remove its mesh from one of the "
                 "two folders"
             )
+        _ = self.record
 
-    @property
+    @functools.cached_property
     def record(self) -> dict[str, Any]:
-        """Everything about the distractors that determines the embedding, in JSON types."""
+        """Everything about the distractors that determines the embedding, in JSON types; reads the meshes."""
         named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
-        return named | {"meshes": sorted(self.meshes)}
+        return named | {"meshes": [[name, load_mesh(path).digest] for name, path in sorted(self.meshes.items())]}
 
     def samples(
         self, directory: Path, network: ColorNetwork, config: DescriptorConfig, progress: Callable[[int, int], object]

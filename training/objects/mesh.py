@@ -53,11 +53,9 @@ class TexturedMesh:
         Raises:
             InputError: some meshes have textures and others corner colours.
         """
-        offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])], dtype=np.int32)
         vertices = np.concatenate([part.vertices for part in parts])
-        faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(
-            np.int32
-        )
+        faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
         colors = [part.corner_colors for part in parts if part.corner_colors is not None]
         if len(colors) == len(parts):
             return cls(vertices, faces, corner_colors=np.concatenate(colors))

@@ -43,14 +43,18 @@ UNSUPPORTED_EXTENSIONS = {
 """Extensions of glTF that trimesh ignores, so that it fails, or reads other vertices or colours."""
 
 MISREAD_TEXT = {
-    ".obj": rb"(?m)^v(?=(?:[ \t]+\S+){6})(?:[ \t]+\S+){3,5}[ \t]+(?:[2-9]|\d\d+)(?:\.\d*)?\s",
+    ".obj": rb"(?m)^v(?=(?:[ \t]+\S+){6})(?:[ \t]+\S+){3,5}[ \t]+(?:[2-9]|\d\d+)(?:\.\d*)?\s"
+    rb"|\A(?>(?s:.*?)^f[^\n]*[ \t/]-)(?s:.*)\nv",
     ".ply": rb"TextureFile(?s:.*)TextureFile|property\s+(?:ushort|uint16)\s+red",
 }
-"""Vertex colours above 1 in an OBJ; several textures or colours of 16 bits in the header of a PLY: trimesh misreads
-their colours. The first megabytes of a file are searched."""
+"""Vertex colours above 1 in an OBJ, and vertices after faces with relative indices; several textures or colours of 16
+bits in the header of a PLY: trimesh misreads them. The first megabytes of a file are searched."""
 
-FLOAT, UNSIGNED_SHORT = 5126, 5123
-"""Types of numbers in glTF."""
+FLOAT, UNSIGNED_SHORT, TRIANGLE_FAN = 5126, 5123, 6
+"""Types of numbers and a mode of primitives in glTF."""
+
+NEARLY_WHITE = 0.98
+"""Vertex colours from this value on do not change a texture noticeably."""
 
 MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
@@ -74,6 +78,10 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
     if visual.kind == "vertex":
+        ply = geometry.metadata.get("_ply_raw")
+        stored = [] if ply is None else [ply["vertex"]["data"][name] for name in ("red", "green", "blue")]
+        if any(each.dtype.kind == "f" and each.max() > 1 for each in stored):
+            raise InputError("its colours cannot be read, which are floats above 1; expected 0 to 1, or integers")
         return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
     if visual.kind == "face":
         colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
@@ -82,11 +90,13 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
         raise InputError("no texture and no vertex colours; export the mesh with its colours")
     uv, texture = _texture(visual, faces)
     colors = visual.vertex_attributes.get("color", geometry.vertex_attributes.get("color"))
-    if colors is not None and texture.size == 3:  # a plain colour multiplies the vertex colours
-        colors = colors[:, :3] / (1 if colors.dtype.kind == "f" else np.iinfo(colors.dtype).max)
-        corners = np.rint((colors * texture[0, 0]).clip(0, 255)).astype(np.uint8)[faces]
-        if (corners != texture[0, 0]).any():
+    if colors is not None:
+        colors = colors[faces][..., :3] / (1 if colors.dtype.kind == "f" else np.iinfo(colors.dtype).max)
+        corners = np.rint((colors * texture[0, 0]).clip(0, 255)).astype(np.uint8)
+        if texture.size == 3 and (corners != texture[0, 0]).any():  # a plain colour multiplies the vertex colours
             return TexturedMesh(vertices, faces, corner_colors=corners)
+        if "color" in visual.vertex_attributes.data and (colors < NEARLY_WHITE).any():  # only those of a GLB multiply
+            raise InputError("a texture and vertex colours, which multiply it; bake them into one kind")
     return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
@@ -131,7 +141,12 @@ def _check_glb(path: Path) -> None:
     header = json.loads(content[20:end])
     unsupported = UNSUPPORTED_EXTENSIONS.intersection(header.get("extensionsUsed", ()))
     for primitive in (each for mesh in header.get("meshes", ()) for each in mesh["primitives"]):
-        types = {name: header["accessors"][number]["componentType"] for name, number in primitive["attributes"].items()}
+        accessors = {name: header["accessors"][number] for name, number in primitive["attributes"].items()}
+        types = {name: accessor["componentType"] for name, accessor in accessors.items()}
+        if any("sparse" in accessor for accessor in accessors.values()):
+            unsupported.add("sparse accessors")
+        if primitive.get("mode") == TRIANGLE_FAN:
+            unsupported.add("triangle fans")
         if types.get("TEXCOORD_0", FLOAT) != FLOAT:
             unsupported.add("texture coordinates that are integers")
         if types.get("COLOR_0") == UNSIGNED_SHORT and "material" not in primitive:
@@ -140,12 +155,11 @@ def _check_glb(path: Path) -> None:
         uses = f"it uses {', '.join(sorted(unsupported))}"
         raise InputError(f"{uses}; expected a GLB without compression and texture transforms; export the mesh again")
     for material in header.get("materials", ()):
-        base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        if base is None or "source" not in (texture := header["textures"][base["index"]]):
-            continue
+        base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
         if base.get("texCoord"):
             raise InputError("its texture uses a second set of texture coordinates; export the mesh with one set")
-        image = header["images"][texture["source"]]
+        source = header["textures"][base["index"]].get("source") if base else None
+        image = {} if source is None else header["images"][source]
         if "bufferView" in image:  # trimesh loads the mesh without a damaged image, as white
             view = header["bufferViews"][image["bufferView"]]
             start = end + 8 + view.get("byteOffset", 0)
@@ -169,11 +183,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
             texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
             not a positive number.
     """
-    if not 0 < scale < np.inf:
-        raise InputError(f"mesh_scale is {scale:g}; expected a positive number, such as 0.001 for millimetres")
-    mesh = read_mesh(Path(path))
-    if scale != 1:
-        mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
+    mesh = read_mesh(Path(path), scale)
     longest = mesh.longest_side
     if not MIN_SIDE <= longest <= MAX_SIDE:
         unit, factor = (" (is it in millimetres?)", 0.001) if longest > MAX_SIDE else ("", 1000)
@@ -184,19 +194,24 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     return mesh
 
 
-def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | TexturedMesh]:
-    """Return object name -> mesh file, or -> scaled mesh if `scale` is not 1; raise InputError as `load_mesh`."""
-    return {name: path if scale == 1 else load_mesh(path, scale) for name, path in meshes.items()}
+def scaled_meshes(meshes: Mapping[str, Path | TexturedMesh], scale: float) -> dict[str, Path | TexturedMesh]:
+    """Return object name -> mesh, or -> scaled mesh of a file if `scale` is not 1; raise InputError as `load_mesh`."""
+    return {
+        name: load_mesh(one, scale) if isinstance(one, Path) and scale != 1 else one for name, one in meshes.items()
+    }
 
 
-def read_mesh(path: Path) -> TexturedMesh:
-    """Return the mesh in the unit of its file, of any size; raise InputError as `load_mesh`."""
+def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:
+    """Return the mesh of a file, multiplied by `scale`, of any size; raise InputError as `load_mesh`."""
+    if not 0 < scale < np.inf:
+        raise InputError(f"mesh_scale is {scale:g}; expected a positive number, such as 0.001 for millimetres")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}; convert the mesh")
     try:
-        return _read(path)
+        mesh = _read(path)
+        return mesh if scale == 1 else mesh.transformed(np.diag([scale, scale, scale, 1.0]))
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
     # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
@@ -223,7 +238,8 @@ def _read(path: Path) -> TexturedMesh:
     if path.suffix.lower() == ".glb":
         _check_glb(path)  # before trimesh fails with another message
     elif re.search(MISREAD_TEXT[path.suffix.lower()], read_file(path)[: 2**24].partition(b"end_header")[0]):
-        raise InputError("its colours cannot be read; expected one texture, or 8-bit colours (0 to 1 in an OBJ)")
+        expected = "expected positive ones, and one texture or 8-bit colours (0 to 1 in an OBJ)"
+        raise InputError(f"its indices or colours cannot be read; {expected}; export the mesh again")
     # Processing would silently drop vertices that are not finite.
     scene = trimesh.load_scene(path, resolver=Files(str(path)), process=False)
     if missing:

@@ -188,8 +188,11 @@ def test_baselines_of_a_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_train_by_folds(
     meshes: Path, views: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The mesh of an object that is left out is not read."""
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
-    arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *STEPS, *options)
+    (shutil.copytree(meshes, tmp_path / "meshes") / "bad.ply").touch()
+    options += ("--meshes", tmp_path / "meshes", "--leave-out", "bad")
+    arguments = ("train", "--out", tmp_path / "run", *STEPS, *options)
     shutil.copytree(views, tmp_path / "run" / "views")
     out = printed(*arguments)
     assert "fold 0: tops" in out and "fold 1: tops" in out and "(objects: 3)" in out
@@ -202,7 +205,7 @@ def test_train_by_folds(
     assert "nothing was trained" in printed(*arguments)
     own_views = ("--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run", "--embedding", 0)
     assert "manifest.json" in refused("train", *own_views)
-    for change in (("--leave-out", NAMES[0]), ("--epochs", 2)):
+    for change in (("--leave-out", f"bad,{NAMES[0]}"), ("--epochs", 2)):
         assert "was written with" in refused(*arguments, *change)
     assert files_of(tmp_path / "run") == before
     # A training that is killed at the very end leaves its own views.

@@ -205,6 +205,7 @@ def test_units_of_meshes(tmp_path: Path) -> None:
         (20.0, 1.0, "mesh-unit: .*--mesh-scale 0.01"),
         (0.0002, 1.0, "mesh-unit: .*--mesh-scale 1000"),
         (1e9, 1.0, "mesh-unit: .*--mesh-scale"),
+        (0.2, np.nan, "mesh: .*mesh_scale is nan"),
     ):
         meshes = {"box": write_box(tmp_path / "box.ply", (side, side / 2, side / 3))}
         assert_found(expected, check_meshes, meshes, scale)

@@ -111,5 +111,8 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert key(epochs=3, networks=2, workers=2) == same and key(box=0.1) == box
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
+    boxes = ({"box": write_box(tmp_path / "box.ply", (side, 0.1, 0.1))} for side in (0.1, 0.2))
+    first, second = (Distractors(procedural=10, meshes=each).record["meshes"] for each in boxes)
+    assert first != second and first[0][0] == second[0][0] == "box"
     record = samples_record([0], NETWORK, SMALL_CONFIG, 1)
     assert record["color_network"] == NETWORK.fingerprint and "augmentations" in record

@@ -121,9 +121,12 @@ def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
     for name, message in (("mesh.stl", ".glb, .obj, .ply"), ("mesh.glb", "not a GLB file")):
         (tmp_path / name).touch()
         check_refused(tmp_path / name, message)
-    mixed = trimesh.Scene([colored(QUAD), textured_quad(PBR)])
-    mixed.export(tmp_path / "mixed.glb")
-    check_refused(tmp_path / "mixed.glb", "some parts .* vertex colours")
+    for mixed, message in (
+        (trimesh.Scene([colored(QUAD), textured_quad(PBR)]), "some parts .* vertex colours"),
+        (colored_material(PBR), "a texture and vertex colours"),
+    ):
+        mixed.export(tmp_path / "mixed.glb")
+        check_refused(tmp_path / "mixed.glb", message)
     for mesh, message in (
         (trimesh.Trimesh(QUAD, QUAD_FACES, process=False), "no texture"),
         (trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)), "no faces"),
@@ -174,6 +177,8 @@ EXTENSIONS = ("KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshop
     [
         *((("extensionsUsed",), [name], f"it uses {name}") for name in EXTENSIONS),
         (("accessors", 2, "componentType"), 5123, "integers"),
+        (("accessors", 1, "sparse"), {}, "sparse accessors"),
+        (("meshes", 0, "primitives", 0, "mode"), 6, "triangle fans"),
         (("materials", 0, "pbrMetallicRoughness", "baseColorTexture", "texCoord"), 1, "second set"),
     ],
 )
@@ -202,11 +207,13 @@ def test_textures_that_cannot_be_used(tmp_path: Path) -> None:
     check_refused(tmp_path / "quad.glb", "its texture is damaged")
 
 
-def test_vertex_colours_that_trimesh_misreads(tmp_path: Path) -> None:
+def test_colours_and_indices_that_trimesh_misreads(tmp_path: Path) -> None:
     rows = "".join(f"v {x} {y} {z} {x * 2000} 0 0\n" for x, y, z in QUAD)
-    (tmp_path / "quad.obj").write_text(rows + "f 1 2 3 4\n")
-    check_refused(tmp_path / "quad.obj", "0 to 1")
-    for old, new in ((b"uchar red", b"ushort red"), (b"1.0\n", b"1.0\ncomment TextureFile a\ncomment TextureFile b\n")):
+    for text in (rows + "f 1 2 3 4\n", "v 0 0 0 1 1 1\nf -1 -1 -1\nv 0 0 1 1 1 1\n"):
+        (tmp_path / "quad.obj").write_text(text)
+        check_refused(tmp_path / "quad.obj", "0 to 1")
+    textures = b"1.0\ncomment TextureFile a\ncomment TextureFile b\n"
+    for old, new in ((b"uchar red", b"ushort red"), (b"uchar red", b"float red"), (b"1.0\n", textures)):
         (tmp_path / "quad.ply").write_bytes(ASCII_PLY.replace(old, new, 1))
         check_refused(tmp_path / "quad.ply", "colours cannot be read")
 
