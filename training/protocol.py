@@ -4,7 +4,7 @@ import dataclasses
 import enum
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
@@ -121,12 +121,12 @@ class Protocol:
             "learning_rates": list(self.fit.learning_rates),
         }
 
-    def with_distractors(self, procedural: int | None, meshes: Mapping[str, Path], workers: int) -> "Protocol":
+    def with_distractors(self, procedural: int | None, meshes: Mapping[str, Path | TexturedMesh], workers: int) -> Self:
         """Return the protocol with an embedding fitted on these distractors; if there are none, with classifiers only.
 
         Args:
             procedural: number of procedural objects; None keeps the protocol's number (0 if it has no embedding).
-            meshes: name -> file of other objects.
+            meshes: name -> other object.
             workers: rendering processes.
 
         Raises:

@@ -177,14 +177,14 @@ def train(
         if not re.fullmatch(r".+:[0-9]+", coordinator):
             raise InputError(f"coordinator is {coordinator!r}; expected HOST:PORT of process 0")
         jax.distributed.initialize(coordinator, processes, process)
-    from training.objects.meshes import find_meshes
+    from training.objects.meshes import find_meshes, scaled_meshes
     from training.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
     from training.train_job import TrainJob, run_train_job
 
     keep_freed_memory()
     protocol = PAPER if paper else QUICK if quick else DEFAULT
-    others = {} if distractors is None else find_meshes(distractors)
+    others = {} if distractors is None else scaled_meshes(find_meshes(distractors), given.mesh_scale)
     protocol = protocol.with_distractors(embedding, others, given.workers)
     features = None if classifiers is None else options.split_names(classifiers)
     job = TrainJob(

@@ -34,6 +34,7 @@ from thor2_jax.files import content_digest, json_digest, remove_written
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.fitting.samples import OF_EMBEDDING, Samples, sample_normalized
+from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera, RayCaster, camera_pose, random_angles
@@ -60,8 +61,8 @@ UNCHANGED = 0.2
 CAMERA = Camera.from_field_of_view(540, 405, 40.0)
 """Camera with half the pixels of the training camera, which is still two pixels per voxel of a cloud."""
 
-ObjectSource = int | Path
-"""The seed of a procedural object, or a mesh file."""
+ObjectSource = int | Path | TexturedMesh
+"""The seed of a procedural object, a mesh file, or a mesh."""
 
 
 def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple[int, Cloud]]:
@@ -76,7 +77,7 @@ def render_clouds(objects: Mapping[int, ObjectSource], views: int) -> list[tuple
     """
     clouds = []
     for index, source in objects.items():
-        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+        mesh = procedural_object(source) if isinstance(source, int) else load_mesh(source)
         caster = RayCaster([mesh])
         rng = np.random.default_rng([SEED, index])
         for _ in range(views):
@@ -108,7 +109,7 @@ def samples_record(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
-        "objects": [load_mesh(each).digest if isinstance(each, Path) else each for each in sources],
+        "objects": [each if isinstance(each, int) else load_mesh(each).digest for each in sources],
         "views": views,
         "copies": OF_EMBEDDING.orientations,
         "seed": SEED,
@@ -187,7 +188,7 @@ class Distractors:
 
     Attributes:
         procedural: number of procedural objects.
-        meshes: name -> file of other objects.
+        meshes: name -> other object.
         views: views of each distractor.
         epochs: passes over the samples.
         networks: number of networks in the embedding; docs/decisions.md explains why there are several.
@@ -198,7 +199,7 @@ class Distractors:
     """
 
     procedural: int = 1500
-    meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    meshes: Mapping[str, Path | TexturedMesh] = dataclasses.field(default_factory=dict)
     views: int = 8
     epochs: int = 8
     networks: int = 3

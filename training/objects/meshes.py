@@ -169,13 +169,13 @@ def _check_glb(path: Path) -> None:
                 raise InputError("its texture is damaged; export the mesh again") from None
 
 
-def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
+def load_mesh(path: str | Path | TexturedMesh, scale: float = 1.0) -> TexturedMesh:
     """Read a GLB, OBJ or PLY file with a texture, vertex colours, face colours or plain material colours.
 
     Stored colours are interpreted as sRGB. A base colour factor multiplies its texture, or is the colour without one.
 
     Args:
-        path: the file.
+        path: the file; a mesh is returned as it is.
         scale: factor from the unit of the file to metres; 0.001 for millimetres.
 
     Raises:
@@ -183,6 +183,8 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
             texture coordinates are not finite or too large; its size in metres is not that of an object; or `scale` is
             not a positive number.
     """
+    if isinstance(path, TexturedMesh):
+        return path
     mesh = read_mesh(Path(path), scale)
     longest = mesh.longest_side
     if not MIN_SIDE <= longest <= MAX_SIDE:
@@ -196,9 +198,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
 
 def scaled_meshes(meshes: Mapping[str, Path | TexturedMesh], scale: float) -> dict[str, Path | TexturedMesh]:
     """Return object name -> mesh, or -> scaled mesh of a file if `scale` is not 1; raise InputError as `load_mesh`."""
-    return {
-        name: load_mesh(one, scale) if isinstance(one, Path) and scale != 1 else one for name, one in meshes.items()
-    }
+    return {name: mesh if scale == 1 else load_mesh(mesh, scale) for name, mesh in meshes.items()}
 
 
 def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:

@@ -142,11 +142,6 @@ def render_task(task: ViewTask) -> list[tuple[int, int, "Cloud"]]:
     return [(number, copy, cloud) for number, copy, cloud in clouds if len(cloud[0]) >= MIN_VIEW_POINTS]
 
 
-def _read_mesh(source: Path | TexturedMesh) -> TexturedMesh:
-    """Return the mesh of a file, or the mesh itself."""
-    return source if isinstance(source, TexturedMesh) else load_mesh(source)
-
-
 def _checked_meshes(
     meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
 ) -> Iterator[tuple[str, TexturedMesh]]:
@@ -159,7 +154,7 @@ def _checked_meshes(
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
-        mesh = _read_mesh(source)
+        mesh = load_mesh(source)
         diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
         if SIGMA_S * diameter > MAX_VIEW_LENGTH:
             raise InputError(
@@ -241,14 +236,14 @@ class RenderJob:
         """Read the mesh of each object, one at a time, to compute its surface, while showing the progress."""
         for number, (name, source) in enumerate(self.meshes.items()):
             progress("surfaces", number, len(self.meshes), name)
-            yield _read_mesh(source)
+            yield load_mesh(source)
         progress("surfaces", len(self.meshes), len(self.meshes), "")
 
     def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
         """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh."""
         angles = self.angles
         for name, group in itertools.groupby(map(self.shards.__getitem__, files), key=operator.itemgetter(0)):
-            mesh = _read_mesh(self.meshes[name])
+            mesh = load_mesh(self.meshes[name])
             for _, views in group:
                 of_views = angles[views.start : views.stop]
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)
@@ -294,7 +289,7 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int 
         InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
         OSError: the file cannot be opened.
     """
-    name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
+    name, loaded = mesh.name if isinstance(mesh, Path) else "mesh", load_mesh(mesh, mesh_scale)
     augmentations = Augmentations.of_names(KINDS, copies=1)
     task = ViewTask(name, loaded, _evenly_spread(cameras), augmentations=augmentations)
     clouds = enumerate(render_task(task))
