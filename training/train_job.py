@@ -136,9 +136,7 @@ def _check_batch_size(protocol: Protocol, n_views: int) -> None:
     size = protocol.fit.batch_size
     n_samples = n_views * (len(protocol.mirrors) + protocol.orientation_copies)
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
-        raise InputError(
-            f"batch_size is {size}; expected at most {n_samples}, the number of samples of {n_views} views"
-        )
+        raise InputError(f"batch_size is {size}; expected at most {n_samples}, the samples of {n_views} views")
 
 
 def _is_complete(job: TrainJob, labelled: LabelledInstances | None) -> bool:
@@ -229,9 +227,7 @@ def _check_names(job: TrainJob, names: Sequence[str], instances: Mapping[str, Se
     for name in classes:
         other = folded.setdefault(normal_name(name).casefold(), name)
         if other != name:
-            raise InputError(
-                f"the objects {other!r} and {name!r} differ only by case or form; expected one name of an object"
-            )
+            raise InputError(f"objects {other!r} and {name!r} differ only by case or form; expected distinct names")
     if single := [name for name in classes if name not in names and len(instances[name]) < 2]:
         raise InputError(
             f"frames: one usable instance of {', '.join(map(repr, single))}; expected at least two without a mesh: "

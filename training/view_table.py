@@ -40,9 +40,7 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
             labels.append(classes.index(name))
             rotations.append(view.pose[:3, :3])
     if not views:
-        raise InputError(
-            f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected meshes of the classes"
-        )
+        raise InputError(f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected some of them")
     _, inference = recognizer.infer(views, answer_by="classifiers")
     probabilities = {name: values[: len(views)] for name, values in inference.probabilities.items()}
     return ViewTable(np.array(labels), np.array(rotations), recognizer.model.fused(probabilities).astype(np.float64))

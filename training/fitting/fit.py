@@ -204,9 +204,7 @@ def fit(
     train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]
     least = max(2, n_devices)
     if len(train_rows) < least:
-        raise InputError(
-            f"there are {len(train_rows)} samples to train on; at least {least} are required; render more views"
-        )
+        raise InputError(f"there are {len(train_rows)} samples to train on; expected at least {least}; add views")
     batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
     steps = Steps(options.epochs, len(train_rows) // batch_size, batch_size)
     n_inputs = input_size(context.feature, config, network.n_regions)

@@ -73,9 +73,7 @@ def fetch_ycb(
                 load_mesh(meshes[name])
                 continue
             if (directory / name).exists():
-                raise InputError(
-                    f"out: {directory / name} exists without {MESH_FILE}; move it, or choose another directory"
-                )
+                raise InputError(f"out: {directory / name} exists without {MESH_FILE}; move it, or choose another one")
             archive = directory / f".{name}.tgz"
             _download(f"{url.rstrip('/')}/{name}_google_16k.tgz", archive, name, progress)
             _extract(archive, directory, name)
@@ -147,8 +145,6 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None
     except (InputError, FileExistsError) as error:
         reason = reason_of(error).replace(f"{folder.parent}/", "")
-        raise InputError(
-            f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
-        ) from None
+        raise InputError(f"objects: archive of {name} has no usable mesh ({reason}); report this to its host") from None
     finally:
         archive.unlink()

@@ -212,6 +212,4 @@ def read_crop_manifest(directory: Path) -> tuple[dict[str, Any], dict[str, str]]
 
 def crops_of(task: ViewTask, size: int) -> dict[tuple[int, int], Crop]:
     """Return (number of the view, number of the copy) -> crop for the views of a task that are not empty."""
-    return {
-        (number, copy): rgbd_crop(view.frame, 1, size) for number, copy, view in all_views(task) if view.depth.any()
-    }
+    return {(k, copy): rgbd_crop(view.frame, 1, size) for k, copy, view in all_views(task) if view.depth.any()}

@@ -145,9 +145,8 @@ def test_a_dataset_of_an_earlier_version_stays_as_it_is(copied: Path) -> None:
     for shard in dataset.shards:
         arrays = safetensors.numpy.load((copied / shard.file).read_bytes())
         del arrays["camera"]
-        shards.append(
-            dataclasses.replace(shard, sha256=write_checked(copied / shard.file, safetensors.numpy.save(arrays)))
-        )
+        digest = write_checked(copied / shard.file, safetensors.numpy.save(arrays))
+        shards.append(dataclasses.replace(shard, sha256=digest))
     old = dataclasses.replace(dataset, shards=tuple(shards), surfaces_sha256=None)
     (copied / MANIFEST).write_text(old.manifest)
     before = files_of(copied)
