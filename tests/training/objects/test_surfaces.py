@@ -31,8 +31,7 @@ def test_a_sphere() -> None:
         np.testing.assert_allclose(points.mean(axis=0), 0, atol=0.03 * RADIUS)  # spread evenly
         np.testing.assert_allclose(normals, points / RADIUS, atol=0.05)
         assert np.abs(lab - to_lab(np.array(color, np.uint8), MEAN_WHITE)).max() < 0.05
-        rng = np.random.default_rng(row)
-        cell = rng.integers(0, GRID, (1000, 3))
+        cell = np.random.default_rng(row).integers(0, GRID, (1000, 3))
         low, side = np.asarray(surfaces.grid[row])
         at = low + (cell + 0.5) * side
         distance = np.linalg.norm(points[np.asarray(surfaces.nearest[row])[cell @ [GRID**2, GRID, 1]]] - at, axis=1)
@@ -48,8 +47,7 @@ def test_rotations_are_proper_and_look_from_all_sides() -> None:
     matrices = rotations().astype(np.float64)
     np.testing.assert_allclose(matrices @ matrices.mT, np.broadcast_to(np.eye(3), matrices.shape), atol=1e-6)
     np.testing.assert_allclose(np.linalg.det(matrices), 1, atol=1e-6)
-    rng = np.random.default_rng(0)
-    anywhere = rng.standard_normal((1000, 3))
+    anywhere = np.random.default_rng(0).standard_normal((1000, 3))
     anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
     assert np.degrees(np.arccos((anywhere @ matrices[:, 2].T).max(axis=1))).max() < 30
 

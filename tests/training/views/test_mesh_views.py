@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination
 from training.objects.builtin_objects import builtin_objects
-from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.camera import camera_pose, view_angles
 from training.views import mesh_views as views
@@ -52,7 +51,8 @@ def test_golden_clouds(golden_files: tuple[Path, ...]) -> None:
     for path in golden_files:
         with np.load(path) as golden:
             points, colors, (azimuth, polar) = golden["points"], golden["colors"] * 255, golden["view"]
-        mesh = golden_mesh(path)
+        name = path.stem.rpartition("_")[0]  # of a scan that stands beside the golden file
+        mesh = OBJECTS.get(path.stem) or load_mesh(find_meshes(path.parents[1] / "data/meshes", {name: name})[name])
         xyz, rgb = views.view_cloud(mesh, camera_pose(azimuth, polar, mesh.centre))
         assert abs(len(xyz) - len(points)) <= 3 and (xyz.dtype, rgb.dtype) == (np.float32, np.uint8), path.name
         distance, nearest = cKDTree(points).query(xyz * views.SIGMA_S)
@@ -63,11 +63,3 @@ def test_golden_clouds(golden_files: tuple[Path, ...]) -> None:
         difference = np.abs(rgb - colors[nearest])
         assert difference[same].mean() < 0.5 and np.mean(difference > 2) < 0.03, path.name
     assert total > 1000 and equal / total > 0.97
-
-
-def golden_mesh(path: Path) -> TexturedMesh:
-    """The mesh of a golden file: a built-in object, or a scan that stands beside it."""
-    if path.stem in OBJECTS:
-        return OBJECTS[path.stem]
-    name = path.stem.rpartition("_")[0]
-    return load_mesh(find_meshes(path.parents[1] / "data" / "meshes", {name: name})[name])

@@ -16,10 +16,9 @@ def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
 
 
 def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
-    rng = np.random.default_rng(3)
     clouds = thor2.PointClouds.pack(random_clouds(3, [200], (0.2, 0.19, 0.1)) * 8)
     normal = thor2.view_normalize(clouds, thor2.DescriptorConfig())
-    turned = reorient(normal, rng)
+    turned = reorient(normal, np.random.default_rng(3))
     assert len({np.asarray(cloud).tobytes() for cloud in turned.points}) == 8
     both = [np.concatenate([each.points[:, :200], each.camera[:, None]], axis=1) for each in (turned, normal)]
     for cloud, before in zip(*both, strict=True):
