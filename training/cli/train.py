@@ -162,7 +162,8 @@ def train(
         raise InputError("give --meshes, --dataset or --frames; only --frames goes with one of the others")
     scale = options.given_values(given).get("mesh_scale")
     steps = {"azimuth_step": settings.azimuth_step, "polar_step": settings.polar_step}
-    options.check_belongs("--meshes", given.meshes, names=given.names, mesh_scale=scale, **steps)
+    options.check_belongs("--meshes", given.meshes, names=given.names, **steps)
+    options.check_belongs("--meshes or --distractors", given.meshes or distractors, mesh_scale=scale)
     options.check_belongs("--dataset", given.dataset, sequences=given.sequences)
     options.check_alone("sequences", given.sequences, leave_out=leave_out)
     if coordinator is None and (processes, process) != (1, 0):

@@ -135,11 +135,9 @@ def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def _resized(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Return an image [h, w] or [h, w, C] resized to a square; it is area-filtered like in Pillow if it shrinks."""
-    planes = image[..., None] if image.ndim == 2 else image
-    resized = [
-        np.asarray(Image.fromarray(np.ascontiguousarray(plane)).resize((size, size), Image.Resampling.BILINEAR))
-        for plane in np.moveaxis(planes, -1, 0)
-    ]
+    planes = np.moveaxis(np.atleast_3d(image), -1, 0)
+    images = (Image.fromarray(np.ascontiguousarray(plane)) for plane in planes)
+    resized = [np.asarray(each.resize((size, size), Image.Resampling.BILINEAR)) for each in images]
     return np.stack(resized, axis=-1).reshape(size, size, *image.shape[2:])
 
 

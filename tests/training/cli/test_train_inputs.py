@@ -96,7 +96,7 @@ def test_invalid_inputs(
         ("--meshes meshes --leave-out brick", "the objects are box; expected at least two"),
         ("--meshes meshes --embedding 9 --distractors meshes", "also a class"),
         ("--meshes meshes --out full", "full"),
-        ("--dataset absent", "absent"),
+        ("--dataset absent --embedding 9 --distractors meshes --mesh-scale 0.5", "absent"),
         ("--meshes meshes --baselines templates", "templates needs a backbone"),
         ("--meshes meshes --baselines thor --azimuth-step 180", "baselines: thor needs views from the side"),
         ("--dataset views --names names.json", "names is names.json"),
