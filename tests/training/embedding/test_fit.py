@@ -52,10 +52,11 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
 
 
 def test_views_depend_on_their_object_only() -> None:
-    one = render_clouds({3: 15, 4: 20}, 2)
-    again = render_clouds({4: 20}, 2)
-    assert [index for index, _ in one] == [3, 3, 4, 4]
-    np.testing.assert_equal(again, one[2:])
+    """Most views are augmented."""
+    with mock.patch.object(module, "augment", wraps=module.augment) as augmented:
+        one = render_clouds({3: 15, 4: 20}, 2)
+    assert [index for index, _ in one] == [3, 3, 4, 4] and augmented.call_count > 2
+    np.testing.assert_equal(render_clouds({4: 20}, 2), one[2:])
 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
