@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["InputError", "as_array", "decoding", "needs_extra", "reason_of", "refusing_os_errors", "with_context"]
+__all__ = [
+    "InputError",
+    "as_array",
+    "decoding",
+    "needs_extra",
+    "one_line",
+    "reason_of",
+    "refusing_os_errors",
+    "with_context",
+]
 
 MAX_MESSAGE = 1000
 """Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
@@ -17,13 +26,20 @@ class InputError(ValueError):
     """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
 
     The command line prints it on standard error and exits with code 2. Every other exception is a defect of this
-    software and keeps its traceback. The middle of a message that would fill a screen is left out.
+    software and keeps its traceback. Line breaks become spaces, and the middle of a message that would fill a screen is
+    left out.
     """
 
     def __init__(self, message: str) -> None:
+        message = one_line(message)
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
+
+
+def one_line(text: str) -> str:
+    """Return a text with spaces in place of line breaks, without the blanks around them."""
+    return " ".join(map(str.strip, text.splitlines()))
 
 
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]", dtype: Any = None) -> NDArray[Any]:
@@ -41,7 +57,7 @@ def reason_of(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, OSError) and error.strerror:
         message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(message.split()) or type(error).__name__
+    return one_line(message) or type(error).__name__
 
 
 @contextlib.contextmanager

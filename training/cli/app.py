@@ -27,7 +27,7 @@ from rich import progress, table
 from rich.console import Console
 
 from thor2_jax import __version__
-from thor2_jax.errors import InputError, reason_of
+from thor2_jax.errors import InputError, one_line, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
@@ -216,8 +216,15 @@ def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 
         report(lost)
 
 
+def _interrupt(number: int, _: object) -> NoReturn:
+    """Raise KeyboardInterrupt for SIGTERM, so that files are finished or removed; a second one ends the process."""
+    signal.signal(number, signal.SIG_DFL)
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Run the command line (entry point of the console script)."""
+    previous = signal.signal(signal.SIGTERM, _interrupt)
     report = sys.unraisablehook
     sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:
@@ -245,6 +252,8 @@ def main() -> None:
         _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
+        if signal.signal(signal.SIGTERM, previous) is signal.SIG_DFL:
+            signal.raise_signal(signal.SIGTERM)
     raise SystemExit(status)
 
 
@@ -280,5 +289,5 @@ def _given_value(error: Exception) -> str:
 
 
 def _exit_with(message: str) -> NoReturn:
-    print_note(f"error: {' '.join(message.split())}")
+    print_note(f"error: {one_line(message)}")
     raise SystemExit(2)

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from thor2_jax.errors import InputError
 from thor2_jax.printable import first_names
 from training.cli import options
 from training.cli.app import Table, app, console, finish, show_help, show_progress
@@ -47,7 +46,7 @@ def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = No
 
 
 @evaluate_app.command()
-@options.grouped_options
+@functools.partial(options.grouped_options, without=options.RECORDING_OPTIONS)
 def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames with named objects: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
@@ -61,8 +60,6 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
     given.check()
-    if given.bag is not None:
-        raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:

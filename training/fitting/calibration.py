@@ -63,7 +63,8 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
 
 
 KEPT = 0.95
-"""Fraction of the correct held-out answers whose confidence must reach the threshold of a run."""
+"""Least fraction of the correct held-out answers whose confidence reaches the threshold of a run, which is one of these
+confidences."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:
@@ -100,7 +101,8 @@ def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> t
         if factor > 0:  # otherwise the confidence would not increase with the score
             calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
     confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
-    return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT))), accuracy
+    threshold = float(np.quantile(confidence, 1 - KEPT, method="lower"))
+    return dataclasses.replace(calibration, unknown_below=threshold), accuracy
 
 
 def _logistic(feature: NDArray[Any], target: NDArray[np.bool_], class_weight: str | None = None) -> tuple[float, float]:

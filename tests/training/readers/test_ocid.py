@@ -136,6 +136,7 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     output = printed(*command, "--per-sequence", "--out", tmp_path / "report")
     assert f"--model {models}/seq36/fold-0 " in output  # of the command that explains answers
     assert "Published table 1" in output and "Published table 3" not in output
+    assert "Accuracy of the answers without rejection: " in output
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     assert {("camera",), ("camera", "place"), ("camera", "type")} < cells.keys()
