@@ -77,8 +77,9 @@ class _Answers:
             check_output_directory(given.out, resumable=resumable)
             for name in frames if several else [""]:
                 result_files.check_no_foreign_results(given.out / name)
-        if given.coco is not None and given.bop is not None and given.coco.absolute() == given.bop.absolute():
-            raise InputError(f"coco and bop are {given.coco}; expected two files")
+        for (name, path), (other, same) in itertools.combinations(options.given_values(given).items(), 2):
+            if path.absolute() == same.absolute():
+                raise InputError(f"{name} and {other} are {path}; expected different paths")
         self._bag = None if given.out_bag is None else DetectionBag(given.out_bag)
         self._rerun = None if given.rerun is None else RerunFile(given.rerun)
         self._numbers = None if given.names is None else read_object_names(given.names)

@@ -26,7 +26,7 @@ from typer.main import get_command
 import thor2_jax as thor2
 from training.cli.app import app, enable_compilation_cache, finish, show_progress
 from training.cli.options import FrameOptions
-from training.storage.jobs import numbered
+from training.storage.jobs import cache_directory, numbered
 
 ROOT = Path(__file__).parents[3]
 
@@ -114,8 +114,9 @@ def test_a_narrow_terminal_cuts_no_column(monkeypatch: pytest.MonkeyPatch) -> No
     assert "".join(table).count("x") == 99 and "120" in "".join(table)
 
 
-def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
-    description = {"format": 2, "descriptor_version": thor2.DESCRIPTOR_VERSION, "classes": ["mug"]}
+def test_objects_without_jax_or_all_characters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    description = {"format": 2, "descriptor_version": thor2.DESCRIPTOR_VERSION, "classes": ["t\xe9"]}
     (tmp_path / "run.json").write_text(json.dumps(description))
     code = (
         "import training.cli, thor2_jax, sys; assert not {'jax', 'scipy'} & {*sys.modules};"
@@ -124,7 +125,7 @@ def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
         "except SystemExit as end: assert not end.code and 'jax' not in sys.modules"
     )
     done = run_python("-c", code, "objects", "--model", str(tmp_path))
-    assert done.returncode == 0 and "1 object: mug" in done.stdout, done.stderr
+    assert done.returncode == 0 and r"1 object: t\xe9" in done.stdout, done.stderr
 
 
 def test_public_names_are_imported_when_used() -> None:
@@ -311,8 +312,8 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A directory that cannot be created is ignored, and a file is refused."""
-    for value in ("off", "/proc/no-such-directory"):
+    """A directory that cannot be created or accessed is ignored, and a file is refused."""
+    for value in ("off", "/proc/no-such-directory", "x" * 300):
         monkeypatch.setenv("THOR2_CACHE", value)
         enable_compilation_cache()
         assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "" and not environment.exists()
@@ -325,6 +326,10 @@ def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, m
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone
     enable_compilation_cache()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
+    for name in ("THOR2_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # a user without a home directory
+    assert cache_directory("xla") is None
 
 
 @pytest.mark.slow

@@ -157,6 +157,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("BAG --workers 2", "workers is 2 and --bag is"),
         ("BAG --out-bag a.bag", "expected an MCAP file"),
         ("BAG --out-bag .", "which exists"),
+        ("BAG --out-bag x --out x", "out and --out-bag are x"),
         ("BAG --out-bag none/a.mcap", "No such file"),
         ("BAG --out-bag in.mcap/a.mcap", "a.mcap: Not a directory"),
         ("BAG --color-topic /x", "--color-topic is /x"),
