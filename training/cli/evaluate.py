@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,7 +64,7 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
         console.print(f"skipped: {folder.note}")
-    _evaluate("frames", folder, dataset, job, runs, given=given.arguments)
+    _evaluate("frames", folder, dataset, job, runs, given=given)
 
 
 @evaluate_app.command()
@@ -108,7 +108,7 @@ def _evaluate(
     runs: list[Path] | None,
     per_sequence: bool = False,
     names: Path | None = None,
-    given: Sequence[str] = (),
+    given: options.FrameOptions | None = None,
 ) -> None:
     from thor2_jax.files import file_digest
     from thor2_jax.model.run_record import RUN_FILE
@@ -119,6 +119,8 @@ def _evaluate(
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = file_digest(names)
+    if given and given.depth_scale is not None:
+        description["depth_scale"] = str(given.depth_scale)
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
         loaded = load_runs(*load)
@@ -132,7 +134,7 @@ def _evaluate(
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
     purpose = "explain wrong answers" if report["worst"] else "explain answers"
-    finish(result, purpose, "explain", *(given or ["FRAME"]), model=run, out="why")
+    finish(result, purpose, "explain", *(given.arguments if given else ["FRAME"]), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:
