@@ -7,16 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "InputError",
-    "as_array",
-    "decoding",
-    "needs_extra",
-    "one_line",
-    "reason_of",
-    "refusing_os_errors",
-    "with_context",
-]
+__all__ = ["InputError", "as_array", "decoding", "needs_extra", "reason_of", "refusing_os_errors", "with_context"]
 
 MAX_MESSAGE = 1000
 """Largest length of a message; a damaged file may contain a name or a number with millions of characters."""
@@ -31,15 +22,10 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        message = one_line(message)
+        message = " ".join(map(str.strip, message.splitlines()))
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
-
-
-def one_line(text: str) -> str:
-    """Return a text with spaces in place of line breaks, without the blanks around them."""
-    return " ".join(map(str.strip, text.splitlines()))
 
 
 def as_array(values: ArrayLike, name: str, expected: str = "an array [n, 3]", dtype: Any = None) -> NDArray[Any]:
@@ -57,7 +43,7 @@ def reason_of(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, OSError) and error.strerror:
         message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return one_line(message) or type(error).__name__
+    return str(InputError(message)) or type(error).__name__
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ from rich import progress, table
 from rich.console import Console
 
 from thor2_jax import __version__
-from thor2_jax.errors import InputError, one_line, reason_of
+from thor2_jax.errors import InputError, reason_of
 from thor2_jax.printable import escape_characters
 from training.storage.jobs import Progress, cache_directory, processor
 
@@ -158,8 +158,7 @@ TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that only training imports; recognition and the service do not need them (docs/install.md)."""
 
 COLLECTION_THRESHOLD = 5_000
-"""Number of new objects after which Python collects garbage. With the default of Python 3.11, 700, garbage collection
-takes an eighth of the time of a short command."""
+"""Number of new objects after which garbage is collected; with the default, 700, that takes an eighth of a command."""
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 """Options whose value may be empty, or whose command checks the value itself."""
@@ -292,5 +291,5 @@ def _given_value(error: Exception) -> str:
 
 
 def _exit_with(message: str) -> NoReturn:
-    print_note(f"error: {one_line(message)}")
+    print_note(f"error: {InputError(message)}")
     raise SystemExit(2)

@@ -18,9 +18,6 @@ evaluate_app = typer.Typer(
 )
 app.add_typer(evaluate_app, name="evaluate")
 
-MAX_LISTED = 10
-"""Largest number of labels that the summary lists."""
-
 DatasetArgument = Annotated[Path, typer.Argument(help="Folder of the dataset.")]
 MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
 
@@ -165,7 +162,7 @@ def _print_report(report: Mapping[str, Any]) -> None:
     )
     if report["no_pixels"]:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
-        console.print(f"labels without pixels in the label image: {first_names(missing, MAX_LISTED)}")
+        console.print(f"labels without pixels in the label image: {first_names(missing)}")
     console.print(
         f"frames: {speed['frames']}, {speed['frames_per_second']:.2f} a second with compilation; "
         f"median {speed['median_seconds']:.2f} s a frame"

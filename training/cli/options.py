@@ -149,8 +149,7 @@ class FrameOptions:
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
-        given = given_values(self)
-        check_belongs("--bag", self.bag, **{name: given[name] for name in RECORDING_OPTIONS if name in given})
+        check_belongs("--bag", self.bag, **{n: v for n, v in given_values(self).items() if n in RECORDING_OPTIONS})
         if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics; see --help")
 

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
     from training.frame_recognition import FrameAnswer
 
-MAX_LISTED = 5
-"""Largest number of failed frames that the last line lists."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OutputOptions:
@@ -152,7 +149,7 @@ class _Answers:
         if self._tables.n_without_number:
             print_note(f"instances whose name has no number in {self._given.names}: {self._tables.n_without_number}")
         if self._failed:
-            total, listed = len(self._failed) + len(self.failures), first_names(self._failed, MAX_LISTED)
+            total, listed = len(self._failed) + len(self.failures), first_names(self._failed)
             raise InputError(f"{len(self._failed)} of {total} frames could not be recognized: {listed}; see above")
 
 

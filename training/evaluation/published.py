@@ -16,8 +16,7 @@ from training.evaluation.scores import summarize_runs
 __all__ = ["compare_with_published", "published_seconds"]
 
 _LIGHTS = {"1": "bright", "2": "dim"}
-"""Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not state this; see the note in
-`published.json`."""
+"""Light of UW-IS Occluded: number in the dataset -> name in the paper, an assumption; see `published.json`."""
 
 
 @functools.cache

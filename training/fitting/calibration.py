@@ -63,8 +63,7 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
 
 
 KEPT = 0.95
-"""Least fraction of the correct held-out answers whose confidence reaches the threshold of a run, which is one of these
-confidences."""
+"""Least fraction of the correct held-out answers whose confidence reaches the threshold, which is one of theirs."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:

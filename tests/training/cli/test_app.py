@@ -72,9 +72,8 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Comm
         (("absent",), "absent"),
         (("--color", "c.png"), "--depth"),
     ):
-        if command == "evaluate frames" and not {"--bag", "--every"}.isdisjoint(given):
-            expected = "No such option"
-        assert expected in refused(*command.split(), *given, "--model", tmp_path / "run", *out)
+        error = refused(*command.split(), *given, "--model", tmp_path / "run", *out)
+        assert expected in error or (command == "evaluate frames" and "No such option: --" in error)
 
 
 def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:

@@ -116,9 +116,7 @@ def test_unknown_objects_are_told_apart_without_incorrect_answers(held_out: View
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
 
 
-def test_held_out_views_are_recognized_in_the_looks_of_the_run(
-    held_out: Views, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_out_views_have_the_looks_of_the_run(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     """The threshold is that of the answers to all clouds in one batch, in their own order."""
     run = untrained_embedding_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, looks=4))
     assert run.embedding is not None
