@@ -10,6 +10,7 @@ import functools
 import gc
 import io
 import itertools
+import multiprocessing
 import os
 import re
 import shlex
@@ -219,6 +220,8 @@ def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 
 def _interrupt(number: int, _: object) -> NoReturn:
     """Raise KeyboardInterrupt for SIGTERM, so that files are finished or removed; a second one ends the process."""
     signal.signal(number, signal.SIG_DFL)
+    if multiprocessing.active_children():  # their running calls would be awaited
+        signal.raise_signal(number)
     raise KeyboardInterrupt
 
 
