@@ -229,9 +229,8 @@ class Bag:
         self.frame_id = str(first[self.topics.color].header.frame_id)
         likely = {self.topics.depth: "not aligned to color", self.topics.camera: "the camera of other images"}
         for topic, mistake in likely.items():
-            if topic and (frame_id := first[topic].header.frame_id) != self.frame_id:
-                frames = f"the coordinate frame {frame_id} and color in {self.frame_id}"
-                self.notes.append(f"{topic} is in {frames}: it is probably {mistake}")
+            if topic and (its := first[topic].header.frame_id) != self.frame_id:
+                self.notes.append(f"{topic} is in coordinate frame {its}, color in {self.frame_id}: probably {mistake}")
 
     @contextlib.contextmanager
     def _damage_named(self) -> Iterator[None]:

@@ -8,7 +8,6 @@ only the first run of a command compiles; JAX_COMPILATION_CACHE_DIR takes preced
 import contextlib
 import functools
 import gc
-import io
 import itertools
 import multiprocessing
 import os
@@ -229,7 +228,7 @@ def main() -> None:
     """Run the command line (entry point of the console script)."""
     previous = signal.signal(signal.SIGTERM, _interrupt)
     report = sys.unraisablehook
-    if isinstance(sys.stdout, io.TextIOWrapper):
+    if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")  # as standard error, for names that its encoding lacks
     sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:

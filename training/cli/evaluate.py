@@ -56,7 +56,6 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     paths = given.frames or ()
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
-    given.check()
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
