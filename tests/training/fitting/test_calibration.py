@@ -100,8 +100,7 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
-    below = fitted.unknown_below
-    assert np.mean(scores[correct] >= below) >= 0.95 > np.mean(scores[correct] > below)
+    assert np.mean(scores[correct] >= fitted.unknown_below) >= 0.95 > np.mean(scores[correct] > fitted.unknown_below)
     unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
     assert fit(fused, embedded, unknown)[0] is None
 

@@ -84,8 +84,7 @@ def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
     write_ocid(tmp_path, stem="unlisted")
     write_ocid(tmp_path, "floor/top/mixed/seq08")
     mug = vlg_item(3, "mug", f"{sequence},{STEM}.png")
-    items = [mug, mug, vlg_item("5", "bowl_1", f"{sequence},later.png")]
-    dataset = OCID(tmp_path, write_names(tmp_path, items))
+    dataset = OCID(tmp_path, write_names(tmp_path, [mug, mug, vlg_item("5", "bowl_1", f"{sequence},later.png")]))
     assert dataset.identifiers == [f"table/bottom/curved/seq36/{stem}" for stem in ("later", STEM)]
     for item in dataset:
         assert item.frame.instances == (3, 4, 5)
