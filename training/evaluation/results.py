@@ -221,7 +221,7 @@ def check_known(names: Iterable[str], classes: Sequence[str]) -> None:
         unknown.add(name)
     raise InputError(
         f"model: no object of the dataset is of a class of the runs; it has {first_names(sorted(unknown)) or 'none'}, "
-        f"the runs have {first_names(sorted(classes))}; check the names, give other runs, or add frames with known objects"
+        f"the runs have {first_names(sorted(classes))}; check the names, give other runs, or frames with known objects"
     )
 
 
