@@ -217,7 +217,7 @@ def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 
 
 
 def _interrupt(number: int, _: object) -> NoReturn:
-    """Raise KeyboardInterrupt for SIGTERM, so that files are finished or removed; a second one ends the process."""
+    """Raise KeyboardInterrupt, so that files are finished or removed; a second signal ends the process at once."""
     signal.signal(number, signal.SIG_DFL)
     if multiprocessing.active_children():  # their running calls would be awaited
         signal.raise_signal(number)
@@ -226,7 +226,8 @@ def _interrupt(number: int, _: object) -> NoReturn:
 
 def main() -> None:
     """Run the command line (entry point of the console script)."""
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) is signal.SIG_DFL]
+    previous = {number: signal.signal(number, _interrupt) for number in caught}  # `nohup` ignores SIGHUP
     report = sys.unraisablehook
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")  # as standard error, for names that its encoding lacks
@@ -256,8 +257,9 @@ def main() -> None:
         _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
-        if signal.signal(signal.SIGTERM, previous) is signal.SIG_DFL:
-            signal.raise_signal(signal.SIGTERM)
+        for number, handler in previous.items():
+            if signal.signal(number, handler) is signal.SIG_DFL:
+                signal.raise_signal(number)
     raise SystemExit(status)
 
 

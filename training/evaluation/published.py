@@ -58,8 +58,7 @@ _OURS = {"THOR (MLP)": "THOR"}
 """Published methods whose name differs from the title of the measured column."""
 
 _SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
-"""Suffixes of methods in the published tables that were trained without and with all real images, and suffix of the
-titles of small networks."""
+"""Suffixes of published methods trained without and with all real images, and of the titles of small networks."""
 
 
 def _measured_column(method: str, real_views: bool, titles: Collection[str]) -> str | None:

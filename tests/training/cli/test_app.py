@@ -166,8 +166,8 @@ import training.cli
     assert (done.returncode, done.stderr) == (130, "")
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
-def test_sigterm_leaves_no_warning_and_no_files_without_workers(workers: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("workers", "number"), [("1", signal.SIGHUP), ("1", signal.SIGTERM), ("2", signal.SIGTERM)])
+def test_a_signal_leaves_no_warning_nor_files(workers: str, number: signal.Signals, tmp_path: Path) -> None:
     code = """
 import os, signal, sys
 import training.cli
@@ -178,13 +178,13 @@ def command(**_):
     with temporary_directory(sys.argv[1]):
         results = local_workers(int(sys.argv[2]))(eval, ["1"] * 9)
         next(results)
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), int(sys.argv[3]))
 
 sys.modules["training.cli.app"].app = command
 sys.modules["training.cli.app"].main()
 """
-    done = run_python("-c", code, str(tmp_path), workers)
-    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+    done = run_python("-c", code, str(tmp_path), workers, str(int(number)))
+    assert (done.returncode, done.stderr) == (-number, "")
     assert workers == "2" or not os.listdir(tmp_path)
 
 
