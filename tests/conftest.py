@@ -100,22 +100,6 @@ def pytest_collectreport() -> None:
     settings.load_profile("default")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def one_line_errors() -> Iterator[None]:
-    """Check that the message of each InputError is one line."""
-    from thor2_jax.errors import InputError
-
-    create = InputError.__init__
-
-    def create_checked(self: InputError, message: str) -> None:
-        assert "\n" not in message, message
-        create(self, message)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(InputError, "__init__", create_checked)
-        yield
-
-
 @pytest.fixture(autouse=True)
 def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
     import jax

@@ -17,10 +17,12 @@ class InputError(ValueError):
     """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
 
     The command line prints it on standard error and exits with code 2. Every other exception is a defect of this
-    software and keeps its traceback. The middle of a message that would fill a screen is left out.
+    software and keeps its traceback. Line breaks become spaces, and the middle of a message that would fill a screen is
+    left out.
     """
 
     def __init__(self, message: str) -> None:
+        message = " ".join(map(str.strip, message.splitlines()))
         if len(message) > MAX_MESSAGE:
             message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
         super().__init__(message)
@@ -41,7 +43,7 @@ def reason_of(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, OSError) and error.strerror:
         message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(message.split()) or type(error).__name__
+    return str(InputError(message)) or type(error).__name__
 
 
 @contextlib.contextmanager

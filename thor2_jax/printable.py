@@ -48,7 +48,7 @@ def find_name(name: str, known: Collection[str]) -> str | None:
     return next((each for each in known if isinstance(name, str) and normal_name(each) == normal_name(name)), None)
 
 
-def first_names(names: Sequence[str], most: int) -> str:
+def first_names(names: Sequence[str], most: int = 6) -> str:
     """Return the first `most` names as a list in a sentence, with dots for further ones."""
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 

@@ -19,6 +19,7 @@ def test_the_reason_of_an_error_of_the_system_names_its_file() -> None:
     assert reason_of(OSError("two\nlines")) == "two lines" and reason_of(ValueError()) == "ValueError"
 
 
-def test_the_middle_of_a_long_message_is_left_out() -> None:
+def test_a_message_has_one_line_without_the_middle_of_a_long_one() -> None:
+    assert str(InputError("the file a  b is\n  [[1 2]\n [3 4]]\n")) == "the file a  b is [[1 2] [3 4]]"
     assert str(InputError("a" * 500 + "b" * 500)) == "a" * 500 + "b" * 500
     assert str(InputError("a" * 600 + "b" * 600)) == f"{'a' * 500} ... {'b' * 500}"

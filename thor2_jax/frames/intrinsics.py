@@ -67,10 +67,6 @@ _MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
 Array = NDArray[np.floating[Any]]
 
 
-def _line(value: Any) -> str:
-    return " ".join(str(value).split())
-
-
 def _is_number(value: Any) -> bool:
     is_real = isinstance(value, Real) and not isinstance(value, bool)
     return is_real and bool(abs(value) <= LARGEST_INTRINSIC)
@@ -173,8 +169,7 @@ class Intrinsics:
         except (TypeError, ValueError):
             skew = None
         if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
-            shown = _line(matrix)[:200]
-            raise InputError(f"intrinsics is {shown}; expected a 3 x 3 matrix fx, 0, cx, 0, fy, cy, 0, 0, 1")
+            raise InputError(f"intrinsics is {matrix}; expected a 3 x 3 matrix fx, 0, cx, 0, fy, cy, 0, 0, 1")
         return cls(fx, fy, cx, cy, depth_scale, width, height, distortion)
 
 
@@ -269,7 +264,7 @@ def _distortion(values: Mapping[Any, Any]) -> Any:
     name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
     if name not in _PINHOLE_MODELS and _is_given(distortion):
         raise InputError(
-            f"intrinsics has the distortion model {_line(model)}; expected plumb_bob or rational_polynomial; rectify "
+            f"intrinsics has the distortion model {model}; expected plumb_bob or rational_polynomial; rectify "
             "the images and give the intrinsics of the rectified images"
         )
     return distortion
@@ -290,8 +285,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
         matrix = as_array(values["intrinsic_matrix"], "intrinsics.intrinsic_matrix", dtype=object).ravel()
         if matrix.size != 9 or any(matrix[[2, 5]]):  # with cx and cy there, it is given row by row
             raise InputError(
-                f"intrinsics.intrinsic_matrix is {_line(values['intrinsic_matrix'])[:200]}; expected fx, 0, 0, 0, fy, "
-                "0, cx, cy, 1"
+                f"intrinsics.intrinsic_matrix is {values['intrinsic_matrix']}; expected fx, 0, 0, 0, fy, 0, cx, cy, 1"
             )
         return matrix.reshape(3, 3).T, scale
     if "ppx" in values or "ppy" in values:
@@ -304,7 +298,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
         if has_size and _is_number(scale) and BOP_CAMERA_SCALES[0] <= scale <= BOP_CAMERA_SCALES[1]:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale
-    shown, expected = ", ".join(map(_line, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
+    shown, expected = ", ".join(map(str, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
     raise InputError(f"intrinsics has {shown}; expected {expected}, cam_K, ppx and ppy, or intrinsic_matrix")
 
 

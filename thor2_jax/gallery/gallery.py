@@ -63,9 +63,6 @@ TOYS = frozenset(
 )  # fmt: skip
 """The built-in objects, the classes of the demo's model."""
 
-MAX_LISTED = 6
-"""Names that `Gallery.summary` lists."""
-
 EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
 
@@ -324,7 +321,7 @@ class Gallery:
         """The names as a phrase, such as "21 objects: mug, bowl, ..."."""
         toys = [name for name in self.answered_names if name in TOYS] if set(self.trained) == TOYS else []
         own = [name for name in self.answered_names if name not in toys]
-        listed = first_names(own, MAX_LISTED)
+        listed = first_names(own)
         if toys:
             others = f", and {listed}" if own else "; none of yours"
             return f"{len(toys)} toy objects of the demo{others}"

@@ -226,13 +226,11 @@ class Bag:
                 with with_context(str(self.topics.camera)):
                     self.intrinsics = camera_of(first[self.topics.camera], str(self.topics.color))
         self.intrinsics = self.intrinsics.with_depth_scale(self._depth_scale)
-        color, depth = (first[topic].header.frame_id for topic in (self.topics.color, self.topics.depth))
-        self.frame_id = str(color)
-        if color != depth:
-            self.notes.append(
-                f"depth ({self.topics.depth}) is in the coordinate frame {depth} and color in {color}: it is probably "
-                "not aligned to color"
-            )
+        self.frame_id = str(first[self.topics.color].header.frame_id)
+        likely = {self.topics.depth: "not aligned to color", self.topics.camera: "the camera of other images"}
+        for topic, mistake in likely.items():
+            if topic and (its := first[topic].header.frame_id) != self.frame_id:
+                self.notes.append(f"{topic} is in coordinate frame {its}, color in {self.frame_id}: probably {mistake}")
 
     @contextlib.contextmanager
     def _damage_named(self) -> Iterator[None]:

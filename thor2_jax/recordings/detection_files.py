@@ -212,7 +212,8 @@ class RerunFile:
         """Check that `path` can be written.
 
         Raises:
-            InputError: the suffix is not .rrd, the file is a recording of another program, or rerun-sdk is missing.
+            InputError: the suffix is not .rrd, the file is a recording of another program, or rerun-sdk is missing or
+                disabled.
             OSError: the parent directory does not exist or cannot be written.
         """
         path = as_path(path, "rerun")
@@ -223,6 +224,9 @@ class RerunFile:
         with needs_extra(f"rerun is {path}, which", "rerun-sdk", "rerun"):
             import rerun
         self._rerun: Any = rerun
+        self._recording = rerun.RecordingStream(_APPLICATION)
+        if not rerun.is_enabled(self._recording):
+            raise InputError(f"rerun is {path}, but the variable RERUN disables Rerun; unset it")
         self.path, self.n_frames, self._folder = path, 0, contextlib.ExitStack()
 
     def __enter__(self) -> "RerunFile":
@@ -230,7 +234,6 @@ class RerunFile:
         parent = self.path.absolute().parent
         with errors_name(self.path):
             self._temporary = self._folder.enter_context(temporary_directory(parent)) / self.path.name
-        self._recording = self._rerun.RecordingStream(_APPLICATION)
         self._recording.save(self._temporary)
         # Camera coordinates are those of OpenCV: x right, y down, z forward.
         self._recording.log("/", self._rerun.ViewCoordinates.RDF, static=True)

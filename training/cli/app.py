@@ -9,6 +9,7 @@ import contextlib
 import functools
 import gc
 import itertools
+import multiprocessing
 import os
 import re
 import shlex
@@ -157,8 +158,7 @@ TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that only training imports; recognition and the service do not need them (docs/install.md)."""
 
 COLLECTION_THRESHOLD = 5_000
-"""Number of new objects after which Python collects garbage. With the default of Python 3.11, 700, garbage collection
-takes an eighth of the time of a short command."""
+"""Number of new objects after which garbage is collected; with the default, 700, that takes an eighth of a command."""
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 """Options whose value may be empty, or whose command checks the value itself."""
@@ -216,9 +216,21 @@ def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 
         report(lost)
 
 
+def _interrupt(number: int, _: object) -> NoReturn:
+    """Raise KeyboardInterrupt, so that files are finished or removed; a second signal ends the process at once."""
+    signal.signal(number, signal.SIG_DFL)
+    if multiprocessing.active_children():  # their running calls would be awaited
+        signal.raise_signal(number)
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Run the command line (entry point of the console script)."""
+    caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) is signal.SIG_DFL]
+    previous = {number: signal.signal(number, _interrupt) for number in caught}  # `nohup` ignores SIGHUP
     report = sys.unraisablehook
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error, for names that its encoding lacks
     sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:
         _check_not_empty(sys.argv[1:])
@@ -245,6 +257,9 @@ def main() -> None:
         _exit_with(_with_options(reason_of(error)))
     finally:
         sys.unraisablehook = report
+        for number, handler in previous.items():
+            if signal.signal(number, handler) is signal.SIG_DFL:
+                signal.raise_signal(number)
     raise SystemExit(status)
 
 
@@ -280,5 +295,5 @@ def _given_value(error: Exception) -> str:
 
 
 def _exit_with(message: str) -> NoReturn:
-    print_note(f"error: {' '.join(message.split())}")
+    print_note(f"error: {InputError(message)}")
     raise SystemExit(2)

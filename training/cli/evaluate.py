@@ -3,13 +3,12 @@
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from thor2_jax.errors import InputError
 from thor2_jax.printable import first_names
 from training.cli import options
 from training.cli.app import Table, app, console, finish, show_help, show_progress
@@ -18,9 +17,6 @@ evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."
 )
 app.add_typer(evaluate_app, name="evaluate")
-
-MAX_LISTED = 10
-"""Largest number of labels that the summary lists."""
 
 DatasetArgument = Annotated[Path, typer.Argument(help="Folder of the dataset.")]
 MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
@@ -47,7 +43,7 @@ def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = No
 
 
 @evaluate_app.command()
-@options.grouped_options
+@functools.partial(options.grouped_options, without=options.RECORDING_OPTIONS)
 def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames with named objects: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
@@ -60,14 +56,11 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     paths = given.frames or ()
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
-    given.check()
-    if given.bag is not None:
-        raise InputError(f"bag is {given.bag}; a recording has no labels.json, so give folders of frames that have one")
     folder = FrameFolder(given.sources())
     dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
     if folder.note:
         console.print(f"skipped: {folder.note}")
-    _evaluate("frames", folder, dataset, job, runs, given=given.arguments)
+    _evaluate("frames", folder, dataset, job, runs, given=given)
 
 
 @evaluate_app.command()
@@ -111,7 +104,7 @@ def _evaluate(
     runs: list[Path] | None,
     per_sequence: bool = False,
     names: Path | None = None,
-    given: Sequence[str] = (),
+    given: options.FrameOptions | None = None,
 ) -> None:
     from thor2_jax.files import file_digest
     from thor2_jax.model.run_record import RUN_FILE
@@ -122,6 +115,8 @@ def _evaluate(
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = file_digest(names)
+    if given and given.depth_scale is not None:
+        description["depth_scale"] = str(given.depth_scale)
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
         loaded = load_runs(*load)
@@ -135,7 +130,7 @@ def _evaluate(
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
     purpose = "explain wrong answers" if report["worst"] else "explain answers"
-    finish(result, purpose, "explain", *(given or ["FRAME"]), model=run, out="why")
+    finish(result, purpose, "explain", *(given.arguments if given else ["FRAME"]), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:
@@ -166,7 +161,7 @@ def _print_report(report: Mapping[str, Any]) -> None:
     )
     if report["no_pixels"]:
         missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
-        console.print(f"labels without pixels in the label image: {first_names(missing, MAX_LISTED)}")
+        console.print(f"labels without pixels in the label image: {first_names(missing)}")
     console.print(
         f"frames: {speed['frames']}, {speed['frames_per_second']:.2f} a second with compilation; "
         f"median {speed['median_seconds']:.2f} s a frame"

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import inspect
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,6 +27,7 @@ __all__ = [
     "ModelOption",
     "NamesOption",
     "QuietOption",
+    "RECORDING_OPTIONS",
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
@@ -84,6 +85,10 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progre
 
 recording_option = functools.partial(typer.Option, rich_help_panel="Recordings")
 """Option for recordings; the help lists these in a panel of their own."""
+
+
+RECORDING_OPTIONS = ("bag", "color_topic", "depth_topic", "camera_topic", "max_gap", "every")
+"""Names of the options of `FrameOptions` for recordings."""
 
 
 def given_values(record: Any) -> dict[str, Any]:
@@ -144,10 +149,9 @@ class FrameOptions:
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
         check_alone("bag", self.bag, frames=self.frames, color=self.color, depth=self.depth, labels=self.labels)
-        of_bag = ("color_topic", "depth_topic", "camera_topic", "max_gap", "every")
-        check_belongs("--bag", self.bag, **{name: each for name, each in given_values(self).items() if name in of_bag})
+        check_belongs("--bag", self.bag, **{n: v for n, v in given_values(self).items() if n in RECORDING_OPTIONS})
         if self.bag is None and bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
-            raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
+            raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics; see --help")
 
     def sources(
         self, segment: str | None = None, model: "Segmenter | None" = None, *, masks: bool = True
@@ -210,11 +214,15 @@ def find_segmenter(name: str, model: "Segmenter | None" = None) -> "Segmenter":
     return model
 
 
-def grouped_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a command: replace parameters that are dataclasses of options (`FrameOptions`) by their fields."""
+def grouped_options(command: Callable[..., None], without: Collection[str] = ()) -> Callable[..., None]:
+    """Decorate a command: replace parameters that are dataclasses of options (`FrameOptions`) by their fields.
+
+    The command has no options for the fields `without`, which keep their defaults.
+    """
     own = inspect.signature(command).parameters.values()
     groups: dict[str, Any] = {one.name: one.annotation for one in own if dataclasses.is_dataclass(one.annotation)}
-    fields = {name: inspect.signature(group).parameters for name, group in groups.items()}
+    options = {name: inspect.signature(group).parameters for name, group in groups.items()}
+    fields = {name: {each: p[each] for each in p if each not in without} for name, p in options.items()}
     expanded = [each for one in own for each in (fields[one.name].values() if one.name in fields else (one,))]
 
     @functools.wraps(command)

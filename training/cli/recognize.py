@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
     from training.frame_recognition import FrameAnswer
 
-MAX_LISTED = 5
-"""Largest number of failed frames that the last line lists."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OutputOptions:
@@ -77,8 +74,9 @@ class _Answers:
             check_output_directory(given.out, resumable=resumable)
             for name in frames if several else [""]:
                 result_files.check_no_foreign_results(given.out / name)
-        if given.coco is not None and given.bop is not None and given.coco.absolute() == given.bop.absolute():
-            raise InputError(f"coco and bop are {given.coco}; expected two files")
+        for (name, path), (other, same) in itertools.combinations(options.given_values(given).items(), 2):
+            if path.absolute() == same.absolute():
+                raise InputError(f"{name} and {other} are {path}; expected different paths")
         self._bag = None if given.out_bag is None else DetectionBag(given.out_bag)
         self._rerun = None if given.rerun is None else RerunFile(given.rerun)
         self._numbers = None if given.names is None else read_object_names(given.names)
@@ -151,7 +149,7 @@ class _Answers:
         if self._tables.n_without_number:
             print_note(f"instances whose name has no number in {self._given.names}: {self._tables.n_without_number}")
         if self._failed:
-            total, listed = len(self._failed) + len(self.failures), first_names(self._failed, MAX_LISTED)
+            total, listed = len(self._failed) + len(self.failures), first_names(self._failed)
             raise InputError(f"{len(self._failed)} of {total} frames could not be recognized: {listed}; see above")
 
 

@@ -160,8 +160,7 @@ RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fused_probabilities`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "classifiers", "gallery", "both"
-"""Columns of the embedding alone, of the classifiers with the confidence from the embedding (in runs that have both),
-of the gallery alone, and of all combined. The recognizer computes them without a fusion rule."""
+"""Columns of the embedding alone, the classifiers with its confidence, the gallery alone, and all; none has a rule."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
 """All columns that are computed without a fusion rule."""

@@ -117,11 +117,13 @@ def write_report_page(report: Mapping[str, Any], out: Path) -> None:
 
 
 def answer_texts(report: Mapping[str, Any]) -> list[str]:
-    """Return sentences on the answers of `thor2 recognize`: accuracy, unknown objects that are named, wrong names."""
+    """Return sentences on the answers: accuracy, unknown objects that are named, wrong names."""
     counts, worst = report["answers"], report["worst"]
     without = counts["known"] - counts["correct"] - counts["wrong"]
+    # The runs of sequences have no threshold.
+    of = "without rejection" if report["rejection"]["threshold"]["mean"] is None else "of thor2 recognize"
     texts = [
-        f"Accuracy of the answers of thor2 recognize: {counts['correct'] / counts['known']:.3f}. "
+        f"Accuracy of the answers {of}: {counts['correct'] / counts['known']:.3f}. "
         f"Of {counts['known']:,} instances of known objects, {counts['correct']:,} are recognized correctly, "
         f"{counts['wrong']:,} get a wrong name and {without:,} get no name.",
         f"Unknown objects: {counts['unknown_named']:,} of {counts['unknown']:,} instances get a name."

@@ -16,8 +16,7 @@ from training.evaluation.scores import summarize_runs
 __all__ = ["compare_with_published", "published_seconds"]
 
 _LIGHTS = {"1": "bright", "2": "dim"}
-"""Light of UW-IS Occluded: number in the dataset -> name in the paper. The paper does not state this; see the note in
-`published.json`."""
+"""Light of UW-IS Occluded: number in the dataset -> name in the paper, an assumption; see `published.json`."""
 
 
 @functools.cache
@@ -59,8 +58,7 @@ _OURS = {"THOR (MLP)": "THOR"}
 """Published methods whose name differs from the title of the measured column."""
 
 _SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
-"""Suffixes of methods in the published tables that were trained without and with all real images, and suffix of the
-titles of small networks."""
+"""Suffixes of published methods trained without and with all real images, and of the titles of small networks."""
 
 
 def _measured_column(method: str, real_views: bool, titles: Collection[str]) -> str | None:

@@ -34,9 +34,6 @@ CURVE = tuple(k / 100 for k in range(101))
 
 Integers = NDArray[np.intp]
 
-MAX_LISTED = 20
-"""Largest number of names that an error message shows."""
-
 MOST_FREQUENT = 12
 """Number of confusions (object and wrong name) that a report lists, for known and for unknown objects."""
 
@@ -223,13 +220,9 @@ def check_known(names: Iterable[str], classes: Sequence[str]) -> None:
             return
         unknown.add(name)
     raise InputError(
-        f"model: no instance of the dataset is of a class of the runs; the dataset has {_listed(unknown)}, the runs "
-        f"have {_listed(classes)}; check the names, give other runs, or add frames with known objects"
+        f"model: no object of the dataset is of a class of the runs; it has {first_names(sorted(unknown)) or 'none'}, "
+        f"the runs have {first_names(sorted(classes))}; check the names, give other runs, or frames with known objects"
     )
-
-
-def _listed(names: Iterable[str]) -> str:
-    return first_names(sorted(names), MAX_LISTED) or "no names"
 
 
 def _accuracy(

@@ -63,7 +63,7 @@ def fit_temperature(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.
 
 
 KEPT = 0.95
-"""Fraction of the correct held-out answers whose confidence must reach the threshold of a run."""
+"""Least fraction of the correct held-out answers whose confidence reaches the threshold, which is one of theirs."""
 
 
 def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> tuple[Calibration | None, float]:
@@ -99,8 +99,9 @@ def fit_calibration(run: TrainedRun, held_out: Sequence[tuple[int, Cloud]]) -> t
         bias, factor = _logistic(score[known], correct[known])
         if factor > 0:  # otherwise the confidence would not increase with the score
             calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
-    confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
-    return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT))), accuracy
+    confidence = calibration.confidence(fused, probabilities[EMBEDDING])
+    threshold = np.quantile(confidence[correct], 1 - KEPT, method="lower")
+    return dataclasses.replace(calibration, unknown_below=float(threshold)), accuracy
 
 
 def _logistic(feature: NDArray[Any], target: NDArray[np.bool_], class_weight: str | None = None) -> tuple[float, float]:

@@ -156,10 +156,6 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
-MAX_LISTED = 5
-"""Largest number of frames without labels that the note lists."""
-
-
 class FrameFolder(LabelledFrames):
     """Frames, for instance of a folder, whose objects are named in a `labels.json` beside the label image.
 
@@ -185,15 +181,14 @@ class FrameFolder(LabelledFrames):
         self.named = bool(labelled)
         if named and not self.named:
             raise InputError(
-                f"frames: {first_names([each.name for each in sources], MAX_LISTED)} has no labels.json; expected the "
-                "names of the objects in the frames"
+                f"frames: {first_names([each.name for each in sources])} has no labels.json; expected the names of the "
+                "objects in the frames"
             )
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
         used = set(self.identifiers)
         left_out = [source.name for source in sources if source.name not in used]
-        listed = first_names(left_out, MAX_LISTED)
-        self.note = f"frames without labels.json: {len(left_out)} ({listed})" if left_out else ""
+        self.note = f"frames without labels.json: {len(left_out)} ({first_names(left_out)})" if left_out else ""
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame and the names in its labels.json, if it has one; there are no attributes."""

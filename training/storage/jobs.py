@@ -41,7 +41,7 @@ VARIABLE = "THOR2_CACHE"
 
 
 def cache_directory(kind: str) -> Path | None:
-    """Return the directory for files of a kind, which may not exist yet; None if the cache is disabled.
+    """Return the directory for files of a kind, which may not exist yet; None without a cache or a home directory.
 
     With THOR2_CACHE, all kinds share one directory, since their file names differ.
 
@@ -51,8 +51,11 @@ def cache_directory(kind: str) -> Path | None:
     value = os.environ.get(VARIABLE, "")
     if value == "off":
         return None
-    directory = Path(value) if value else platformdirs.user_cache_path("thor2-jax") / kind
-    if directory.exists() and not directory.is_dir():
+    try:
+        directory = Path(value) if value else platformdirs.user_cache_path("thor2-jax") / kind
+    except RuntimeError:  # a user without a home directory
+        return None
+    if os.path.exists(directory) and not directory.is_dir():  # False if it cannot be accessed
         raise InputError(f"{VARIABLE} is {directory}, a file; expected a directory, or off")
     return directory
 

@@ -85,10 +85,11 @@ def test_rectified_images_have_the_camera_of_the_projection(tmp_path: Path) -> N
     assert_refused("color_topic is not given", Bag(path).__enter__)
 
 
-def test_depth_that_is_not_aligned(tmp_path: Path) -> None:
-    depth = {"/camera/depth/image_rect_raw": image(DEPTH[::2, ::2], "16UC1", frame_id="depth")}
-    with Bag(write_messages(tmp_path / "a.mcap", {COLOR: image(RGB, "rgb8"), files.CAMERA: INFO} | depth)) as bag:
-        assert len(bag.notes) == 1 and "aligned" in bag.notes[0]
+def test_depth_that_is_not_aligned_and_another_camera(tmp_path: Path) -> None:
+    depth = image(DEPTH[::2, ::2], "16UC1", frame_id="depth")
+    messages = {COLOR: image(RGB, "rgb8", frame_id="rgb"), files.CAMERA: INFO, "/camera/depth/image_rect_raw": depth}
+    with Bag(write_messages(tmp_path / "a.mcap", messages)) as bag:
+        assert ["aligned" in note for note in bag.notes] == [True, False] and files.CAMERA in bag.notes[1]
         (recorded,) = bag.frames()
         assert_refused("160 x 120 pixels and color 320 x 240", recorded.read)
 

@@ -49,7 +49,7 @@ def test_frames_and_detections_are_read_back(reader: Any, tmp_path: Path) -> Non
     assert [one.name for one in tmp_path.iterdir()] == ["a.rrd"]
 
 
-def test_files_of_frames_without_instances_and_of_no_frames(reader: Any, tmp_path: Path) -> None:
+def test_files_without_instances_or_frames(reader: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.rrd"
     with RerunFile(path):
         pass
@@ -59,6 +59,8 @@ def test_files_of_frames_without_instances_and_of_no_frames(reader: Any, tmp_pat
             for _ in range(count):
                 file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="x")
     assert read(reader, path)["/camera/name"]["frame"] == [0, 1]
+    monkeypatch.setenv("RERUN", "off")
+    assert_refused("RERUN", RerunFile, path)
 
 
 def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

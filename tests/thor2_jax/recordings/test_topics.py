@@ -26,8 +26,7 @@ def test_choice_of_topics() -> None:
 
 def pairs_of(images: list[StampedImage], tolerance: int) -> tuple[list[tuple[int, int]], PairCounts]:
     counts = PairCounts()
-    pairs = [(color.stamp, depth.stamp) for color, depth in nearest_pairs(images, tolerance, counts)]
-    return pairs, counts
+    return [(color.stamp, depth.stamp) for color, depth in nearest_pairs(images, tolerance, counts)], counts
 
 
 @pytest.mark.parametrize("seed", range(20))

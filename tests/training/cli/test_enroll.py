@@ -73,10 +73,12 @@ def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Co
         assert "frames without labels.json: 1 (001)" in printed(*command, "--model", model).replace("\n", " ")
 
 
-def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
+def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path, refused: Command) -> None:
     frames = tmp_path / "test"
     write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
-    assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
+    command = ("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report")
+    assert run_thor2(*command) == 0
+    assert 'depth_scale null, not "900.0"' in refused(*command, "--depth-scale", 900)
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["main"] == "gallery" and report["fusions"] == ["gallery"]
     cell = report["accuracy"][report["rule"]][0]["cells"][0]
@@ -122,7 +124,6 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
     assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
     assert view_counts(model) == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
-    assert "no labels.json" in refused("evaluate", "frames", "--bag", bag, "--model", model)
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:

@@ -81,8 +81,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, texts: Texts) -
     coco_file, names_file = tmp_path / "out" / "coco.json", tmp_path / "names.json"
     names_file.write_text(json.dumps({"14": "mug", "21": "bowl", "5": "plate"}))
     tables = ("--coco", coco_file, "--bop", tmp_path / "bop.csv", "--names", names_file)
-    outputs = (*tables, "--out", tmp_path / "out")
-    command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
+    command = ("recognize", "--model", model, one, tmp_path / "more", *tables, "--out", tmp_path / "out")
     out, err = texts(*command)
     assert "instances whose name" not in err
     assert f"written to {tmp_path / 'out'}, {tables[1]}, {tables[3]}; see why" in out
@@ -134,7 +133,6 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
         *((f"frames --coco {path}", f"coco: {path} is not a file") for path in no_files),
         *((f"frames --bop {path}", f"bop: {path} is not a file") for path in no_files),
-        ("frames --coco x --bop x", "coco and --bop are x"),
         ("frames --out frames", "expected a new or empty directory"),
         ("frames --depth-scale 1e-300", "error: --depth-scale is 1e-300"),
         ("frames --segment sam --out out", "error: --segment is 'sam'; expected one of table, model"),
@@ -157,6 +155,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkey
         ("BAG --workers 2", "workers is 2 and --bag is"),
         ("BAG --out-bag a.bag", "expected an MCAP file"),
         ("BAG --out-bag .", "which exists"),
+        ("BAG --out-bag x --out x", "out and --out-bag are x"),
         ("BAG --out-bag none/a.mcap", "No such file"),
         ("BAG --out-bag in.mcap/a.mcap", "a.mcap: Not a directory"),
         ("BAG --color-topic /x", "--color-topic is /x"),
@@ -189,8 +188,7 @@ def test_no_file_of_the_user_is_replaced(model: Path, tmp_path: Path, refused: C
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
 def test_segmented_frames(model: Path, recognize: Recognize, tmp_path: Path, refused: Command, segmenter: str) -> None:
-    folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
-    files = frame_options(folder)
+    files = frame_options(write_frame_files(tmp_path / "frames" / "a", table_frame()))
     del files[files.index("--labels") : files.index("--labels") + 2]
     write_frame_files(tmp_path / "labelled" / "a", dataclasses.replace(table_frame(), labels=np.full((240, 320), 9)))
     for given in (files, [tmp_path / "frames"], [tmp_path / "labelled"]):  # labels of a folder are replaced

@@ -60,9 +60,8 @@ def test_measured_values_stand_beside_the_published_ones() -> None:
     }  # fmt: skip
     assert cells["S-08"]["published"]["THOR"] == {"mean": pytest.approx(0.4343), "std": pytest.approx(0.013)}
     assert own[0]["ours"] == {"THOR2": "THOR2"} and own[1]["ours"] == {"THOR2, synthetic": "THOR2"}
-    text = " ".join(own[0]["differences"])
     parts = "OCID", "5 models", "frames 10, objects 3, models 2", "log-mean; 3 of", "25 rows"
-    assert all(part in text for part in parts) and "max" in own[0]["source"]
+    assert all(part in " ".join(own[0]["differences"]) for part in parts) and "max" in own[0]["source"]
 
     (table,) = compare_with_published("ocid", [ToyRun("run")], 10, [where] * 4, ["a"] * 4, correct)
     assert table["number"] == 3

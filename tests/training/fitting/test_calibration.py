@@ -100,7 +100,7 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=2e-4)  # fitted on known objects
-    assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 0.05))
+    assert np.mean(scores[correct] >= fitted.unknown_below) >= 0.95 > np.mean(scores[correct] > fitted.unknown_below)
     unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
     assert fit(fused, embedded, unknown)[0] is None
 
@@ -117,10 +117,11 @@ def test_unknown_objects_are_told_apart_without_incorrect_answers(held_out: View
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
 
 
-def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) -> None:
+def test_held_out_views_have_the_looks_of_the_run(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     """The threshold is that of the answers to all clouds in one batch, in their own order."""
     run = untrained_embedding_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, looks=4))
     assert run.embedding is not None
+    monkeypatch.setattr(calibration, "KEPT", 0.75)  # the lowest confidence is the same with one look
     sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
     fitted, accuracy = calibration.fit_calibration(run, views)
@@ -132,7 +133,7 @@ def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) 
         embedded = np.asarray(run.embedding.class_probabilities(described))[:40]
         fused = embedded.astype(np.float64) / embedded.sum(axis=1, keepdims=True, dtype=np.float64)
         correct = fused.argmax(axis=1) == LABEL
-        thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 1 - calibration.KEPT))
+        thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 0.25, method="lower"))
         if looks == 4:
             assert accuracy == correct.sum() / (LABEL < 2).sum()
     assert fitted.unknown_below == pytest.approx(thresholds[0], abs=1e-6)

@@ -84,8 +84,7 @@ def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
     write_ocid(tmp_path, stem="unlisted")
     write_ocid(tmp_path, "floor/top/mixed/seq08")
     mug = vlg_item(3, "mug", f"{sequence},{STEM}.png")
-    items = [mug, mug, vlg_item("5", "bowl_1", f"{sequence},later.png")]
-    dataset = OCID(tmp_path, write_names(tmp_path, items))
+    dataset = OCID(tmp_path, write_names(tmp_path, [mug, mug, vlg_item("5", "bowl_1", f"{sequence},later.png")]))
     assert dataset.identifiers == [f"table/bottom/curved/seq36/{stem}" for stem in ("later", STEM)]
     for item in dataset:
         assert item.frame.instances == (3, 4, 5)
@@ -136,6 +135,7 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     output = printed(*command, "--per-sequence", "--out", tmp_path / "report")
     assert f"--model {models}/seq36/fold-0 " in output  # of the command that explains answers
     assert "Published table 1" in output and "Published table 3" not in output
+    assert "Accuracy of the answers without rejection: " in output
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     cells = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     assert {("camera",), ("camera", "place"), ("camera", "type")} < cells.keys()
