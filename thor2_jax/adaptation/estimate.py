@@ -243,8 +243,14 @@ class OnlineAdaptation:
     Estimates run in a thread, one at a time; instances that arrive during an estimate are kept for the next one.
     """
 
-    def __init__(self, criterion: Criterion) -> None:
-        """Create an adaptation without instances; `criterion` is the argument of `estimate_transform`."""
+    def __init__(self, criterion: Callable[[], Criterion]) -> None:
+        """Create an adaptation without instances.
+
+        Args:
+            criterion: function that returns the criterion of the current model, see `estimate_transform`. It is called
+                here and at each estimate, since the gallery may change.
+        """
+        criterion()
         self._criterion = criterion
         self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
         self._new = 0
@@ -253,7 +259,7 @@ class OnlineAdaptation:
 
     def compile(self) -> None:
         """Compile all functions of an estimate by evaluating an instance."""
-        objective([EMPTY_INSTANCE], self._criterion, CAPACITY)(np.zeros(4))
+        objective([EMPTY_INSTANCE], self._criterion(), CAPACITY)(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
         """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""
@@ -268,6 +274,6 @@ class OnlineAdaptation:
 
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
-            self.latest = estimate_transform(instances, self._criterion, capacity=CAPACITY)
+            self.latest = estimate_transform(instances, self._criterion(), capacity=CAPACITY)
         except Exception:
             log.exception("adaptation failed; the colour transform is unchanged")

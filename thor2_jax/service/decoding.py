@@ -249,7 +249,7 @@ def decode_npz_clouds(content: bytes) -> CloudArrays:
             raise RequestError(422, name, f"{name} is {array.dtype} {list(array.shape)}; expected {expected}.")
     counts = sizes[: MAX_CLOUDS + 1].tolist()
     if not 1 <= len(counts) <= MAX_CLOUDS:
-        raise RequestError(422, "sizes", f"sizes has {len(sizes)} entries; expected 1 to {MAX_CLOUDS}.")
+        raise RequestError(422, "sizes", f"sizes describes {len(sizes)} clouds; expected 1 to {MAX_CLOUDS}.")
     if min(counts) < 0 or max(counts) > MAX_POINTS or sum(counts) != len(points):
         message = f"sizes must lie between 0 and {MAX_POINTS} and sum to the {len(points)} points."
         raise RequestError(422, "sizes", message)

@@ -86,7 +86,7 @@ def frame_request(files: Files) -> Callable[[httpx.AsyncClient], Any]:
     return lambda client: client.post("/v1/recognize", files=files)
 
 
-MODEL = Mock(**{"gallery.summary": "no objects"})
+MODEL = Mock(names=(), **{"gallery.summary": "no objects"})
 NOTHING = MODEL, PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
 
 

@@ -60,7 +60,7 @@ def test_invalid_settings(run_dir: Path, serve: Command, name: str, value: str) 
 
 
 def test_a_url_is_no_host(run_dir: Path, serve: Command) -> None:
-    assert "--host http://localhost, which" in serve("--model", run_dir, "--host", "http://localhost", "--port", "0")
+    assert "--host is 'http://localhost'" in serve("--model", run_dir, "--host", "http://localhost", "--port", "0")
 
 
 def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
