@@ -173,11 +173,7 @@ def adaptation_criterion(model: Model) -> Criterion:
     else:
         raise InputError("model has neither classes nor enrolled objects; enroll some first")
     config = dataclasses.replace(config, homology="closed_form", relaxation=None)
-
-    def criterion(clouds: PointClouds) -> jax.Array:
-        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
-
-    return criterion
+    return lambda clouds: classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
 
 
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:

@@ -255,18 +255,17 @@ class ColorNetworkAnswer(BaseModel):
     fingerprint: str
 
 
-class Readiness(BaseModel):
-    """Readiness of the service."""
-
-    status: str
-    ready_workers: int = Field(description="Number of processes that accept requests.")
-    workers: int = Field(description="Number of processes, including those that are starting.")
-
-
 class Health(BaseModel):
     """Health of the service."""
 
     status: str
+
+
+class Readiness(Health):
+    """Readiness of the service."""
+
+    ready_workers: int = Field(description="Number of processes that accept requests.")
+    workers: int = Field(description="Number of processes, including those that are starting.")
 
 
 def _file(description: str) -> dict[str, Any]:

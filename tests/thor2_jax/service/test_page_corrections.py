@@ -189,8 +189,7 @@ def test_naming_does_not_drop_a_frame_that_is_being_recognized(open_teaching: Op
     waiting[0].continue_()
     expect(page.locator("#notice-text")).to_contain_text("is enrolled")
     waiting[1].continue_()
-    wait_for_answer(page)
-    expect(page.locator("#status")).to_contain_text(page.locator("#samples button").first.inner_text())
+    expect(page.locator("#status")).to_contain_text(page.locator("#samples button").first.inner_text() + ":")
 
 
 def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) -> None:
