@@ -271,5 +271,5 @@ class OnlineAdaptation:
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
             self.latest = estimate_transform(instances, self._criterion(), capacity=CAPACITY)
-        except Exception:
-            log.exception("adaptation failed; the colour transform is unchanged")
+        except Exception as error:  # An InputError says that all objects were forgotten.
+            log.error("the colour transform is unchanged: %s", error, exc_info=not isinstance(error, InputError))
