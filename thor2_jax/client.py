@@ -322,8 +322,7 @@ def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, i
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read("labels", labels)
     if not isinstance(intrinsics, File):
         intrinsics = json.dumps(dataclasses.asdict(Intrinsics.of(intrinsics)), default=np.generic.item).encode()
-    files["intrinsics"] = _read("intrinsics", intrinsics)
-    return files
+    return files | {"intrinsics": _read("intrinsics", intrinsics)}
 
 
 def _read(name: str, file: File) -> bytes:
