@@ -197,7 +197,7 @@ class Client(_Connection):
         return self._send("POST", "/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
 
     def describe(self, clouds: Sequence[tuple[Any, Any]]) -> Descriptors:
-        """Compute the descriptors of clouds, pairs (xyz, rgb) as `PointClouds.pack` takes them; colours have 8 bits.
+        """Compute the descriptors of up to 32 clouds (xyz, rgb) as `PointClouds.pack` takes them; colours have 8 bits.
 
         Returns:
             Descriptors of the B clouds, as `thor2_jax.describe` returns them; the fields are NumPy arrays.
@@ -322,8 +322,7 @@ def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, i
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read("labels", labels)
     if not isinstance(intrinsics, File):
         intrinsics = json.dumps(dataclasses.asdict(Intrinsics.of(intrinsics)), default=np.generic.item).encode()
-    files["intrinsics"] = _read("intrinsics", intrinsics)
-    return files
+    return files | {"intrinsics": _read("intrinsics", intrinsics)}
 
 
 def _read(name: str, file: File) -> bytes:

@@ -173,11 +173,7 @@ def adaptation_criterion(model: Model) -> Criterion:
     else:
         raise InputError("model has neither classes nor enrolled objects; enroll some first")
     config = dataclasses.replace(config, homology="closed_form", relaxation=None)
-
-    def criterion(clouds: PointClouds) -> jax.Array:
-        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
-
-    return criterion
+    return lambda clouds: classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
 
 
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
@@ -243,8 +239,14 @@ class OnlineAdaptation:
     Estimates run in a thread, one at a time; instances that arrive during an estimate are kept for the next one.
     """
 
-    def __init__(self, criterion: Criterion) -> None:
-        """Create an adaptation without instances; `criterion` is the argument of `estimate_transform`."""
+    def __init__(self, criterion: Callable[[], Criterion]) -> None:
+        """Create an adaptation without instances.
+
+        Args:
+            criterion: function that returns the criterion of the current model, see `estimate_transform`. It is called
+                here and at each estimate, since the gallery may change.
+        """
+        criterion()
         self._criterion = criterion
         self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
         self._new = 0
@@ -253,7 +255,7 @@ class OnlineAdaptation:
 
     def compile(self) -> None:
         """Compile all functions of an estimate by evaluating an instance."""
-        objective([EMPTY_INSTANCE], self._criterion, CAPACITY)(np.zeros(4))
+        objective([EMPTY_INSTANCE], self._criterion(), CAPACITY)(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
         """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""
@@ -268,6 +270,6 @@ class OnlineAdaptation:
 
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
-            self.latest = estimate_transform(instances, self._criterion, capacity=CAPACITY)
-        except Exception:
-            log.exception("adaptation failed; the colour transform is unchanged")
+            self.latest = estimate_transform(instances, self._criterion(), capacity=CAPACITY)
+        except Exception as error:  # An InputError says that all objects were forgotten.
+            log.error("the colour transform is unchanged: %s", error, exc_info=not isinstance(error, InputError))

@@ -119,13 +119,16 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
         known: an earlier state of the gallery, whose objects are not read again.
 
     Raises:
-        GalleryError: a file is missing or damaged, or the gallery has another embedding. The message names the file.
+        GalleryError: a file is missing or damaged, the gallery has another embedding, or that of `known` was removed.
+            The message names the file.
     """
     for _ in range(3):
         stamp = gallery_stamp(directory)  # of this index or of an earlier one
         index = _read_index(directory / INDEX_FILE)
         if index is None:
             check_index(directory)
+            if known is not None and (known.objects or known.hidden):
+                raise GalleryError(f"gallery: {directory} was removed; restore it from a copy, or restart without it")
             return Gallery(embedding or "")
         if embedding is not None and index["embedding"] != embedding:
             raise GalleryError(

@@ -94,7 +94,8 @@ def explained_frame(
         is_shown = len(instances) < schemas.MAX_EXPLAINED
         details = _details(model, instance, result, recognition) if result and is_shown else None
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
-    return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
+    known: dict[str, Any] = {"knows": model.gallery.summary, "classes": list(model.names)}
+    return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings, **known)
 
 
 def calibrated_confidence(model: Model, recognition: Recognition, inference: Inference) -> float | None:

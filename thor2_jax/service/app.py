@@ -180,10 +180,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             raise RequestError(415, "body", f"The body must be application/json or {NPZ} (npz).")
         async with service.admit(request, read_body) as (admitted, content):
             results = await service.describe(content, content_type == NPZ, admitted)
-            if content_type == NPZ:
-                return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
-            text = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
-            return Response(text, media_type="application/json")
+            encode = _encode_npz if content_type == NPZ else partial(_encode_json, timings=admitted.milliseconds())
+            return Response(await run_in_threadpool(encode, results), media_type=content_type)
 
 
 def _add_model_routes(routes: APIRouter, service: Service) -> None:

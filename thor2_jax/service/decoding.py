@@ -104,12 +104,10 @@ def _parse_field(name: str, values: list[bytes]) -> Any:
     if len(values) != 1:
         raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
     # A valid name has at most 4000 bytes; decoding and quoting a long one completely would take time.
-    return _PARSERS[name](name, values[0][:4004].decode(errors="surrogateescape")) if name in _PARSERS else values[0]
-
-
-def _parse_name(_: str, text: str) -> str:
-    with field_errors("name"):
-        return check_name(text)
+    with field_errors(name):
+        return (
+            _PARSERS[name](name, values[0][:4004].decode(errors="surrogateescape")) if name in _PARSERS else values[0]
+        )
 
 
 def _parse_flag(field: str, text: str) -> bool:
@@ -125,7 +123,7 @@ def _parse_number(field: str, text: str) -> int:
 
 
 _PARSERS: dict[str, Callable[[str, str], Any]] = {
-    "name": _parse_name,
+    "name": lambda _, text: check_name(text),
     "instance": _parse_number,
     "extend": _parse_flag,
     "replace": _parse_flag,
@@ -249,7 +247,7 @@ def decode_npz_clouds(content: bytes) -> CloudArrays:
             raise RequestError(422, name, f"{name} is {array.dtype} {list(array.shape)}; expected {expected}.")
     counts = sizes[: MAX_CLOUDS + 1].tolist()
     if not 1 <= len(counts) <= MAX_CLOUDS:
-        raise RequestError(422, "sizes", f"sizes has {len(sizes)} entries; expected 1 to {MAX_CLOUDS}.")
+        raise RequestError(422, "sizes", f"sizes describes {len(sizes)} clouds; expected 1 to {MAX_CLOUDS}.")
     if min(counts) < 0 or max(counts) > MAX_POINTS or sum(counts) != len(points):
         message = f"sizes must lie between 0 and {MAX_POINTS} and sum to the {len(points)} points."
         raise RequestError(422, "sizes", message)

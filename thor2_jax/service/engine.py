@@ -144,7 +144,7 @@ class InferenceEngine:
         self._embeds = settings.teach or self.model.answers_by() != "classifiers"
         self._last_error = ""
         self.max_batch = settings.max_batch
-        self._online = OnlineAdaptation(adaptation_criterion(self.model)) if settings.adapt else None
+        self._online = OnlineAdaptation(lambda: adaptation_criterion(self.model)) if settings.adapt else None
 
     @property
     def model(self) -> Model:

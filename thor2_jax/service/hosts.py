@@ -33,6 +33,7 @@ def listening(host: str, port: int) -> Iterator[tuple[socket.socket, str]]:
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     both = host == "::" and socket.has_dualstack_ipv6()
+    check_host_names([host], "host")
     if not 0 <= port <= 65_535:
         raise InputError(f"port is {port}; expected 0 to 65535, where 0 chooses a free one")
     with refusing_os_errors(f"port is {port} and host {host}, which cannot be used", "choose others"):
@@ -60,11 +61,11 @@ def page_headers(images: str, cache: str) -> dict[str, str]:
     }
 
 
-def check_host_names(names: Iterable[str]) -> None:
-    """Raise InputError unless every value of `--allow-host` is a host name or an address, without a port."""
+def check_host_names(names: Iterable[str], argument: str = "allow_host") -> None:
+    """Raise InputError unless every value of an argument is a host name or an address, without a port."""
     for name in names:
         if not (_NAME.fullmatch(name) or _address(name)):
-            raise InputError(f"allow_host is {name!r}; expected a host name or an address, without a port")
+            raise InputError(f"{argument} is {name!r}; expected a host name or an address, without a port")
 
 
 def check_token(token: str | None) -> None:

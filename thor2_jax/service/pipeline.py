@@ -173,14 +173,14 @@ class Service:
     def close(self) -> None:
         """Refuse new requests, finish those in progress, then stop processes and threads.
 
-        A compilation that has begun cannot be interrupted; its thread ends later.
+        A compilation or explanation that has begun cannot be interrupted; its thread ends later.
         """
         self.state = "stopping"
         self.metrics.ready_workers.set(0)
         self._compiler.shutdown(wait=False, cancel_futures=True)
         self._pool.close()
         self._batcher.close()
-        self._explainer.shutdown(cancel_futures=True)
+        self._explainer.shutdown(wait=False, cancel_futures=True)
         self._changer.shutdown(cancel_futures=True)
         jax.monitoring.unregister_event_duration_listener(self._count_compilation)
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
@@ -197,8 +197,8 @@ class Service:
             min_seconds: shortest time until the deadline, if that of the settings is shorter; its body has the latter.
 
         Raises:
-            RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
-                has not arrived and 504 otherwise; also as `read_body`.
+            RequestError: 503 if the service is not ready or stops, 429 if the queue is full; at the deadline, 408 if
+                the body has not arrived and 504 otherwise; also as `read_body`.
             ClientDisconnect: the client has disconnected.
         """
         self.check_ready()
@@ -222,6 +222,8 @@ class Service:
             if "upload" not in request.seconds:
                 raise RequestError(408, "body") from None
             raise (ClientDisconnect() if watch.done() else RequestError(504)) from None
+        except asyncio.CancelledError:  # uvicorn stops, and does not wait longer
+            raise RequestError(503, None, "The service is stopping.") from None
         finally:
             self._in_progress -= 1
             self.metrics.in_progress.dec()

@@ -132,7 +132,14 @@ class LabelMap(BaseModel):
     lengths: list[int] = Field(description="Length in pixels of the run of each entry of `labels`.")
 
 
-class ExplainedFrame(BaseModel):
+class KnownNames(BaseModel):
+    """The objects of a model."""
+
+    classes: list[str] = Field(description="Names that an answer can have.")
+    knows: str = Field(description="Description of these objects; others are unknown.")
+
+
+class ExplainedFrame(KnownNames):
     """All instances of a frame with their clouds and descriptors, in the order of their labels."""
 
     instances: list[ExplainedInstance]
@@ -197,11 +204,9 @@ class DescribeAnswer(BaseModel):
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, device, total.")
 
 
-class ModelAnswer(BaseModel):
+class ModelAnswer(KnownNames):
     """The model of the service."""
 
-    classes: list[str]
-    knows: str = Field(description="Description of the objects of the model.")
     classifiers: list[str]
     descriptor_version: int
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
@@ -250,18 +255,17 @@ class ColorNetworkAnswer(BaseModel):
     fingerprint: str
 
 
-class Readiness(BaseModel):
-    """Readiness of the service."""
-
-    status: str
-    ready_workers: int = Field(description="Number of processes that accept requests.")
-    workers: int = Field(description="Number of processes, including those that are starting.")
-
-
 class Health(BaseModel):
     """Health of the service."""
 
     status: str
+
+
+class Readiness(Health):
+    """Readiness of the service."""
+
+    ready_workers: int = Field(description="Number of processes that accept requests.")
+    workers: int = Field(description="Number of processes, including those that are starting.")
 
 
 def _file(description: str) -> dict[str, Any]:
@@ -284,7 +288,7 @@ _FRAME: dict[str, Any] = {
         "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
     },
 }
-_INSTANCE = {"type": "integer", "minimum": 0, "description": "Label number of the object."}
+_INSTANCE = {"type": "integer", "minimum": 1, "description": "Label number of the object."}
 
 FRAME_FORM = _form(_FRAME, "labels")
 """OpenAPI schema of the body of /v1/recognize. `decoding` parses it, since FastAPI writes large files to disk."""

@@ -47,7 +47,7 @@ MAX_HEAD = 2**20
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:
     """Serve until SIGTERM or SIGINT, then finish the accepted requests and return.
 
-    A thread may still be compiling explanations then; a normal exit of the process waits for it.
+    A thread may still be compiling or computing explanations then; a normal exit of the process waits for it.
 
     Args:
         settings: settings of each worker.

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import re
+import shutil
 import socket
 import ssl
 import subprocess
@@ -182,6 +183,13 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
 def service(teaching_url: str, teaching_app: FastAPI) -> Service:
     """The service behind this URL, for tests that replace its attributes."""
     return teaching_app.state.service
+
+
+def remove_gallery(service: Service) -> None:
+    """Let the service forget its objects, which it would keep if only their directory were removed."""
+    objects = service.engine.objects
+    shutil.rmtree(objects.directory, ignore_errors=True)
+    objects.gallery = dataclasses.replace(objects.gallery, objects={}, hidden=())
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def frame_request(files: Files) -> Callable[[httpx.AsyncClient], Any]:
     return lambda client: client.post("/v1/recognize", files=files)
 
 
-MODEL = Mock(**{"gallery.summary": "no objects"})
+MODEL = Mock(names=(), **{"gallery.summary": "no objects"})
 NOTHING = MODEL, PreparedRequest([], {}, LabelMap(width=1, height=1, labels=[0], lengths=[1])), [], []
 
 
@@ -176,6 +176,8 @@ def test_full_queue_is_429_and_deadline_504(
     assert sorted(answer.status_code for answer in answers) == [200, 200, 429, 429, 429]
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
     assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.
+    recognize.side_effect = asyncio.CancelledError  # by uvicorn, which does not wait longer
+    check_refused(calls(app, frame_request(files))[0], 503, None, "stopping")
     recognize.side_effect = stuck
     monkeypatch.setattr(asyncio, "timeout", timeout)
     assert calls(app, frame_request(files))[0].status_code == 504

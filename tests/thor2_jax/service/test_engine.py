@@ -16,7 +16,7 @@ import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
-from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import ColorTransform
@@ -116,12 +116,15 @@ def test_the_service_adapts_after_enough_instances_if_told(
     run = write_run(tmp_path / "run", trained)
     if not trained:  # the gallery answers
         assert_refused("neither classes nor enrolled objects", InferenceEngine, Settings(run, adapt=True))
-        thor2.Recognizer.load(run).enroll("tall", [(frame, 200)])
+        (library := thor2.Recognizer.load(run)).enroll("tall", [(frame, 200)])
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
         monkeypatch.setattr(estimate, "objective", create_autospec(estimate.objective))
         monkeypatch.setattr(estimate, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
     engine = InferenceEngine(Settings(run, adapt=True))
     engine.compile_adaptation()
+    if not trained:
+        library.enroll("wide", [(frame, 7)])
+        engine.refresh()
     first, second = views(EVERY - 1), views(3)
     unusable = dataclasses.replace(first[0], reason="too few points")
     for frame, observe in ((first, True), ([unusable], True), (second, False)):
@@ -132,6 +135,8 @@ def test_the_service_adapts_after_enough_instances_if_told(
     engine._online._thread.join()
     adaptation = engine.adaptation
     assert adaptation.instances == EVERY + 2
+    if not (trained or is_estimated):  # Estimates use objects that were enrolled after the start, too.
+        assert estimate.estimate_transform.call_args.args[1](pack_instances(second, 4)).shape == (4, 2)
     (corrected,) = engine.correct(second[:1], observe=False)
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()

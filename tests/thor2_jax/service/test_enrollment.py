@@ -34,15 +34,15 @@ from thor2_jax.service.engine import InferenceEngine, recognize
 from thor2_jax.service.pipeline import AdmittedRequest, Service
 from thor2_jax.service.settings import Settings
 
-from .conftest import Files
+from .conftest import Files, remove_gallery
 
 
 @pytest.fixture
-def http(teaching_url: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
+def http(teaching_url: str, service: Service, files: Files) -> Iterator[httpx.Client]:
     """The service with an empty gallery; it still answers after the test."""
     with httpx.Client(base_url=teaching_url, timeout=HANG) as client:
         yield client
-        shutil.rmtree(gallery, ignore_errors=True)
+        remove_gallery(service)
         assert len(recognized(client, files)) == 4 and known(client) == {}
 
 
@@ -226,6 +226,11 @@ def test_a_damaged_gallery_stops_changes_but_not_recognition(
         assert http.get("/v1/model").json()["classes"] == ["a", "b", "tall"]
     assert str(gallery) in caplog.text
     index.write_bytes(good)
+    gallery.rename(copy := gallery.with_name("copy"))
+    for answer in (enroll(http, files, "wide", 7), http.delete("/v1/objects/tall"), http.get("/v1/objects")):
+        check_refused(answer, 500, None, "gallery: ", "removed")
+    assert recognized(http, files)[3] == "tall" and f"{gallery} was removed" in caplog.text
+    shutil.copytree(copy, gallery, dirs_exist_ok=True)
     assert known(http) == {"tall": 1} and enroll(http, files, "wide", 7).status_code == 200
 
 

@@ -24,5 +24,6 @@ def test_other_names_and_addresses_are_refused() -> None:
     check_host_names(["robot.local", "10.0.0.7", "fe80::7", "[fe80::7]"])
     for name in ("", "robot.local:80", "http://robot.local", "*", "a b", "[::1]:80"):
         assert_refused("allow_host", check_host_names, [name])
+    assert_refused("host is", listening("\u00e9" * 80, 0).__enter__)
     assert_refused("port is 70000", listening("127.0.0.1", 70_000).__enter__)
     assert_refused("host 203.0.113.9", listening("203.0.113.9", 0).__enter__)  # an address for documentation

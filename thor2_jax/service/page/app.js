@@ -89,7 +89,6 @@ async function recognize(title, fileSource, fields, selected = () => null, histo
     loaded ??= await load();
     let files = await fileSource();
     const answer = await whenStarted(() => service.explain(files, signal), signal);
-    await readModel(); // Other clients may have changed its objects.
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
     const { width, height } = answer.label_map;
     if (!files.labels && width === bitmap.width) {
@@ -115,7 +114,9 @@ function hideResult() {
 
 function show(answer, bitmap, selected) {
   frame = answer;
-  const { title, instances, timings, history } = answer;
+  const { title, instances, timings, history, knows, classes } = answer;
+  Object.assign(loaded.model, { knows, classes }); // Other clients may have changed its objects.
+  showClasses(loaded.model);
   const named = instances.filter(({ name }) => name !== null);
   const count = `${instances.length} ${instances.length === 1 ? "object" : "objects"}`;
   const unknown = instances.length - named.length;
@@ -183,16 +184,18 @@ function choose(click) {
 }
 
 async function changeMasks(map, selected) {
-  const { title, files, fields, history } = frame;
-  const { width, height } = frame.label_map;
-  const labels = await labelImage(map, width, height);
-  await recognize(title, async () => ({ ...files, labels }), fields, () => selected, [...history, files.labels]);
+  const { files, history, label_map } = frame;
+  const labels = await labelImage(map, label_map.width, label_map.height);
+  await recognizeAgain({ ...files, labels }, [...history, files.labels], () => selected);
 }
 
 function undoMasks() {
-  const { title, files, fields, history } = frame;
-  const corrected = { ...files, labels: history.at(-1) };
-  return recognize(title, async () => corrected, fields, () => overlay.selected, history.slice(0, -1));
+  return recognizeAgain({ ...frame.files, labels: frame.history.at(-1) }, frame.history.slice(0, -1));
+}
+
+/** Recognize the shown frame with other labels, or by a model with other objects. */
+function recognizeAgain(files, history, selected = () => overlay.selected) {
+  return recognize(frame.title, async () => files, frame.fields, selected, history);
 }
 
 function select(label, byUser = false) {
@@ -225,11 +228,6 @@ async function load() {
       await pause(RETRY_MS);
     }
   }
-}
-
-async function readModel() {
-  loaded.model = await service.model();
-  showClasses(loaded.model);
 }
 
 function showClasses({ classes, knows }) {
@@ -294,14 +292,10 @@ byId("token-form").addEventListener("submit", async (event) => {
 
 connectWhy(() => frame.files, showProblem);
 
-connectNaming(
-  () => frame.files,
-  async (files) => {
-    if (frame?.files !== files) return readModel();
-    await recognize(frame.title, async () => files, frame.fields, () => overlay.selected, frame.history);
-  },
-  showProblem,
-);
+connectNaming(async () => {
+  // Another frame that is being recognized is shown next.
+  if (frame && !byId("result").hasAttribute("aria-busy")) await recognizeAgain(frame.files, frame.history);
+}, showProblem);
 
 async function watchReady() {
   let again = RETRY_MS;

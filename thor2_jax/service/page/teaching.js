@@ -38,13 +38,9 @@ function showNotice(text, generation = null) {
 /**
  * Connect the form and the notice.
  *
- * `shownFiles()` returns the files of the shown frame, `changed(files)` is called after each change with the files of
- * the frame in which an object was named or a name was undone, and `failed(problem)` with a problem that is
- * not shown beside the name.
+ * `changed()` is called after each change, and `failed(problem)` with a problem that is not shown beside the name.
  */
-export function connectNaming(shownFiles, changed, failed) {
-  let files = null;
-
+export function connectNaming(changed, failed) {
   async function whileBusy(action) {
     const setBusy = (isBusy) => [byId("save-name"), byId("undo")].forEach((button) => (button.disabled = isBusy));
     setBusy(true);
@@ -63,10 +59,9 @@ export function connectNaming(shownFiles, changed, failed) {
     markName(name ? "" : "Enter a name.");
     if (!name) return byId("name").focus();
     whileBusy(async () => {
-      files = shownFiles();
       let answer;
       try {
-        answer = await service.enroll(files, shown.label, name);
+        answer = await service.enroll(shown.files, shown.label, name);
       } catch (problem) {
         if (problem.status === 401 || !(problem instanceof service.Problem)) throw problem;
         markName(problem.message);
@@ -76,7 +71,7 @@ export function connectNaming(shownFiles, changed, failed) {
       const { name: enrolled, views, generation } = answer;
       showNotice(views === 1 ? `“${enrolled}” is enrolled.` : `“${enrolled}” has ${views} views now.`, generation);
       byId("notice").dataset.name = enrolled;
-      await changed(files);
+      await changed();
     });
   });
 
@@ -90,7 +85,7 @@ export function connectNaming(shownFiles, changed, failed) {
         return showNotice("Another change was made since, so this one stays.");
       }
       showNotice(`The name “${byId("notice").dataset.name}” is taken back.`);
-      await changed(files);
+      await changed();
     });
   });
 }
