@@ -54,11 +54,12 @@ def poses(centre: np.ndarray = CENTRE, start: float = 0.0) -> list[np.ndarray]:
 def table(front: np.ndarray) -> ViewTable:
     """Return two classes that look alike from everywhere except from one azimuth of each, a third one that does not.
 
-    Views of azimuth 0 are answered by `front`, those of azimuth pi by certainty, all others by doubt.
+    Views of azimuth 0 are answered by `front`, those of azimuth pi by certainty, all others by doubt. Calibrated
+    probabilities need not sum to 1.
     """
     doubt, sure = np.array([0.48, 0.48, 0.04]), np.eye(3)
     rows = [(label, azimuth) for label in range(2) for azimuth in range(8)]
-    answers = [front if azimuth == 0 else sure[label] if azimuth == 4 else doubt for label, azimuth in rows]
+    answers = [0.3 * front if azimuth == 0 else sure[label] if azimuth == 4 else doubt for label, azimuth in rows]
     rotations = np.array([poses(np.zeros(3))[azimuth][:3, :3] for _, azimuth in rows])
     return ViewTable(np.array([label for label, _ in rows]), rotations, np.array(answers))
 
