@@ -50,16 +50,13 @@ SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Smallest fraction of a piece's border along its object, for pieces without depth, inner sides and shadows."""
+"""Smallest fraction of the border of a piece along its object, for pieces without depth and for shadows."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
 
 SAME_HEIGHT, RIM_SHARE = 0.015, 97
 """Largest height difference, metres, between the rims of both sides of a hollow object; percentile of a rim."""
-
-CONCAVE = 0.1
-"""Smallest bend of the inner side of a hollow object, as a fraction of its size."""
 
 BEFORE, AFTER = 2, 2
 """Distances, pixels, from a border at which the two pieces are compared."""
@@ -233,8 +230,6 @@ def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
 def _is_hollow(k: int, pieces: _Pieces, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence) -> bool:
     """Return whether the farther piece of a pair is the other's inner side: concave, with the same upper rim."""
     outer, inner = pieces.pairs[k].tolist() if pieces.behind[k] > 0 else pieces.pairs[k, ::-1].tolist()
-    if pieces.length[k] < ATTACHED * pieces.perimeter[inner]:
-        return False
     heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
     rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
     return abs(rims[0] - rims[1]) < SAME_HEIGHT and _is_concave((labels == inner) & evidence.high, depth)
@@ -255,4 +250,4 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     fitted, *_ = np.linalg.lstsq(terms, inverse)
     bend = fitted[3] * squared.mean()
     noise = np.sqrt(np.mean((terms @ fitted - inverse) ** 2))
-    return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
+    return bool(bend > noise)

@@ -37,12 +37,12 @@ def books(height: float) -> list[Box]:
 
 POSES = [(40, 0, 0, 0.9), (55, 30, 5, 0.8), (20, -70, -10, 1.1), (65, 140, 0, 0.9)]
 SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
-    **{f"apart {pose}": (APART, pose, 0.85) for pose in POSES},
-    "touching in the image": (TOUCHING, (55,), 0.85),
-    "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.75),
-    "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.85),
-    "flat strips": (STRIPS, (30,), 0.7),
-    **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.85) for height in (0.004, 0.02)},
+    **{f"apart {pose}": (APART, pose, 0.91) for pose in POSES},
+    "touching in the image": (TOUCHING, (55,), 0.93),
+    "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.95),
+    "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.92),
+    "flat strips": (STRIPS, (30,), 0.95),
+    **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.94) for height in (0.004, 0.02)},
 }
 """Name -> boxes, pose of the camera, and least overlap with a piece of each box, except for tables."""
 
@@ -81,14 +81,13 @@ def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
     hits = cast([TABLE_TOP, *things], camera_pose(tilt), 0.8, CAMERA, (240, 320))
     depth, truth = (values.reshape(240, 320) for values in (np.rint(hits.distance * 1000), hits.mesh))
     frame = RGBDFrame(hits.color.reshape(240, 320, 3), depth.astype(np.uint16), truth, CAMERA)
-    # At the foot of a bowl, which is in the shade below its rim, a sliver may be a piece of its own.
-    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.8).all()
+    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.95).all()
 
 
 @pytest.mark.parametrize("size", [(481, 641), *slow((480, 640), (720, 1280))])
 def test_larger_images_have_labels_of_their_size(size: tuple[int, int]) -> None:
     frame = render(APART, size=size)
-    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.85).all()
+    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.93).all()
 
 
 def test_the_nearest_large_plane_is_the_support() -> None:
@@ -117,7 +116,7 @@ def test_frames_without_things() -> None:
 def assert_one_thing(frame: RGBDFrame, **changed: Any) -> None:
     """Assert that the only piece of a changed frame is its only box."""
     labels = segment_table(dataclasses.replace(frame, **changed))
-    assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.85
+    assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.93
 
 
 def test_a_soft_shadow_is_not_a_thing() -> None:
@@ -144,7 +143,7 @@ def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
 def test_wall_sized_and_tiny_pieces_are_dropped() -> None:
     frame = render([Box(0.0, 0.3, (0.6, 0.02), 0.9, RED), Box(0.1, -0.05, (0.005, 0.005), 0.01, BLUE), APART[1]], 60)
     labels = segment_table(frame)
-    assert best_overlaps(labels, frame.label_image)[2] > 0.8
+    assert best_overlaps(labels, frame.label_image)[2] > 0.94
     assert set(np.unique(labels[frame.label_image == 1])) == {0}
 
 
@@ -154,7 +153,7 @@ def test_depth_with_nan_and_holes() -> None:
     metres = np.where(holes, np.float32(np.nan), frame.depth_m)
     metres[:30] = np.inf
     labels = segment_table(dataclasses.replace(frame, depth=metres))
-    assert (best_overlaps(labels, frame.label_image)[:2] > 0.8).all()
+    assert (best_overlaps(labels, frame.label_image) > 0.92).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400), (1, 4000)])
