@@ -43,14 +43,11 @@ PART = 90.0
 GAP = 5
 """Width, pixels, of closed gaps between parts of one object that are found by colour, plus one."""
 
-OPEN = 0.3
-"""Smallest fraction of a shadow's border along the plane, which distinguishes it from the bottom of a bowl."""
-
 SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Smallest fraction of the border of a piece along its object, for pieces without depth and for shadows."""
+"""Smallest fraction of the border of a shadow along tall objects."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
@@ -111,9 +108,7 @@ class _Pieces:
         self.tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
         self.low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
         self.unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
-        is_shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-        to_plane = np.bincount(self.pairs[:, 1], self.length * (self.pairs[:, 0] == 0), minlength=n)
-        self.shade = is_shade & (to_plane > OPEN * self.perimeter)
+        self.shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
 
 
 def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> NDArray[np.int32]:
@@ -217,14 +212,13 @@ def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
 def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
     """Return which pairs [N] of a body and a piece found by its colour are one object without a depth step.
 
-    The body must have the longest common border with the piece, and the piece must not be in the shade.
+    The body must have the longest common border with the piece.
     """
     part = np.where(pieces.colored[pieces.pairs[:, 0]], *pieces.pairs.T)
     length = pieces.length * parts
     longest = np.zeros(len(pieces.colored), length.dtype)
     np.maximum.at(longest, part, length)
-    joined = (pieces.unknown[part] | (pieces.step < EDGE)) & ~pieces.shade[part]
-    return parts & joined & (length == longest[part]) & (length > ATTACHED * pieces.perimeter[part])
+    return parts & (pieces.unknown[part] | (pieces.step < EDGE)) & (length == longest[part])
 
 
 def _is_hollow(k: int, pieces: _Pieces, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence) -> bool:
