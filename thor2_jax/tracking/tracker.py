@@ -68,11 +68,9 @@ def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
 
 
 def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
-    """Return the overlap of two clouds, from 0 to 1."""
-    shares = [
-        len(np.intersect1d(a, b, assume_unique=True)) / max(min(len(a), len(b)), 1)
-        for a, b in zip(first, second, strict=True)
-    ]
+    """Return the overlap of two clouds that are not empty, from 0 to 1."""
+    pairs = zip(first, second, strict=True)
+    shares = [len(np.intersect1d(*pair, assume_unique=True)) / min(map(len, pair)) for pair in pairs]
     return float(np.mean(shares))
 
 

@@ -42,6 +42,7 @@ SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
     "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.95),
     "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.92),
     "half of the image": ([Box(0.0, 0.0, (0.12, 0.1), 0.05, RED)], (30, 0, 0, 0.36), 0.95),
+    "on a sheet": ([Box(0.0, 0.0, (0.14, 0.1), 0, BLUE), Box(0.0, 0.0, (0.03, 0.03), 0.06, RED)], (20,), 0.9),
     "flat strips": (STRIPS, (30,), 0.95),
     **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.94) for height in (0.004, 0.02)},
 }

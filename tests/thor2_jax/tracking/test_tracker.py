@@ -62,7 +62,7 @@ def test_a_view_of_fewer_points_has_a_smaller_weight() -> None:
     first *= 0.5 ** (1 / 30)  # a view loses half of its weight in 30 further ones
     mean = np.exp(np.average(np.log([SURE_A, UNSURE_B]), axis=0, weights=[first, second]))
     assert second < first / 2 and answer.confidence == pytest.approx(mean[0] / mean.sum(), abs=1e-4)
-    recognizer.overflow = 10_000  # a view outside the grid does not count
+    recognizer.overflow = round(0.6 * len(recognizer.described[0].points))  # such a view does not count
     for each, confidence in (tracker, answer.confidence), (Tracker(recognizer), 1 / 3):
         (overflowed,) = each.update(frame_of_squares({1: (10, 10, UNSURE_B)}))
         assert (overflowed.name, overflowed.confidence) == (None, pytest.approx(confidence))
