@@ -47,7 +47,8 @@ SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Smallest fraction of the border of a shadow along tall objects."""
+"""Smallest fraction of the border of a shadow along tall objects, and of the border of one side of a hollow object (the
+side with the shorter border) along the other side."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
@@ -121,12 +122,13 @@ def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence)
     """
     labels, colored = _flood(color, depth, evidence)
     pieces, n = _Pieces(labels, colored, color, depth, evidence), len(colored)
-    apart = pieces.length < LEAST_CONTACT * pieces.perimeter[pieces.pairs].min(axis=1)
+    smaller = pieces.perimeter[pieces.pairs].min(axis=1)
+    apart = pieces.length < LEAST_CONTACT * smaller
     together = _belong_together(pieces, apart)
-    for k, (a, b) in enumerate(pieces.pairs.tolist()):
-        if not together[k] and not apart[k] and a > 0 and pieces.tall[a] and pieces.tall[b]:
-            together[k] = _is_hollow(k, pieces, labels, depth, evidence)
     a, b = pieces.pairs.T
+    may_be_hollow = (a > 0) & (pieces.length > ATTACHED * smaller) & pieces.tall[a] & pieces.tall[b]
+    for k in np.flatnonzero(may_be_hollow & ~together).tolist():
+        together[k] = _is_hollow(k, pieces, labels, depth, evidence)
     groups = _components(pieces.pairs[together & (pieces.shade[a] == pieces.shade[b])], n)
     shadow = _is_shadow(groups, pieces)
     groups = _components(pieces.pairs[together & ~shadow[a] & ~shadow[b]], n)
