@@ -118,9 +118,9 @@ def test_scores_of_views_and_looks_against_a_gaussian_process() -> None:
     scores = values[:, :2].clip(0, 1)
     expected = scores * scores / (scores + values[:, 2:3])
     assert len(views) <= NEAREST and (expected.max(axis=1) > 0.05).sum() >= 10
-    np.testing.assert_allclose(gallery.scores(queries), expected, atol=2e-3)
+    np.testing.assert_allclose(gallery.scores(queries), expected, atol=8e-4)
     looks, mean = queries.reshape(5, 5, 16), expected.reshape(5, 5, 2).mean(axis=1)
-    np.testing.assert_allclose(gallery.scores(looks), mean, atol=2e-3)
+    np.testing.assert_allclose(gallery.scores(looks), mean, atol=8e-4)
     assert gallery.scores(looks[:0]).shape == (0, 2) and gallery.scores(queries).dtype == np.float32
     assert Gallery("").scores(queries).shape == (25, 0)
     # Amid the background, the value of the only class is negative.
@@ -219,7 +219,7 @@ def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
     indexed = dataclasses.replace(gallery, search="usearch")
     np.testing.assert_allclose(indexed.scores(queries), gallery.scores(queries), atol=0.02)
     received = pickle.loads(pickle.dumps(indexed))  # builds its index again
-    np.testing.assert_allclose(received.scores(queries), gallery.scores(queries), atol=0.02)
+    np.testing.assert_allclose(received.scores(queries[:1]), gallery.scores(queries[:1]), atol=0.02)
 
 
 @pytest.mark.usefixtures("usearch")
