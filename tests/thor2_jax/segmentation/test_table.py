@@ -121,11 +121,13 @@ def assert_one_thing(frame: RGBDFrame, **changed: Any) -> None:
     assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.93
 
 
-def test_a_soft_shadow_is_not_a_thing() -> None:
+def test_soft_shadows_and_patterns_are_not_things() -> None:
     frame = render(APART[:1])
     row, column = np.mgrid[0:240, 0:320]
     shade = 1 - 0.4 * np.exp(-((row - 170) ** 2 + (column - 230) ** 2) / (2 * 25**2))
     assert_one_thing(frame, color=(frame.color * shade[..., None]).astype(np.uint8))
+    squares = np.random.default_rng(0).integers(-40, 41, (40, 54, 1)).repeat(6, axis=0).repeat(6, axis=1)[:, :320]
+    assert_one_thing(frame, color=(frame.color + squares).clip(0, 255).astype(np.uint8))
 
 
 def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
@@ -137,9 +139,7 @@ def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
 def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
     frame = render([Box(0.0, 0.0, (0.04, 0.04), 0.14, RED)])
     lower = (frame.label_image == 1) & (np.arange(240)[:, None] > np.nonzero(frame.label_image)[0].mean())
-    color, depth = frame.color.copy(), frame.depth.copy()
-    color[lower], depth[lower] = (25, 25, 25), 0
-    assert_one_thing(frame, color=color, depth=depth)
+    assert_one_thing(frame, color=np.where(lower[..., None], np.uint8(25), frame.color), depth=frame.depth * ~lower)
 
 
 def test_wall_sized_and_tiny_pieces_are_dropped() -> None:
