@@ -96,7 +96,7 @@ def test_the_nearest_large_plane_is_the_support() -> None:
     """Its coefficients absorb the distortion of a sensor; depth that is too near is not used."""
     rays, on_table = backproject(np.ones((240, 320)), CAMERA), np.zeros((240, 320), bool)
     on_table[40:200, 60:260] = True
-    table = 1 / (rays @ (0, 0.6, 0.8) / 0.75 + 0.06 * rays[..., 0] * rays[..., 1])  # 0.75 m from the camera
+    table = 1 / (rays @ (0.36, 0.48, 0.8) / 0.75 + 0.06 * rays[..., 0] * rays[..., 1])  # 0.75 m from the camera
     depth = np.where(on_table, table, 1.3 / (rays @ (-0.1, 0.6, 0.79)))
     depth[:20] = 0.2
     image = DepthImage(depth.astype(np.float32), CAMERA)
