@@ -63,7 +63,6 @@ def test_each_box_of_a_scene_is_a_thing(name: str) -> None:
 
 
 WHITE, DARK_RED = (225, 225, 220), (170, 60, 50)
-LIGHT = np.array([0.3, -0.2, 0.93])
 BOWL = [(0, 0), (0.04, 0), (0.07, 0.03), (0.08, 0.06), (0.076, 0.06), (0.066, 0.03), (0.038, 0.006), (0, 0.006)]
 CUP = [(0, 0), (0.04, 0), (0.04, 0.1), (0.036, 0.1), (0.036, 0.006), (0, 0.006)]
 
@@ -73,7 +72,7 @@ def revolved(profile: list[tuple[float, float]], x: float, color: Any, inside: A
     mesh = trimesh.creation.revolve(np.array([*profile, profile[0]]), sections=48)
     is_inside = np.linalg.norm(mesh.triangles_center[:, :2], axis=1, keepdims=True) < 0.0385
     mesh.apply_translation([x, 0, 0])
-    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ LIGHT, 0, 1)
+    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ (0.3, -0.2, 0.93), 0, 1)
     return surface(mesh, np.where(is_inside, color if inside is None else inside, color) * light[:, None])
 
 
@@ -107,12 +106,13 @@ def test_the_nearest_large_plane_is_the_support() -> None:
 
 
 def test_frames_without_things() -> None:
-    """An empty table, boxes without a table, depth that is missing or out of range, and depth that is noise."""
-    frame = render(APART)
+    """An empty table, boxes without a table or beside it, depth that is missing or out of range, or noise."""
+    frame = render(APART[2:])
+    beside = frame.depth * ((frame.label_image > 0) | (np.arange(320) < 160))
     noise = np.random.default_rng(0).integers(400, 2400, frame.depth.shape).astype(np.uint16)
-    depths = [np.full_like(frame.depth, depth) for depth in (0, 100, 60000)] + [noise]
+    depths = [np.full_like(frame.depth, depth) for depth in (0, 100, 60000)] + [noise, beside]
     frames = [render([]), render(APART, plane=False), *(dataclasses.replace(frame, depth=depth) for depth in depths)]
-    assert [segment_table(each).any() for each in frames] == [False] * 6
+    assert [segment_table(each).any() for each in frames] == [False] * 7
 
 
 def assert_one_thing(frame: RGBDFrame, **changed: Any) -> None:
