@@ -145,12 +145,12 @@ def test_frames_and_poses_of_different_sequences_are_refused() -> None:
 
 
 def test_the_next_view_is_chosen_for_a_track() -> None:
-    cameras = [camera_pose(azimuth, np.pi / 2, np.zeros(3), 0.7) for azimuth in (0.0, 2.0, 4.0)]
+    cameras = [camera_pose(azimuth, np.pi / 2, np.full(3, 5.0), 0.7) for azimuth in (0.0, 2.0, 4.0)]
     doubt, sure = np.array([0.48, 0.48, 0.04]), np.array([0.98, 0.01, 0.01])
-    rotations = np.stack([pose[:3, :3] for pose in cameras])
-    table = ViewTable(np.zeros(3, int), rotations, np.stack([doubt, [0.05, 0.05, 0.9], sure]))
+    table = ViewTable(np.zeros(3, int), np.stack(cameras)[:, :3, :3], np.stack([doubt, [0.05, 0.05, 0.9], sure]))
     tracker = Tracker(ToyRecognizer())
-    tracker.update(frame_of_squares({1: (40, 60, (122, 122, 10))}), cameras[0])
+    for pose in (cameras[0] @ np.diag([-1, -1, 1, 1]), cameras[0]):  # turned about the line of sight
+        tracker.update(frame_of_squares({1: (40, 60, (122, 122, 10))}), pose)
     assert tracker.next_view(1, cameras[1:], table).index == 1
     assert_refused("track is 7; expected one of 1", tracker.next_view, 7, cameras, table)
     without = Tracker(ToyRecognizer())
