@@ -191,9 +191,7 @@ def _color_vectors(segment: jax.Array, region_set: jax.Array, sets: RegionSets, 
 def _released_values(strips: Strips) -> Strips:
     """Round the extremes of y to 0.01 and divide each colour vector by its strip's number of points."""
     # Rounding keeps the order of numbers, so the extremes of rounded coordinates are the rounded extremes.
-    low, high = (
-        _round_scaled(jnp.clip(y, -_COORDINATE_LIMIT, _COORDINATE_LIMIT), 100) / 100 for y in (strips.low, strips.high)
-    )
+    low, high = (_round_scaled(y, 100) / 100 for y in (strips.low, strips.high))
     color = strips.color / jnp.maximum(strips.color.sum(axis=-1, keepdims=True), 1)
     return dataclasses.replace(strips, low=low, high=high, color=color)
 

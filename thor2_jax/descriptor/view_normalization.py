@@ -237,7 +237,7 @@ class Normalization(NamedTuple):
 
     Attributes:
         rotation: [3, 3], axes of the minimal box with their signs as rows, the longest side first.
-        end_is_occluded: [] bool, whether an occluded end caused the half turn about z.
+        end_is_occluded: [] bool, whether the occlusion boundary decides which end along x comes first.
         points: [3, M], scaled units, mean zero; padding is 0.
         mask: [M] bool, False on padding.
         camera: [3], position of the camera relative to the mean.

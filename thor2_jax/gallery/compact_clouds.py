@@ -78,5 +78,4 @@ class CompactClouds:
         for number, (count, end, centre) in enumerate(zip(self.counts, ends, self.centre, strict=True)):
             rows = slice(end - count, end)
             points = self.points[rows] * np.float32(STEP) + centre
-            boundary = self.boundary[rows]
-            yield PreparedInstance(number, points, self.colors[rows], boundary, bool(boundary.any()))
+            yield PreparedInstance(number, points, self.colors[rows], self.boundary[rows])

@@ -18,9 +18,6 @@ __all__ = ["UNIT", "Evidence"]
 HEIGHT = (0.006, 0.005)
 """Smallest height of an object over its plane: the first in metres, plus the second times squared depth in metres."""
 
-FLAT = 0.05
-"""Height, metres, below which smooth parts of the image may be the plane."""
-
 COARSE = 2
 """Number of pixels along each side of a pixel in the coarse image of the plane's colour."""
 
@@ -64,7 +61,7 @@ class Evidence:
     Attributes:
         heights: float32, metres over the support, which is the first plane; 0 where depth is missing.
         high: pixels above a plane.
-        contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable; 0 far from the support.
+        contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable.
         colored: pixels on the support, or without depth in front of it, with another colour than the support.
         shade: colored pixels on the support that are darker, but have its hue: deep shadows, and black objects.
         region: pixels in the convex hull of the support.
@@ -83,20 +80,18 @@ class Evidence:
         least = HEIGHT[1] * (depth.z * depth.z) + HEIGHT[0]
         self.heights = planes[0].heights(depth)
         on_support = (np.abs(self.heights) <= least) & depth.valid
-        high = (self.heights > least) & depth.valid
+        high = self.heights > least  # not where depth is missing, since the height is 0 there
         for plane in planes[1:]:
             others = plane.heights(depth)
-            high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
+            high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support)
             on_support &= np.abs(self.heights) <= np.abs(others)
         self.high = open_round(high)
-        contrast, darker, near, known = _color_contrast(color, on_support)
+        self.contrast, darker, near, known = _color_contrast(color, on_support)
         self.region = shrink(planes[0].region(depth.z.shape), 3)
         # Far from the plane, pixels without depth are rarely objects on it.
         known = near | (known & depth.valid & self.region)
-        self.contrast = contrast * known
-        low = ((self.heights < FLAT) | ~depth.valid) & self.region & known
         gradient = np.asarray(cv2.morphologyEx(self.contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
-        smooth = shrink(low & (gradient < SMOOTH * UNIT), 2)
+        smooth = shrink(self.region & known & (gradient < SMOOTH * UNIT), 2)
         plain = _plain_parts(smooth, (self.contrast < UNIT) & on_support)
         beside = on_support | (~depth.valid & self.region)
         self.colored = open_round(beside & known & (self.contrast > UNIT) & ~plain)

@@ -153,7 +153,7 @@ def _fitted(
         numbers, sizes = mask.astype(np.int32), np.array([0, mask.sum()])
         if (mask != (labels == label)).any():
             numbers, sizes = components(mask)
-        kept = sizes >= max(LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()), 1)
+        kept = sizes >= (LEAST_PIXELS if label == rest else min(LEAST_PIXELS, sizes.max()))
         numbers, _ = renumbered(numbers, kept, label - 1)
         tidied += numbers if label == rest else np.minimum(numbers, label)
     tidied = np.where((fitted == rest) & (tidied == 0), labels, tidied)  # too few for a piece: they stay

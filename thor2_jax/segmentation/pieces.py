@@ -43,23 +43,18 @@ PART = 90.0
 GAP = 5
 """Width, pixels, of closed gaps between parts of one object that are found by colour, plus one."""
 
-OPEN = 0.3
-"""Smallest fraction of a shadow's border along the plane, which distinguishes it from the bottom of a bowl."""
-
 SHADOW = 21
 """Width, pixels, of the square around a body in which its shadow begins; shadows are pieces of their own."""
 
 ATTACHED = 0.15
-"""Smallest fraction of a piece's border along its object, for pieces without depth, inner sides and shadows."""
+"""Smallest fraction of the border of a shadow along tall objects, and of the border of one side of a hollow object (the
+side with the shorter border) along the other side."""
 
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; there are no depth steps between pieces below the second."""
 
 SAME_HEIGHT, RIM_SHARE = 0.015, 97
 """Largest height difference, metres, between the rims of both sides of a hollow object; percentile of a rim."""
-
-CONCAVE = 0.1
-"""Smallest bend of the inner side of a hollow object, as a fraction of its size."""
 
 BEFORE, AFTER = 2, 2
 """Distances, pixels, from a border at which the two pieces are compared."""
@@ -114,9 +109,7 @@ class _Pieces:
         self.tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
         self.low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
         self.unknown = np.bincount(every[heights == 0], minlength=n) > 0.5 * size
-        is_shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
-        to_plane = np.bincount(self.pairs[:, 1], self.length * (self.pairs[:, 0] == 0), minlength=n)
-        self.shade = is_shade & (to_plane > OPEN * self.perimeter)
+        self.shade = np.bincount(every[evidence.shade[::2, ::2].ravel()[things]], minlength=n) > 0.5 * size
 
 
 def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence) -> NDArray[np.int32]:
@@ -129,12 +122,13 @@ def find_pieces(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence)
     """
     labels, colored = _flood(color, depth, evidence)
     pieces, n = _Pieces(labels, colored, color, depth, evidence), len(colored)
-    apart = pieces.length < LEAST_CONTACT * pieces.perimeter[pieces.pairs].min(axis=1)
+    smaller = pieces.perimeter[pieces.pairs].min(axis=1)
+    apart = pieces.length < LEAST_CONTACT * smaller
     together = _belong_together(pieces, apart)
-    for k, (a, b) in enumerate(pieces.pairs.tolist()):
-        if not together[k] and not apart[k] and a > 0 and pieces.tall[a] and pieces.tall[b]:
-            together[k] = _is_hollow(k, pieces, labels, depth, evidence)
     a, b = pieces.pairs.T
+    may_be_hollow = (a > 0) & (pieces.length > ATTACHED * smaller) & pieces.tall[a] & pieces.tall[b]
+    for k in np.flatnonzero(may_be_hollow & ~together).tolist():
+        together[k] = _is_hollow(k, pieces, labels, depth, evidence)
     groups = _components(pieces.pairs[together & (pieces.shade[a] == pieces.shade[b])], n)
     shadow = _is_shadow(groups, pieces)
     groups = _components(pieces.pairs[together & ~shadow[a] & ~shadow[b]], n)
@@ -220,21 +214,18 @@ def _belong_together(pieces: _Pieces, apart: Mask) -> Mask:
 def _main_contact(pieces: _Pieces, parts: Mask) -> Mask:
     """Return which pairs [N] of a body and a piece found by its colour are one object without a depth step.
 
-    The body must have the longest common border with the piece, and the piece must not be in the shade.
+    The body must have the longest common border with the piece.
     """
     part = np.where(pieces.colored[pieces.pairs[:, 0]], *pieces.pairs.T)
     length = pieces.length * parts
     longest = np.zeros(len(pieces.colored), length.dtype)
     np.maximum.at(longest, part, length)
-    joined = (pieces.unknown[part] | (pieces.step < EDGE)) & ~pieces.shade[part]
-    return parts & joined & (length == longest[part]) & (length > ATTACHED * pieces.perimeter[part])
+    return parts & (pieces.unknown[part] | (pieces.step < EDGE)) & (length == longest[part])
 
 
 def _is_hollow(k: int, pieces: _Pieces, labels: NDArray[np.int32], depth: DepthImage, evidence: Evidence) -> bool:
     """Return whether the farther piece of a pair is the other's inner side: concave, with the same upper rim."""
     outer, inner = pieces.pairs[k].tolist() if pieces.behind[k] > 0 else pieces.pairs[k, ::-1].tolist()
-    if pieces.length[k] < ATTACHED * pieces.perimeter[inner]:
-        return False
     heights = [evidence.heights[::2, ::2][labels[::2, ::2] == piece] for piece in (inner, outer)]
     rims = [float(np.percentile(values, RIM_SHARE)) if len(values) else np.inf for values in heights]
     return abs(rims[0] - rims[1]) < SAME_HEIGHT and _is_concave((labels == inner) & evidence.high, depth)
@@ -255,4 +246,4 @@ def _is_concave(mask: Mask, depth: DepthImage) -> bool:
     fitted, *_ = np.linalg.lstsq(terms, inverse)
     bend = fitted[3] * squared.mean()
     noise = np.sqrt(np.mean((terms @ fitted - inverse) ** 2))
-    return bool(bend > noise and bend > CONCAVE * inverse.mean() * np.sqrt(squared.mean()))
+    return bool(bend > noise)

@@ -17,7 +17,7 @@ from thor2_jax.segmentation.pixels import Mask, pixel_mask
 
 __all__ = ["DepthImage", "Plane", "dominant_planes"]
 
-MAX_PLANES = 4
+MAX_PLANES = 8
 HYPOTHESES = 150
 SCORED_POINTS = 500
 """Number of points on which the hypotheses of a plane are scored."""
@@ -41,8 +41,6 @@ LEAST_FILLING = 0.25
 
 PARALLEL, LARGEST_THING = 0.97, 0.15
 """Smallest cosine between the normals of a plane and of the tops of objects on it, and their largest height, metres."""
-
-LEAST_SHARE_OF_SUPPORT = 0.08
 
 
 class DepthImage:
@@ -128,8 +126,8 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
     left = np.arange(total)
     rng = np.random.default_rng(0)
     planes: list[Plane] = []
-    for _ in range(2 * MAX_PLANES):
-        if len(left) < max(LEAST_POINTS, LEAST_SHARE * total) or len(planes) == MAX_PLANES:
+    for _ in range(MAX_PLANES):
+        if len(left) < max(LEAST_POINTS, LEAST_SHARE * total):
             break
         hypothesis = _best_hypothesis(points, left, rng)
         if hypothesis is None:
@@ -145,9 +143,8 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
         tops = any(_is_just_above(plane.coefficients, coefficients) for plane in planes)
         if not tops and filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
             planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
-        near = np.abs(points.terms[left] @ coefficients - points.inverse[left]) < 2 * points.tolerance[left]
-        left = left[~near]
-    support = min((p for p in planes if p.share >= LEAST_SHARE_OF_SUPPORT), key=lambda p: p.distance, default=None)
+        left = np.setdiff1d(left, inliers)
+    support = min(planes, key=lambda p: p.distance, default=None)
     return sorted(planes, key=lambda p: p is not support)
 
 
@@ -185,8 +182,6 @@ def _refine(
     terms, inverse, tolerance = points.terms[left], points.inverse[left], points.tolerance[left]
     for n_terms in (3, 3, 3, 6, 6):
         near = np.abs(terms @ coefficients - inverse) < tolerance
-        if near.sum() < LEAST_POINTS // 2:
-            break
         matrix = terms[near, :n_terms]
         fitted = np.linalg.solve(matrix.T @ matrix + 1e-9 * np.eye(n_terms), matrix.T @ inverse[near])
         coefficients = np.concatenate([fitted, np.zeros(6 - n_terms)])

@@ -32,9 +32,6 @@ LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
 """Smallest and largest area of an object, square metres."""
 
-LARGEST_SHARE = 0.4
-"""Largest fraction of the image that an object fills."""
-
 LEAST_SUPPORT = 0.3
 """Smallest fraction of the pixels of an object that lie in the hull of a plane."""
 
@@ -106,16 +103,16 @@ def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) 
             continue
         numbers, sizes = components(labels[place] == label, connectivity=8)
         mask = numbers == sizes.argmax()
-        if _is_thing(mask, depth.z[place], depth, region[place], labels.size):
+        if _is_thing(mask, depth.z[place], depth, region[place]):
             count += 1
             free = (labels[place] == label) | (labels[place] == 0)
             cleaned[place][_without_holes(mask) & free] = count
     return cleaned
 
 
-def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mask, n_pixels: int) -> bool:
+def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mask) -> bool:
     size = int(mask.sum())
-    if not LEAST_PIXELS <= size <= LARGEST_SHARE * n_pixels or region[mask].mean() < LEAST_SUPPORT:
+    if size < LEAST_PIXELS or region[mask].mean() < LEAST_SUPPORT:
         return False
     z = z[mask & (z > 0)]
     distance = float(np.quantile(z, 0.5, method="higher")) if len(z) else 1.0

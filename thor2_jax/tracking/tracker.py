@@ -51,8 +51,8 @@ VOXELS = (0.01, 0.02, 0.04)
 MIN_OVERLAP = 0.2
 """Smallest overlap of two clouds of one object."""
 
-_OFFSET = 2**20
-"""Half the number of voxels along each axis that have distinct numbers."""
+_AXIS = 2**21
+"""Number of voxels along each axis that have distinct numbers."""
 
 OccupiedVoxels = tuple[NDArray[np.int64], ...]
 """Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
@@ -62,17 +62,15 @@ def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
     """Return the voxels that points [n, 3] in metres occupy, for each of `VOXELS`."""
     numbers = []
     for size in VOXELS:
-        x, y, z = np.floor(points / size).astype(np.int64).T + _OFFSET
-        numbers.append(np.unique((x * 2 * _OFFSET + y) * 2 * _OFFSET + z))
+        x, y, z = np.floor(points / size).astype(np.int64).T
+        numbers.append(np.unique((x * _AXIS + y) * _AXIS + z))
     return tuple(numbers)
 
 
 def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
-    """Return the overlap of two clouds, from 0 to 1."""
-    shares = [
-        len(np.intersect1d(a, b, assume_unique=True)) / max(min(len(a), len(b)), 1)
-        for a, b in zip(first, second, strict=True)
-    ]
+    """Return the overlap of two clouds that are not empty, from 0 to 1."""
+    pairs = zip(first, second, strict=True)
+    shares = [len(np.intersect1d(*pair, assume_unique=True)) / min(map(len, pair)) for pair in pairs]
     return float(np.mean(shares))
 
 
@@ -103,7 +101,7 @@ def view_weight(instance: PreparedInstance) -> float:
 
 def _log_with_rest(probabilities: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the logarithms [C + 1] of probabilities [C] and of the rest to 1."""
-    rest = max(1 - float(probabilities.sum(dtype=np.float64)), 0.0)
+    rest = 1 - float(probabilities.sum(dtype=np.float64))
     return np.log(np.maximum(np.append(probabilities.astype(np.float64), rest), np.finfo(np.float32).tiny))
 
 

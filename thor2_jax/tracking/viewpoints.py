@@ -185,7 +185,6 @@ def next_view(
     p = np.maximum(p, TINY) / np.maximum(p, TINY).sum()
     # Directions from the object to the candidates, in the axes of the current camera.
     towards = (np.array([each[:3, 3] for each in poses]) - middle) @ now[:3, :3]
-    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), TINY)
     expected, total = np.zeros(len(poses)), 0.0
     for index in np.flatnonzero(p >= MIN_PROBABILITY):
         views = np.flatnonzero(table.label == index)
@@ -193,15 +192,14 @@ def next_view(
             continue
         answers = np.maximum(table.probabilities[views], TINY)
         answers /= answers.sum(axis=1, keepdims=True)
-        divergences = (p * np.log(p / answers)).sum(axis=1)
-        likely = np.exp(-SHARPNESS * (divergences - divergences.min()))
+        likely = np.exp(-SHARPNESS * (p * np.log(p / answers)).sum(axis=1))
         rotations = table.rotations[views]
         # A camera looks along its z axis, so the direction from the object to the camera is -z.
         seen_from = np.einsum("vij,nj->vni", rotations, towards)
         nearest = (seen_from @ -rotations[:, :, 2].T).argmax(axis=2)  # [v, n]
         posterior = p * answers[nearest]
         posterior /= posterior.sum(axis=2, keepdims=True)
-        entropies = -(posterior * np.log(np.maximum(posterior, 1e-300))).sum(axis=2)
+        entropies = -(posterior * np.log(posterior)).sum(axis=2)
         expected += p[index] * (likely @ entropies) / likely.sum()
         total += p[index]
     entropy = float(-(p * np.log(p)).sum())

@@ -17,7 +17,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import search
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
-from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
+from thor2_jax.gallery.search import ExactSearch, IndexSearch
 from thor2_jax.networks.embedding import BACKGROUND, References
 from thor2_jax.surfaces.evidence import compared, sample_points
 from thor2_jax.types import PointClouds
@@ -118,9 +118,9 @@ def test_scores_of_views_and_looks_against_a_gaussian_process() -> None:
     scores = values[:, :2].clip(0, 1)
     expected = scores * scores / (scores + values[:, 2:3])
     assert len(views) <= NEAREST and (expected.max(axis=1) > 0.05).sum() >= 10
-    np.testing.assert_allclose(gallery.scores(queries), expected, atol=2e-3)
+    np.testing.assert_allclose(gallery.scores(queries), expected, atol=8e-4)
     looks, mean = queries.reshape(5, 5, 16), expected.reshape(5, 5, 2).mean(axis=1)
-    np.testing.assert_allclose(gallery.scores(looks), mean, atol=2e-3)
+    np.testing.assert_allclose(gallery.scores(looks), mean, atol=8e-4)
     assert gallery.scores(looks[:0]).shape == (0, 2) and gallery.scores(queries).dtype == np.float32
     assert Gallery("").scores(queries).shape == (25, 0)
     # Amid the background, the value of the only class is negative.
@@ -149,13 +149,14 @@ def test_an_existing_name_needs_extend_or_replace(gallery: Gallery) -> None:
     }.items():
         assert_refused(message, gallery.with_object, name, enrolled(1))
     assert_refused("extend and replace", gallery.with_object, "bowl", enrolled(1), extend=True, replace=True)
-    extended = gallery.with_object("bowl", enrolled(1, 5), extend=True)
+    later = dataclasses.replace(enrolled(1, 5), date="2026-02-03")
+    extended = gallery.with_object("bowl", later, extend=True)
     replaced = gallery.with_object("bowl", enrolled(1, 5), replace=True)
     assert [len(g.objects["bowl"].embeddings) for g in (gallery, extended, replaced)] == [24, 29, 5]
     assert [len(g.objects["bowl"].clouds) for g in (gallery, extended, replaced)] == [1, 2, 1]
-    assert extended.names == replaced.names == gallery.names
+    assert extended.names == replaced.names == gallery.names and extended.objects["bowl"].date == later.date
     changed = gallery.with_object("a", enrolled(1), extend=True).with_object("b", enrolled(1), replace=True)
-    assert changed.hidden == ("b",) and changed.answered_names == ("a", "c", *gallery.names, "b")
+    assert changed.hidden == (*replaced.hidden, "b") and changed.answered_names == ("a", "c", *gallery.names, "b")
     cafe = gallery.with_object("cafe\u0301 ", enrolled(0))
     assert cafe.names[-1] == "caf\u00e9"
     assert cafe.with_object("cafe\u0301", enrolled(0), extend=True).names == cafe.names
@@ -193,7 +194,6 @@ def test_exact_search_in_chunks_equals_one_product(monkeypatch: pytest.MonkeyPat
     embeddings = unit(rng.normal(size=(301, 8))).astype(np.float16)
     embeddings[100] = embeddings[7]
     queries = np.concatenate([unit(rng.normal(size=(4, 8))), embeddings[7:8]]).astype(np.float32)
-    assert len(embeddings) < CHUNK
     similarity, index = ExactSearch(embeddings).nearest(queries, 20)
     products = queries @ embeddings.astype(np.float32).T
     np.testing.assert_allclose(similarity, -np.sort(-products, axis=1)[:, :20], atol=1e-6)
@@ -219,7 +219,7 @@ def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
     indexed = dataclasses.replace(gallery, search="usearch")
     np.testing.assert_allclose(indexed.scores(queries), gallery.scores(queries), atol=0.02)
     received = pickle.loads(pickle.dumps(indexed))  # builds its index again
-    np.testing.assert_allclose(received.scores(queries), gallery.scores(queries), atol=0.02)
+    np.testing.assert_allclose(received.scores(queries[:1]), gallery.scores(queries[:1]), atol=0.02)
 
 
 @pytest.mark.usefixtures("usearch")

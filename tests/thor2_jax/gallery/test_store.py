@@ -173,7 +173,7 @@ def test_a_failed_change_leaves_the_gallery_as_it_was(
     before = files_of(directory)
     monkeypatch.setattr(store, failing, mock.Mock(side_effect=error))
     with pytest.raises(error):
-        update_gallery(directory, add("new", 5), FINGERPRINT)
+        update_gallery(directory, lambda gallery: add("new", 5)(add("mug", 0, replace=True)(gallery)), FINGERPRINT)
     assert files_of(directory) == before
 
 

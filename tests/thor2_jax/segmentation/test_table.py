@@ -37,12 +37,14 @@ def books(height: float) -> list[Box]:
 
 POSES = [(40, 0, 0, 0.9), (55, 30, 5, 0.8), (20, -70, -10, 1.1), (65, 140, 0, 0.9)]
 SCENES: dict[str, tuple[list[Box], tuple[float, ...], float]] = {
-    **{f"apart {pose}": (APART, pose, 0.85) for pose in POSES},
-    "touching in the image": (TOUCHING, (55,), 0.85),
-    "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.75),
-    "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.85),
-    "flat strips": (STRIPS, (30,), 0.7),
-    **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.85) for height in (0.004, 0.02)},
+    **{f"apart {pose}": (APART, pose, 0.91) for pose in POSES},
+    "touching in the image": (TOUCHING, (55,), 0.93),
+    "meeting at a fold": (STACKED, (50, 0, 0, 0.6), 0.95),
+    "on a table and on the floor": (ON_TABLE, (30, 0, 0, 1.3), 0.92),
+    "half of the image": ([Box(0.0, 0.0, (0.12, 0.1), 0.05, RED)], (30, 0, 0, 0.36), 0.95),
+    "on a sheet": ([Box(0.0, 0.0, (0.14, 0.1), 0, BLUE), Box(0.0, 0.0, (0.03, 0.03), 0.06, RED)], (20,), 0.9),
+    "flat strips": (STRIPS, (30,), 0.95),
+    **{f"books of {height} m": (books(height), (45, 0, 0, 1.1), 0.94) for height in (0.004, 0.02)},
 }
 """Name -> boxes, pose of the camera, and least overlap with a piece of each box, except for tables."""
 
@@ -61,7 +63,6 @@ def test_each_box_of_a_scene_is_a_thing(name: str) -> None:
 
 
 WHITE, DARK_RED = (225, 225, 220), (170, 60, 50)
-LIGHT = np.array([0.3, -0.2, 0.93])
 BOWL = [(0, 0), (0.04, 0), (0.07, 0.03), (0.08, 0.06), (0.076, 0.06), (0.066, 0.03), (0.038, 0.006), (0, 0.006)]
 CUP = [(0, 0), (0.04, 0), (0.04, 0.1), (0.036, 0.1), (0.036, 0.006), (0, 0.006)]
 
@@ -71,7 +72,7 @@ def revolved(profile: list[tuple[float, float]], x: float, color: Any, inside: A
     mesh = trimesh.creation.revolve(np.array([*profile, profile[0]]), sections=48)
     is_inside = np.linalg.norm(mesh.triangles_center[:, :2], axis=1, keepdims=True) < 0.0385
     mesh.apply_translation([x, 0, 0])
-    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ LIGHT, 0, 1)
+    light = 0.55 + 0.45 * np.clip(mesh.face_normals @ (0.3, -0.2, 0.93), 0, 1)
     return surface(mesh, np.where(is_inside, color if inside is None else inside, color) * light[:, None])
 
 
@@ -81,21 +82,20 @@ def test_bowls_and_cups_are_one_thing_each(tilt: float) -> None:
     hits = cast([TABLE_TOP, *things], camera_pose(tilt), 0.8, CAMERA, (240, 320))
     depth, truth = (values.reshape(240, 320) for values in (np.rint(hits.distance * 1000), hits.mesh))
     frame = RGBDFrame(hits.color.reshape(240, 320, 3), depth.astype(np.uint16), truth, CAMERA)
-    # At the foot of a bowl, which is in the shade below its rim, a sliver may be a piece of its own.
-    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.8).all()
+    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.95).all()
 
 
 @pytest.mark.parametrize("size", [(481, 641), *slow((480, 640), (720, 1280))])
 def test_larger_images_have_labels_of_their_size(size: tuple[int, int]) -> None:
     frame = render(APART, size=size)
-    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.85).all()
+    assert (best_overlaps(segment_table(frame), frame.label_image) > 0.93).all()
 
 
 def test_the_nearest_large_plane_is_the_support() -> None:
     """Its coefficients absorb the distortion of a sensor; depth that is too near is not used."""
     rays, on_table = backproject(np.ones((240, 320)), CAMERA), np.zeros((240, 320), bool)
     on_table[40:200, 60:260] = True
-    table = 1 / (rays @ (0, 0.6, 0.8) / 0.75 + 0.06 * rays[..., 0] * rays[..., 1])  # 0.75 m from the camera
+    table = 1 / (rays @ (0.36, 0.48, 0.8) / 0.75 + 0.06 * rays[..., 0] * rays[..., 1])  # 0.75 m from the camera
     depth = np.where(on_table, table, 1.3 / (rays @ (-0.1, 0.6, 0.79)))
     depth[:20] = 0.2
     image = DepthImage(depth.astype(np.float32), CAMERA)
@@ -106,25 +106,28 @@ def test_the_nearest_large_plane_is_the_support() -> None:
 
 
 def test_frames_without_things() -> None:
-    """An empty table, boxes without a table, depth that is missing or out of range, and depth that is noise."""
-    frame = render(APART)
+    """An empty table, boxes without a table or beside it, depth that is missing or out of range, or noise."""
+    frame = render(APART[2:])
+    beside = frame.depth * ((frame.label_image > 0) | (np.arange(320) < 160))
     noise = np.random.default_rng(0).integers(400, 2400, frame.depth.shape).astype(np.uint16)
-    depths = [np.full_like(frame.depth, depth) for depth in (0, 100, 60000)] + [noise]
+    depths = [np.full_like(frame.depth, depth) for depth in (0, 100, 60000)] + [noise, beside]
     frames = [render([]), render(APART, plane=False), *(dataclasses.replace(frame, depth=depth) for depth in depths)]
-    assert [segment_table(each).any() for each in frames] == [False] * 6
+    assert [segment_table(each).any() for each in frames] == [False] * 7
 
 
 def assert_one_thing(frame: RGBDFrame, **changed: Any) -> None:
     """Assert that the only piece of a changed frame is its only box."""
     labels = segment_table(dataclasses.replace(frame, **changed))
-    assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.85
+    assert labels.max() == 1 and best_overlaps(labels, frame.label_image)[0] > 0.93
 
 
-def test_a_soft_shadow_is_not_a_thing() -> None:
+def test_soft_shadows_and_patterns_are_not_things() -> None:
     frame = render(APART[:1])
     row, column = np.mgrid[0:240, 0:320]
     shade = 1 - 0.4 * np.exp(-((row - 170) ** 2 + (column - 230) ** 2) / (2 * 25**2))
     assert_one_thing(frame, color=(frame.color * shade[..., None]).astype(np.uint8))
+    squares = np.random.default_rng(0).integers(-40, 41, (40, 54, 1)).repeat(6, axis=0).repeat(6, axis=1)[:, :320]
+    assert_one_thing(frame, color=(frame.color + squares).clip(0, 255).astype(np.uint8))
 
 
 def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
@@ -136,15 +139,13 @@ def test_a_deep_shadow_beside_a_thing_is_no_thing() -> None:
 def test_a_part_without_depth_belongs_to_the_thing_that_it_borders_on() -> None:
     frame = render([Box(0.0, 0.0, (0.04, 0.04), 0.14, RED)])
     lower = (frame.label_image == 1) & (np.arange(240)[:, None] > np.nonzero(frame.label_image)[0].mean())
-    color, depth = frame.color.copy(), frame.depth.copy()
-    color[lower], depth[lower] = (25, 25, 25), 0
-    assert_one_thing(frame, color=color, depth=depth)
+    assert_one_thing(frame, color=np.where(lower[..., None], np.uint8(25), frame.color), depth=frame.depth * ~lower)
 
 
 def test_wall_sized_and_tiny_pieces_are_dropped() -> None:
     frame = render([Box(0.0, 0.3, (0.6, 0.02), 0.9, RED), Box(0.1, -0.05, (0.005, 0.005), 0.01, BLUE), APART[1]], 60)
     labels = segment_table(frame)
-    assert best_overlaps(labels, frame.label_image)[2] > 0.8
+    assert best_overlaps(labels, frame.label_image)[2] > 0.94
     assert set(np.unique(labels[frame.label_image == 1])) == {0}
 
 
@@ -154,7 +155,7 @@ def test_depth_with_nan_and_holes() -> None:
     metres = np.where(holes, np.float32(np.nan), frame.depth_m)
     metres[:30] = np.inf
     labels = segment_table(dataclasses.replace(frame, depth=metres))
-    assert (best_overlaps(labels, frame.label_image)[:2] > 0.8).all()
+    assert (best_overlaps(labels, frame.label_image) > 0.92).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (17, 400), (1, 4000)])
@@ -194,4 +195,3 @@ def test_the_rim_of_thick_things_is_trimmed() -> None:
     expected[6:64, 71:109] = 257
     expected[70:73, 10:110] = 3
     np.testing.assert_array_equal(trimmed, expected)
-    np.testing.assert_array_equal(_trimmed(labels, 1), labels)

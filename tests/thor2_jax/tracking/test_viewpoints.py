@@ -36,9 +36,8 @@ def test_merged_clouds_coincide_in_space(middle: tuple[float, ...]) -> None:
         views.append((PreparedInstance(1, points, colors, np.zeros(500, bool), rim=rim), pose))
     one, both = merge_views(views[1:], 2.5), merge_views(views, 2.5)
     assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
-    np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)
     for merged in (one, both):
-        np.testing.assert_allclose(merged.points.mean(axis=0), views[1][0].points.mean(axis=0), atol=2e-3)
+        np.testing.assert_allclose(merged.points.mean(axis=0), views[1][0].points.mean(axis=0), atol=1e-3)
     packed = pack_instances([both, one], 2)  # the rim of the last view is not that of the merged cloud
     assert packed.rim is not None and not packed.rim.any()
 
@@ -54,11 +53,12 @@ def poses(centre: np.ndarray = CENTRE, start: float = 0.0) -> list[np.ndarray]:
 def table(front: np.ndarray) -> ViewTable:
     """Return two classes that look alike from everywhere except from one azimuth of each, a third one that does not.
 
-    Views of azimuth 0 are answered by `front`, those of azimuth pi by certainty, all others by doubt.
+    Views of azimuth 0 are answered by `front`, those of azimuth pi by certainty, all others by doubt. Calibrated
+    probabilities need not sum to 1.
     """
     doubt, sure = np.array([0.48, 0.48, 0.04]), np.eye(3)
     rows = [(label, azimuth) for label in range(2) for azimuth in range(8)]
-    answers = [front if azimuth == 0 else sure[label] if azimuth == 4 else doubt for label, azimuth in rows]
+    answers = [0.3 * front if azimuth == 0 else sure[label] if azimuth == 4 else doubt for label, azimuth in rows]
     rotations = np.array([poses(np.zeros(3))[azimuth][:3, :3] for _, azimuth in rows])
     return ViewTable(np.array([label for label, _ in rows]), rotations, np.array(answers))
 
@@ -67,20 +67,19 @@ def test_the_view_that_tells_the_classes_apart_is_chosen() -> None:
     front = np.array([0.3, 0.3, 0.4])
     for start in (0.0, 1.1):  # the yaw of the object in the world is unknown
         cameras = poses(start=start)
-        chosen = next_view(front, CENTRE, cameras[0], cameras[1:], table(front))
-        assert chosen.index == 3
+        chosen = next_view(front, CENTRE, cameras[0].round(4), cameras[1:], table(front))
         assert chosen.entropy == pytest.approx(entropy(front))
-        assert chosen.expected.argmin() == 3 and chosen.expected[3] < 0.5 < np.delete(chosen.expected, 3).min()
+        assert chosen.index == 3 and chosen.expected[3] < 0.5 < np.delete(chosen.expected, 3).min()
 
 
 def test_the_expected_entropy_is_a_mean_over_classes() -> None:
     """With one view of a class, every candidate leads to the answer of that view. A class without views is left out."""
     p, answers = np.array([0.5, 0.1, 0.4]), np.array([[0.8, 0.1, 0.1], [0.3, 0.1, 0.6]])
     rotation = poses(np.zeros(3))[0][:3, :3]
-    views = ViewTable(np.array([0, 2]), np.stack([rotation, rotation]), answers)
+    views = ViewTable(np.array([0, 1]), np.stack([rotation, rotation]), answers)
     chosen = next_view(p, CENTRE, poses()[0], poses()[2:4], views)
     posteriors = p * answers / (p * answers).sum(axis=1, keepdims=True)
-    mean = p[[0, 2]] @ [entropy(row) for row in posteriors] / 0.9
+    mean = p[:2] @ [entropy(row) for row in posteriors] / 0.6
     np.testing.assert_allclose(chosen.expected, mean, rtol=1e-6)
     views = ViewTable(np.zeros(1, int), rotation[None], np.array([[0.6, 0.4]]))
     without = next_view([0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], views)
