@@ -34,7 +34,7 @@ NOISE = 0.02
 
 TEMPERATURE = 20.0
 """Temperature of the softmax over colours, units of HyAB. At low temperatures, the descent gets stuck in steps:
-the error of the result is 3 % at 5 and 25 % at 1."""
+the error of the result is 5 % at 20 and at 5, and 39 % at 1."""
 
 
 def under(light: jax.Array, clouds: thor2.PointClouds) -> thor2.PointClouds:

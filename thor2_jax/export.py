@@ -6,7 +6,7 @@ The file runs with jax alone:
 
 >>> exported = jax.export.deserialize(bytearray(blob))                              # doctest: +SKIP
 >>> result = exported.call(points, colors, mask, camera, boundary, rim)              # doctest: +SKIP
->>> result["tops"], result["tops2"], result["overflow"]                                # doctest: +SKIP
+>>> result["embedding"], result["overflow"]         # one entry for each classifier  # doctest: +SKIP
 """
 
 from collections.abc import Sequence

@@ -395,6 +395,7 @@ def reliability(ax: Axes, bins: Mapping[str, Sequence[Any]], *, counts: Axes | N
     if counts is not None:
         counts.bar(edges[:-1], answers, 1 / len(answers), align="edge", color="#888888", edgecolor="white")
         counts.set(ylabel="answers")
+        counts.locator_params(axis="y", integer=True)
     (ax if counts is None else counts).set_xlabel("confidence")
     for axes in filter(None, (ax, counts)):
         axes.spines[["top", "right"]].set_visible(False)

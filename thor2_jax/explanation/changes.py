@@ -66,18 +66,19 @@ class Change:
 
 @partial(jax.jit, static_argnums=1)
 def _axes(clouds: PointClouds, config: DescriptorConfig) -> jax.Array:
-    """Return the axes [3, 3] of the box of the only cloud of a batch, longest first."""
+    """Return the axes [3, 3] of the box of the first cloud of a batch, longest first."""
     cloud = jax.tree.map(lambda a: a[0], clouds)
     return normalization_of(cloud, np.float32(config.sigma_s)).rotation
 
 
-def _changed(clouds: PointClouds, axes: NDArray[np.float32], parameters: jax.Array, kind: Kind) -> PointClouds:
-    if kind == "color":
-        return dataclasses.replace(clouds, colors=jnp.clip(clouds.colors + parameters, 0, 1))
+def _changed(clouds: PointClouds, axes: NDArray[np.float32], parameters: jax.Array) -> PointClouds:
+    """Return clouds after both kinds of changes, whose parameters are [2, 3]; so both need the same programs."""
+    shift, factors = parameters
     centre = clouds.points.mean(axis=1, keepdims=True, where=clouds.mask[..., None])
-    stretch = matmul(axes.T, jnp.exp(parameters)[:, None] * axes)
+    stretch = matmul(axes.T, jnp.exp(factors)[:, None] * axes)
     moved = centre + matmul(clouds.points - centre, stretch.T)
-    return dataclasses.replace(clouds, points=jnp.where(clouds.mask[..., None], moved, 0))
+    points, colors = jnp.where(clouds.mask[..., None], moved, 0), jnp.clip(clouds.colors + shift, 0, 1)
+    return dataclasses.replace(clouds, points=points, colors=colors)
 
 
 def changed_instance(
@@ -114,15 +115,16 @@ def _gradient_directions(
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
 
     def lead(parameters: jax.Array) -> jax.Array:
-        aligned = aligned_looks(_changed(clouds, axes, parameters, kind), config, scores.count)
+        aligned = aligned_looks(_changed(clouds, axes, parameters), config, scores.count)
         oriented = scores.describe(aligned, strips(aligned, scores.network, config), config)
         values = scores.of_descriptors(oriented)[0]
         return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()
 
     parameters, path = np.zeros(3), []
     for _ in range(STEPS):
-        value, gradient = jax.value_and_grad(lead)(jnp.asarray(parameters, jnp.float32))
-        slope = np.asarray(gradient, np.float64)
+        both = [parameters * (each == kind) for each in CHANGES]
+        value, gradient = jax.value_and_grad(lead)(jnp.asarray(both, jnp.float32))
+        slope = np.asarray(gradient[CHANGES.index(kind)], np.float64)
         norm = float(np.linalg.norm(slope))
         if not np.isfinite(norm) or norm == 0:
             break
@@ -153,7 +155,7 @@ def smallest_change(
         return None
     clouds = packed(instance)
     axes = np.asarray(_axes(clouds, scores.config))
-    directions = _gradient_directions(scores, clouds, axes, index, kind)
+    directions = _gradient_directions(scores, jax.tree.map(lambda a: a[:1], clouds), axes, index, kind)
     lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES
 
     def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], str] | None:

@@ -68,7 +68,7 @@ class ClassScores:
 
     def orient(self, instance: PreparedInstance) -> PointClouds:
         """Return the K looks at an instance, [K, N] aligned clouds, the paper's look first; each has its own mask."""
-        return aligned_looks(packed(instance), self.config, self.count)
+        return jax.tree.map(lambda a: a[: self.count], aligned_looks(packed(instance), self.config, self.count))
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as in recognition."""
@@ -76,7 +76,7 @@ class ClassScores:
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
             clouds = pack_instances(rows, ROWS, capacity)
-            return describe_looks(clouds, self.network, self.config, self.count).with_balanced(clouds)
+            return self._complete(describe_looks(clouds, self.network, self.config, self.count), clouds)
 
         return self._of_rows(instances, describe)
 
@@ -99,20 +99,25 @@ class ClassScores:
     def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
         first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        return describe_aligned_looks(aligned, cut, self.network, config, self.count).with_balanced(first)
+        return self._complete(describe_aligned_looks(aligned, cut, self.network, config, self.count), first)
+
+    def _complete(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
+        """Add what only galleries read: the programs of classifiers are those of recognition without it."""
+        return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
 
     def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
         """Return the scores [B, n] of items, described `ROWS` at a time."""
-        scores = [np.zeros((0, len(self.names)), np.float32)]
-        for start in range(0, len(items), ROWS):
-            rows = items[start : start + ROWS]
-            scores.append(np.asarray(self.of_descriptors(describe(rows)))[: len(rows)])
-        return np.concatenate(scores)
+        starts = range(0, max(len(items), 1), ROWS)
+        scores = [np.asarray(self.of_descriptors(describe(items[k : k + ROWS]))) for k in starts]
+        return np.concatenate(scores)[: len(items)]
 
 
 def packed(instance: PreparedInstance) -> PointClouds:
-    """Return an instance as a batch of one cloud, in metres."""
-    return pack_instances([instance], 1, batch_points([len(instance.points)]))
+    """Return an instance as the first of `ROWS` clouds in metres, of which the others are empty.
+
+    Recognition has compiled its programs for this size.
+    """
+    return pack_instances([instance], ROWS, batch_points([len(instance.points)]))
 
 
 def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:

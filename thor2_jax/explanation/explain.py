@@ -184,7 +184,7 @@ class Explanation:
 def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation:
     """Explain the answer for one instance of a frame.
 
-    The first call with a new size of clouds compiles for some seconds; later calls take one to a few seconds.
+    The first call with a new padded size of clouds compiles for a minute; later calls take a few seconds.
 
     Args:
         recognizer: the recognizer.
@@ -289,7 +289,7 @@ def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlic
 
 def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
     """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
-    samples = sample_points(packed(instance))
+    samples = jax.tree.map(lambda a: a[:1], sample_points(packed(instance)))
     unused = model.run.surfaces if model.answers_by() == "gallery" else None
     known = ((name, found) for name in names if (found := model.surface_of(name)) and found[0] is not unused)
     for name, (surfaces, index) in itertools.islice(known, OBJECTS):

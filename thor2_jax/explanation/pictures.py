@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -107,9 +108,8 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
     figure, (first, second) = _figure(5.2, *shape)
     first.imshow(color)
     second.imshow(shown)
-    first.set_title("the object", fontsize=10)
-    second.set_title("what decided", fontsize=10)
-    for axes in (first, second):
+    for axes, title in ((first, "the object"), (second, "what decided")):
+        axes.set_title(title, fontsize=10)
         axes.contour(mask[window], [0.5], colors="#ffffff", linewidths=0.8)
         axes.set_axis_off()
     _color_bar(figure, [first, second], explanation, below=True)
@@ -186,8 +186,8 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
         shown.append((f"{title}:\n{change.answer}", changed))
     figure = _clouds(shown)
     caption = (
-        "The smallest changes of the object's colour and of its side lengths that were found to give another answer. "
-        "Each was confirmed by recognizing the changed cloud."
+        "The smallest changes of the object's colour and of its side lengths that were found to make another name most "
+        "probable. Each was confirmed by recognizing the changed cloud, which may still be an unknown object."
     )
     return ExplanationPicture("changes", "changes", "Smallest changes that change the answer", caption, figure)
 
@@ -227,7 +227,8 @@ def _clouds(shown: Sequence[tuple[str, PreparedInstance]], own_scales: bool = Fa
     for axes, (title, instance) in zip(grid.flat, shown, strict=False):
         points = instance.points if own_scales else instance.points - instance.points.mean(axis=0)
         plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
-        axes.set_title(plain_text(title), fontsize=9, **name_style())
+        lines = [part for line in title.split("\n") for part in textwrap.wrap(line, 66 // columns)]
+        axes.set_title(plain_text("\n".join(lines)), fontsize=9, **name_style())
         axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for axes in figure.axes[len(shown) :]:
         axes.set_visible(False)

@@ -1,8 +1,8 @@
 """RGB-D frames with an instance segmentation, which are validated at construction and can be read from image files.
 
-frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
-frame.instances                        # label numbers; 0 is background
-points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, OpenCV camera frame
+    frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
+    frame.instances                        # label numbers; 0 is background
+    points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, OpenCV camera frame
 
 Image files are not trusted. They are PNG, JPEG or TIFF; depth may also be NPY or EXR.
 """

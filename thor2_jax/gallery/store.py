@@ -1,10 +1,10 @@
 """Galleries on disk, with changes that are atomic even if several processes write.
 
-GALLERY/index.json                      format, generation, fingerprint of the embedding, hidden classes, and for each
-                                        object its name, file, number of views, source and date
-GALLERY/previous.json                   index.json before the last change, which can thus be undone
-GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object, with its name, source and date,
-                                        and the surface of its mesh
+    GALLERY/index.json                     format, generation, fingerprint of the embedding, hidden classes, and for
+                                           each object its name, file, number of views, source and date
+    GALLERY/previous.json                  index.json before the last change, which can thus be undone
+    GALLERY/objects/<SHA-256>.safetensors  embeddings and compact clouds of one object, with its name, source and date,
+                                           and the surface of its mesh
 
 A writer holds the lock, writes the files of new objects and then replaces index.json, so the gallery on disk is always
 in the state before or after a change. The next writer removes object files that index.json does not name; all other

@@ -1,20 +1,20 @@
 """Run directories: a trained model on disk with everything that recognition needs.
 
-RUN/run.json                    format, descriptor version and constants, class names, classifiers and SHA-256 of their
-                                weights, and a record of the training
-RUN/network.npz                 the colour network whose regions the descriptors use
-RUN/weights/NAME.safetensors    parameters and batch statistics of one classifier
-RUN/embedding.safetensors       the embedding of the gallery, in place of the packaged one, which may also recognize
-                                the classes
-RUN/references.safetensors      its reference views, with which galleries reject unknown objects
-RUN/surfaces.safetensors        surfaces of the classes, if all were trained from meshes, see `surfaces`
+    RUN/run.json                  format, descriptor version and constants, class names, classifiers and SHA-256 of
+                                  their weights, and a record of the training
+    RUN/network.npz               the colour network whose regions the descriptors use
+    RUN/weights/NAME.safetensors  parameters and batch statistics of one classifier
+    RUN/embedding.safetensors     the embedding of the gallery, in place of the packaged one, which may also recognize
+                                  the classes
+    RUN/references.safetensors    its reference views, with which galleries reject unknown objects
+    RUN/surfaces.safetensors      surfaces of the classes, if all were trained from meshes, see `surfaces`
 
-These files are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does
-not read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl`
-and `curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`,
-from which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`). A run whose embedding
-recognizes the classes may have no classifiers; a run that `thor2 enroll` created has neither classes nor classifiers.
-With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
+These files are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does not
+read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl` and
+`curves.png` (loss and accuracy of each epoch; for an embedding, each distractor is a class, too) and, while a training
+is unfinished, `checkpoints/` and `views/`, from which an interrupted training resumes. `gallery/` has enrolled objects
+(see `gallery.store`). A run whose embedding recognizes the classes may have no classifiers; a run that `thor2 enroll`
+created has neither classes nor classifiers. With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
 
 A run directory appears under its name only when it is complete, and all files are checked when it is loaded. Two
 equal trainings (see `training.fitting.fit`) write the same bytes to these files.

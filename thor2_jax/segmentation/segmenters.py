@@ -1,7 +1,7 @@
 """Segmenters by name: the built-in one, and those of other packages.
 
-labels = segment(frame)                      # [H, W] integers, by the built-in segmenter "table"
-recognizer.recognize(segmented(frame, "sam"))
+    labels = segment(frame)                      # [H, W] integers, by the built-in segmenter "table"
+    recognizer.recognize(segmented(frame, "sam"))
 
 A segmenter is a function from a frame without labels to labels [H, W], which are integers; 0 is background. A package
 offers a segmenter as an entry point in the group `ENTRY_POINTS`, see docs/segmentation.md.

@@ -279,8 +279,8 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     header = ["objects", "without rejection", f"threshold {values['threshold']}"]
     text = (
         f"Fractions of the instances for {main}. If the confidence is below the threshold, the object is rejected as "
-        "unknown. The threshold is stored in the models; a dash means that they have none. Enrolled objects have "
-        "thresholds that depend on their numbers of views; the median is shown."
+        "unknown. The threshold is stored in the models; a dash means that they have none. Of several "
+        "thresholds, such as those of enrolled objects, the median is shown."
     )
     pictures = []
     if curve is not None:
@@ -320,15 +320,14 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
         "instance because no answer is incorrect or the dataset has no unknown objects."
     )
     draw_reliability(report["reliability"], report["main"], out / "reliability.png")
-    caption = f"Accuracy of {report['main']} by confidence."
-    pictures = [Picture("reliability.png", caption, "half")]
+    pictures = [Picture("reliability.png", f"Accuracy of {report['main']} by confidence.", "half")]
     return _main_row(Section("Confidence", text, (["", *columns], rows), pictures), report["main"])
 
 
 def _frame_section(report: Mapping[str, Any]) -> Section:
     text = (
         "Answers of the first model. Green: correct, including rejected unknown objects. Orange: incorrect. The true "
-        "object is in brackets, or none if the instance could not be described."
+        "object is in brackets. An instance that could not be described is called none."
     )
     shown = [Picture(f"frames/{k}.jpg", f"Frame {name}.", "half") for k, name in enumerate(report["shown"])]
     return Section("Frames", text, pictures=shown)

@@ -164,15 +164,15 @@ def _advice(explanation: Explanation) -> str:
 def _changes_text(explanation: Explanation) -> str:
     scores = explanation.scores.of_instances([explanation.instance])[0]
     kinds = {"color": "A shift of all colours by", "extent": "A change of the side lengths by"}
-    sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
+    sentences = [f"{kinds[c.kind]} {change_text(c)} makes {c.answer} most probable." for c in explanation.changes]
     if explanation.scores.names[scores.argmax()] != explanation.name:
         decided = "the surfaces of the objects, or classifiers and gallery together, decided"
         sentences.insert(0, f"The explained scores alone would give {explanation.runner_up}; {decided}.")
     changed = {change.kind for change in explanation.changes}
     if "color" not in changed:
-        sentences.append("No shift of the colours by up to half of their range changes the answer.")
+        sentences.append("No shift of the colours by up to half of their range was found to change the name.")
     if "extent" not in changed:
-        sentences.append("No change of the side lengths by up to a factor of two changes the answer.")
+        sentences.append("No change of the side lengths by up to a factor of two was found to change the name.")
     return " ".join(sentences)
 
 

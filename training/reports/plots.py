@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colornet import ColorNetwork
 from thor2_jax import DescriptorConfig, PointClouds, align, describe_strips, plot, strips
 from thor2_jax.figures import name_style, plain_text, save_figure
+from thor2_jax.networks.networks import EMBEDDING
 from thor2_jax.plot import PALETTE
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RayCaster, camera_pose
@@ -202,7 +203,7 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | P
     """
     figure = Figure(figsize=(5.5, 5.5), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
-    dashed = False
+    dashed = any(row.get("held_out_accuracy") is not None for rows in curves.values() for row in rows)
     for k, (name, records) in enumerate(curves.items()):
         folds = sorted({record.get("fold", 0) for record in records})
         for fold in folds:
@@ -211,13 +212,10 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | P
             if len(rows) < 30:
                 style |= {"marker": "o", "markersize": 3}
             epochs = [record["epoch"] for record in rows]
-            label = name.upper() if fold == folds[0] else None
-            upper.plot(epochs, [record["loss"] for record in rows], label=label, **style)
+            title = "embedding, distractors included" if name == EMBEDDING else name.upper()
+            upper.plot(epochs, [record["loss"] for record in rows], label=title if fold == folds[0] else None, **style)
             lower.plot(epochs, [record["accuracy"] for record in rows], **style)
-            held_out = [record.get("held_out_accuracy") for record in rows]
-            if None not in held_out:
-                lower.plot(epochs, held_out, linestyle="--", **style)
-                dashed = True
+            lower.plot(epochs, [record.get("held_out_accuracy") for record in rows], linestyle="--", **style)
     upper.set(yscale="log", ylabel="loss (cross-entropy)")
     lower.set(xlabel="epoch", ylabel="accuracy" if dashed else "accuracy, with dropout")
     if dashed:

@@ -162,13 +162,12 @@ REDNESS = toy(redness)
 
 def test_a_left_out_slice_is_an_empty_slice() -> None:
     left = attributions.leave_out(REDNESS, REDNESS.orient(INSTANCE), 1, np.zeros(len(INSTANCE.points), np.float32))
-    oriented = describe_looks(pack_instances([INSTANCE], 1), NETWORK, SMALL_CONFIG)
+    looks = describe_looks(pack_instances([INSTANCE], 1), NETWORK, SMALL_CONFIG)
     margin = jax.jit(lambda o: REDNESS.margin(REDNESS.of_descriptors(o), 1)[0])
     for number in range(2):
         kept = (np.arange(2) != number).reshape(2, 1, 1)
-        blanked = {name: getattr(oriented.each, name) * kept for name in ("images", "embeddings")}
-        each = dataclasses.replace(oriented.each, **blanked)
-        expected = float(margin(oriented) - margin(dataclasses.replace(oriented, each=each)))
+        each = dataclasses.replace(looks.each, images=looks.each.images * kept, embeddings=looks.each.embeddings * kept)
+        expected = float(margin(looks) - margin(dataclasses.replace(looks, each=each)))
         assert left.slices[number] == pytest.approx(expected, abs=1e-3)
     assert left.agreement is None  # all attributions are equal
 
@@ -343,16 +342,19 @@ def test_errors_name_the_argument(recognizer: Recognizer) -> None:
 
 
 def test_texts_of_pictures_are_inside(explanation: Explanation) -> None:
-    """Titles touched the border of a tall photo, and labels of a flat cloud and of slices were cut off."""
+    """Titles touched each other or the border of a tall photo; labels of a flat cloud and of slices were cut off."""
     points = explanation.instance.points
     flat = (points - points.min(axis=0)) / np.ptp(points, axis=0) * [0.144, 0.03744, 0.03] - [0.5, 0.055, -1]
     instance = dataclasses.replace(explanation.instance, points=flat.astype(np.float32))
-    labels = np.where(np.arange(len(FRAME.labels))[:, None] < 58, FRAME.labels, 0)
-    tall = dataclasses.replace(FRAME, labels=labels)
+    tall = dataclasses.replace(FRAME, labels=np.where(np.arange(len(LABELS))[:, None] < 58, LABELS, 0))
     aligned = np.linspace([0, 0, 0], [0.27, 0.1, 0.28], len(points), dtype=np.float32)
     described = dataclasses.replace(explanation.described, points=aligned)
     changed = dataclasses.replace(explanation, instance=instance, described=described)
     for picture in pictures.pictures(changed, tall):
-        with Image.open(io.BytesIO(png_bytes(picture.figure))) as image:
-            pixels = np.asarray(image)
-            assert all((border == 255).all() for border in (pixels[:2], pixels[:, :2])), picture.title
+        pixels = np.asarray(Image.open(io.BytesIO(png_bytes(picture.figure))))
+        assert all((border == 255).all() for border in (pixels[:2], pixels[:, :2])), picture.title
+    narrow = dataclasses.replace(instance, points=instance.points[:, [1, 0, 2]])
+    figure = pictures._clouds([("052_extra_large_clamp" * 2, narrow)] * 3)
+    figure.draw_without_rendering()
+    first, second, third = (axes.title.get_window_extent() for axes in figure.axes[:3])
+    assert first.x1 < second.x0 and second.x1 < third.x0

@@ -80,16 +80,14 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
 
 
 def test_names_without_enrolled_views_are_left_out() -> None:
-    answer = Recognition(
-        1, "mug", 0.9, top={"embedding": [("mug", 0.9), ("bowl", 0.1)], "gallery": [("mug", 1.0), ("bowl", 0.0)]}
-    )
+    top = {"embedding": [("mug", 0.9), ("bowl", 0.1)], "gallery": [("mug", 1.0), ("bowl", 0.0)]}
+    answer = Recognition(1, "mug", 0.9, top=top)
     assert explanation_page._answer_table(answer)[1] == [["1", "mug 90.0 %", "mug >99.9 %"], ["2", "bowl 10.0 %", ""]]
 
 
 def test_texts_of_a_page() -> None:
     """Advice on a wrong name, and what is said if surfaces or an enrolled object decided against the best score."""
-    change = SimpleNamespace(kind="color")
-    for occluded, other, changes in ((True, "bowl", [change]), (False, None, [])):
+    for occluded, other, changes in ((True, "bowl", [SimpleNamespace(kind="color")]), (False, None, [])):
         answer = SimpleNamespace(label=7, occluded=occluded)
         explanation: Any = SimpleNamespace(recognition=answer, name="mug", runner_up=other, changes=changes)
         advice = explanation_page._advice(explanation)

@@ -34,8 +34,8 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
   const what = unit === "log-odds" ? "Log-odds (0 is even, 4.6 means 99\u00a0%)" : "Lead in similarity over other objects";
   const subject = name === null ? `Most probable, though unknown: ${explained_name}. ` : "";
   const found = changes.length
-    ? `Smallest changes that give another name: ${changes.join("; ")}.`
-    : "No small change of colour or side lengths gives another name.";
+    ? `Smallest changes that make another name most probable: ${changes.join("; ")}.`
+    : "No change of colour or side lengths was found that makes another name most probable.";
   const change = (loss) => `${loss < -0.005 ? "rises" : "falls"} by ${Math.abs(loss).toFixed(2)}`;
   const fall = `Without the tenth of the points that speaks most for the name, it ${change(worst)}; without a random tenth, it ${change(random)}.`;
   return `${subject}${what}: ${value}. ${fall} ${found}`;
