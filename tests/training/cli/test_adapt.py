@@ -58,8 +58,7 @@ def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None
     assert after["record"].pop("color_transform") == vars(transform)
     assert after["record"].pop("adapted_to") == {"instances": 12}
     assert before == after
-    names = {path.name for path in model.iterdir()}
-    assert {path.name for path in adapted.iterdir()} == names - {"checkpoints"}
+    assert {path.name for path in adapted.iterdir()} == {path.name for path in model.iterdir()} - {"checkpoints"}
 
 
 def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, printed: Command) -> None:
