@@ -236,8 +236,7 @@ class ObjectGallery:
     def weak_rejection(self) -> str:
         """Message that explains why few unknown objects are rejected, and what helps; empty if there is no cause."""
         objects, references = self.gallery.objects.values(), self.gallery.references
-        few = sum(len(views.clouds) < FEW for views in objects)
-        if few:
+        if few := sum(len(views.clouds) < FEW for views in objects):
             return f"enrolled objects with fewer than {FEW} views: {few} of {len(objects)}; add views from other sides"
         has_surfaces = all(views.surface is not None for views in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:

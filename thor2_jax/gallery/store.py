@@ -108,7 +108,10 @@ def check_index(directory: Path) -> None:
         raise _unusable(directory, f"{directory} has objects, but no {INDEX_FILE}", "rebuild it")
 
 
-def _unusable(directory: Path, problem: str, repair: str) -> GalleryError:
+KEEP_OTHERS = f"delete {INDEX_FILE} and keep the other objects"
+
+
+def _unusable(directory: Path, problem: str, repair: str = KEEP_OTHERS) -> GalleryError:
     """Return the error of a gallery whose index can be rebuilt from the object files that are intact."""
     command = f"thor2 objects --reembed --model RUN --gallery {shlex.quote(str(directory))}"
     return GalleryError(f"gallery: {problem}; restore it from a copy, or {repair}: {command}")
@@ -144,8 +147,7 @@ def load_gallery(
         # A file of the index is missing if a writer replaced it after the index was read, or if it was deleted.
         with contextlib.suppress(FileNotFoundError):
             return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
-    problem = f"{directory / INDEX_FILE} names files that do not exist"
-    raise _unusable(directory, problem, "delete this file and keep the other objects")
+    raise _unusable(directory, f"{directory} lacks files that {INDEX_FILE} names")
 
 
 def _read_index(path: Path) -> dict[str, Any] | None:
@@ -213,8 +215,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     if content_digest([content]) != path.stem:
-        repair = f"delete {INDEX_FILE} and keep the other objects"
-        raise _unusable(path.parent.parent, f"{path} is damaged", repair)
+        raise _unusable(path.parent.parent, f"{path} is damaged")
     try:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
