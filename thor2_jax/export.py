@@ -48,7 +48,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         the camera sees around an instance is not compared.
 
     Raises:
-        InputError: `run` is of another type, a size is not a bucket, or a platform is unknown.
+        InputError: `run` is of another type or has no classes, a size is not a bucket, or a platform is unknown.
     """
     if not isinstance(run, TrainedRun):
         raise InputError(f"run is a {type(run).__name__}; expected a TrainedRun, as load_run returns it")
@@ -58,6 +58,8 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {tuple(platforms)!r}; expected some of {', '.join(PLATFORMS)}")
     model = Model.of_run(run.without_callback())
+    if not model.classifiers:
+        raise InputError("run has no classes, and enrolled objects cannot be exported; expected a run of thor2 train")
 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
         inference = infer_clouds(model, PointClouds(*fields), tuple(model.classifiers))

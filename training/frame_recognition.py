@@ -18,6 +18,7 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, reason_of
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.prepared_instance import unit_question
+from thor2_jax.gallery.store import check_exists
 from thor2_jax.model.recognition import Detection, Recognition, detections_as_json, detections_of
 from training.readers.frames import FrameSource
 
@@ -103,8 +104,10 @@ class RecognizerArguments:
         """Load a recognizer for single frames.
 
         Raises:
-            InputError: as `Recognizer.load`, or the model lacks the classifiers or enrolled objects to answer by.
+            InputError: as `Recognizer.load`, the given gallery does not exist, or the model lacks the classifiers or
+                enrolled objects to answer by.
         """
+        check_exists(self.gallery)
         options: dict[str, Any] = {"gallery": self.gallery, "answer_by": self.answer_by, "chunk": BATCH_BUCKETS[-1]}
         recognizer = Recognizer.load(self.model, self.unknown_below, **options)
         if self.answer_by not in (None, "both", recognizer.model.answers_by()):

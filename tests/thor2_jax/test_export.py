@@ -9,7 +9,7 @@ import pytest
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from small_clouds import random_clouds
-from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, with_surfaces
+from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run, with_surfaces
 
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
@@ -79,6 +79,7 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
 def test_invalid_runs_sizes_and_platforms_are_refused(run: TrainedRun) -> None:
     assert_refused("n_points is 500", export_recognizer, run, n_points=500, n_clouds=1)
     assert_refused("n_clouds is 3", export_recognizer, run, n_points=512, n_clouds=3)
-    assert_refused("run is a str", export_recognizer, "run", n_points=512, n_clouds=1)
+    for given, message in (("run", "run is a str"), (untrained_run((), ()), "run has no classes")):
+        assert_refused(message, export_recognizer, given, n_points=512, n_clouds=1)
     for platforms in (("abacus",), ()):
         assert_refused("platforms is", export_recognizer, run, n_points=512, n_clouds=1, platforms=platforms)

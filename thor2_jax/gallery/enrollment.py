@@ -172,6 +172,10 @@ _CHANGE = threading.Lock()
 An attribute could not be pickled."""
 
 
+Report = Callable[[int, int], Any]
+"""Called with the number of objects embedded again and of all."""
+
+
 class ObjectGallery:
     """Enrolled objects beside the trained classes of a run.
 
@@ -200,16 +204,14 @@ class ObjectGallery:
         self.gallery = Gallery("", trained=trained, search=search)
         self.lock_seconds = store.LOCK_SECONDS
 
-    def open(
-        self, directory: Path, *, reembed: bool = False, report: Callable[[int, int], Any] = lambda done, total: None
-    ) -> None:
+    def open(self, directory: Path, *, reembed: bool = False, report: Report = lambda done, total: None) -> None:
         """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
 
         Args:
             directory: directory of the gallery.
             reembed: embed all views again with the embedding of this run, whatever their embedding was, and rebuild a
                 lost index.
-            report: function that shows the progress, called with the number of objects embedded again and of all.
+            report: function that shows the progress.
 
         Raises:
             InputError: as `refresh`.
@@ -217,7 +219,10 @@ class ObjectGallery:
         """
         self.directory = directory
         if reembed and directory.exists():
-            self._change(functools.partial(self._reembedded, report), reembed=True)
+            store.check_open_to_changes(directory)
+            change = functools.partial(self._reembedded, report, {})
+            change(store.load_gallery(directory, rebuild=True))  # takes long, without the lock
+            self._change(change, reembed=True)  # embeds what was enrolled meanwhile
         else:
             store.check_index(directory)
             self.refresh()
@@ -231,8 +236,7 @@ class ObjectGallery:
     def weak_rejection(self) -> str:
         """Message that explains why few unknown objects are rejected, and what helps; empty if there is no cause."""
         objects, references = self.gallery.objects.values(), self.gallery.references
-        few = sum(len(views.clouds) < FEW for views in objects)
-        if few:
+        if few := sum(len(views.clouds) < FEW for views in objects):
             return f"enrolled objects with fewer than {FEW} views: {few} of {len(objects)}; add views from other sides"
         has_surfaces = all(views.surface is not None for views in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
@@ -251,12 +255,14 @@ class ObjectGallery:
             self.gallery = self._of_run(store.load_gallery(self.directory, self.embedding.fingerprint, self.gallery))
             return True
 
-    def _reembedded(self, report: Callable[[int, int], Any], gallery: Gallery) -> Gallery:
+    def _reembedded(self, report: Report, embedded: dict[str | None, GalleryObject], gallery: Gallery) -> Gallery:
+        """Return the gallery with embedded objects; `embedded` has those of some files, and gets the others."""
         objects, total = dict[str, GalleryObject](), len(gallery.objects)
         for name, views in gallery.objects.items():
-            report(len(objects), total)
-            again = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
-            objects[name] = dataclasses.replace(again, date=views.date)
+            if views.file not in embedded:
+                report(len(objects), total)
+                embedded[views.file] = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
+            objects[name] = dataclasses.replace(embedded[views.file], date=views.date)
         report(total, total)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 

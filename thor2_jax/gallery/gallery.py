@@ -191,9 +191,7 @@ class Gallery:
         name = find_name(name, (*self.objects, *self.trained)) or name
         is_class = self._is_answered_class(name)
         if name not in self.objects and not is_class:
-            raise InputError(
-                f"name: {name!r} is unknown; expected the name of an object: this model recognizes {self.summary}"
-            )
+            raise InputError(f"name: {name!r} is unknown; expected a name that this model recognizes: {self.summary}")
         objects = {other: views for other, views in self.objects.items() if other != name}
         return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
 

@@ -16,6 +16,7 @@ import dataclasses
 import json
 import os
 import re
+import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -86,9 +87,9 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     return status.st_mtime_ns, status.st_ino, status.st_size
 
 
-def check_exists(directory: Path) -> None:
-    """Raise GalleryError unless a directory has an index, or objects from which a lost index can be rebuilt."""
-    if gallery_stamp(directory) is None and not any(_own_objects(directory)):
+def check_exists(directory: Path | None) -> None:
+    """Raise GalleryError if a given directory has neither an index nor objects from which it can be rebuilt."""
+    if directory is not None and gallery_stamp(directory) is None and not any(_own_objects(directory)):
         raise GalleryError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
 
 
@@ -104,19 +105,28 @@ def check_index(directory: Path) -> None:
         if path.exists() and not path.is_dir():
             raise GalleryError(f"gallery: {path} is no directory; expected that of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
-        raise GalleryError(
-            f"gallery: {directory} has objects, but no {INDEX_FILE}; restore it from a copy, or rebuild it: "
-            f"thor2 objects --reembed --model RUN --gallery {directory}"
-        )
+        raise _unusable(directory, f"{directory} has objects, but no {INDEX_FILE}", "rebuild it")
 
 
-def load_gallery(directory: Path, embedding: str | None = None, known: Gallery | None = None) -> Gallery:
+KEEP_OTHERS = f"delete {INDEX_FILE} and keep the other objects"
+
+
+def _unusable(directory: Path, problem: str, repair: str = KEEP_OTHERS) -> GalleryError:
+    """Return the error of a gallery whose index can be rebuilt from the object files that are intact."""
+    command = f"thor2 objects --reembed --model RUN --gallery {shlex.quote(str(directory))}"
+    return GalleryError(f"gallery: {problem}; restore it from a copy, or {repair}: {command}")
+
+
+def load_gallery(
+    directory: Path, embedding: str | None = None, known: Gallery | None = None, *, rebuild: bool = False
+) -> Gallery:
     """Read a gallery; a gallery that does not exist is empty.
 
     Args:
         directory: directory of the gallery.
         embedding: fingerprint that the gallery must have; None accepts any.
         known: an earlier state of the gallery, whose objects are not read again.
+        rebuild: if the index is missing, return a gallery of all object files.
 
     Raises:
         GalleryError: a file is missing or damaged, the gallery has another embedding, or that of `known` was removed.
@@ -125,6 +135,8 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
     for _ in range(3):
         stamp = gallery_stamp(directory)  # of this index or of an earlier one
         index = _read_index(directory / INDEX_FILE)
+        if index is None and rebuild:
+            return _rebuilt(directory)
         if index is None:
             check_index(directory)
             if known is not None and (known.objects or known.hidden):
@@ -138,9 +150,7 @@ def load_gallery(directory: Path, embedding: str | None = None, known: Gallery |
         # A file of the index is missing if a writer replaced it after the index was read, or if it was deleted.
         with contextlib.suppress(FileNotFoundError):
             return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
-    raise GalleryError(
-        f"gallery: {directory / INDEX_FILE} names files that do not exist; restore the directory from a copy"
-    )
+    raise _unusable(directory, f"{directory} lacks files that {INDEX_FILE} names")
 
 
 def _read_index(path: Path) -> dict[str, Any] | None:
@@ -161,10 +171,8 @@ def _read_index(path: Path) -> dict[str, Any] | None:
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise GalleryError(
-            f"gallery: {path} is damaged ({reason_of(error)}); restore it from a copy, or delete this file and rebuild "
-            f"it: thor2 objects --reembed --model RUN --gallery {path.parent}"
-        ) from None
+        problem = f"{path} is damaged ({reason_of(error)})"
+        raise _unusable(path.parent, problem, "delete this file and rebuild it") from None
     if index["format"] not in (GALLERY_FORMAT, FORMAT_WITH_SURFACES):
         raise GalleryError(f"gallery: {path} has format {index['format']}; expected {FORMAT_WITH_SURFACES} or less")
     return dict(index)
@@ -210,7 +218,7 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     except OSError as error:
         raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     if content_digest([content]) != path.stem:
-        raise GalleryError(f"gallery: {path} is damaged; restore it from a copy, or delete the gallery")
+        raise _unusable(path.parent.parent, f"{path} is damaged")
     try:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
@@ -249,8 +257,7 @@ def update_gallery(
     busy = f"another process or thread has been writing to {directory} for {lock_seconds:.2g} s; try again when it ends"
     lock = locked(directory, GalleryBusyError(f"gallery: {busy}"), lock_seconds)
     with lock, new_directory(directory / "objects"):
-        is_lost = embedding is None and gallery_stamp(directory) is None
-        before = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
+        before = load_gallery(directory, embedding, known, rebuild=embedding is None)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
         _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
         objects = dict(changed.objects)
@@ -301,9 +308,7 @@ def previous_gallery(directory: Path, generation: int, gallery: Gallery) -> Gall
     with contextlib.suppress(GalleryError):
         index = _read_index(directory / PREVIOUS_FILE)
     if gallery.generation != generation:
-        raise InputError(
-            f"generation is {generation}; expected {gallery.generation}: the gallery has been changed since"
-        )
+        raise InputError(f"generation is {generation}; expected {gallery.generation}: the gallery has changed since")
     if index is None or index["generation"] != generation - 1 or index["embedding"] != gallery.embedding:
         raise InputError(f"generation is {generation}, and the gallery before it is not known; forget the object")
     with contextlib.suppress(FileNotFoundError):

@@ -130,8 +130,8 @@ class InferenceEngine:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         directory = settings.gallery or settings.model / GALLERY_DIRECTORY
-        if settings.gallery is not None and not settings.teach:
-            check_exists(directory)
+        if not settings.teach:
+            check_exists(settings.gallery)
         self._recognizer = recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
         self.objects = recognizer.objects
         if settings.teach:

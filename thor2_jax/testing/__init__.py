@@ -1,11 +1,12 @@
 """Properties of descriptors and Hypothesis strategies for clouds, to test your own pipeline with.
 
-    from hypothesis import given
+    from hypothesis import given, settings
     import colornet, thor2_jax as thor2
     from thor2_jax.testing import aligned_clouds, assert_permutation_invariant, packed, seeds
 
     network, config = colornet.load_default(), thor2.DescriptorConfig()
 
+    @settings(deadline=None)  # the first call compiles
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order_of_points(clouds, seed):
         describe = lambda clouds: thor2.describe_aligned(clouds, network, config)

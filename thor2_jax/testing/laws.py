@@ -1,5 +1,6 @@
 """Invariances of descriptors and of instance clouds, with one assertion each, for any function that computes them.
 
+    @settings(deadline=None)
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
         assert_permutation_invariant(my_descriptor, clouds, seed, config)

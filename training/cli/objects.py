@@ -28,8 +28,7 @@ def objects(
     from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_exists, load_gallery
     from thor2_jax.model.run_record import read_description
 
-    if gallery is not None:
-        check_exists(gallery)
+    check_exists(gallery)
     directory = model / GALLERY_DIRECTORY if gallery is None else gallery
     if reembed:
         from thor2_jax.gallery.enrollment import ObjectGallery
@@ -38,17 +37,14 @@ def objects(
 
         run = load_run(model)
         with show_progress(quiet) as progress:
-            report = of_stage(progress, "embed")
-            ObjectGallery(run.classes, run.embedding).open(directory, reembed=True, report=report)
+            ObjectGallery(run.classes, run.embedding).open(directory, reembed=True, report=of_stage(progress, "embed"))
     description = read_description(model)
     trained, embedding = tuple(description["classes"]), description.get("embedding")
     stored = load_gallery(directory, None if embedding is None else str(embedding))
     known = dataclasses.replace(stored, trained=trained)
     table = Table("name", "views", "source", "enrolled")
-    for name in known.answered_names:
-        sources, views, date = [], "", ""
-        if name in trained and name not in known.hidden:
-            sources.append("training")
+    for number, name in enumerate(known.answered_names):
+        sources, views, date = ["training"] if known.has_output[number] else [], "", ""
         if name in known.objects:
             views, date = str(len(known.objects[name].clouds)), known.objects[name].date
             sources.append(known.objects[name].source)

@@ -270,14 +270,17 @@ def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
     path, other = tmp_path / "run", small_embedding(1)
     save_run(untrained_run((), ()), path)
     embedding().save(path / EMBEDDING_FILE)
-    thor2.Recognizer.load(path).enroll("brick", [(CLUTTER, 1)])
+    before = thor2.Recognizer.load(path)
+    before.enroll("brick", [(CLUTTER, 1)])
     other.save(path / EMBEDDING_FILE)
     assert_refused("gallery.*reembed", thor2.Recognizer.load, path)
-    ObjectGallery((), other).open(path / "gallery", reembed=True)
+    meanwhile = functools.partial(before.enroll, "book", [(CLUTTER, 2)], extend=True)  # needs the lock when it is new
+    ObjectGallery((), other).open(path / "gallery", reembed=True, report=lambda *_: meanwhile())
     expected = thor2.Recognizer(dataclasses.replace(untrained_run((), ()), embedding=other))
-    expected.enroll("brick", [(CLUTTER, 1)])
-    embeddings = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
-    np.testing.assert_array_equal(embeddings, expected.gallery.objects["brick"].embeddings)
+    for label, name in enumerate(("brick", "book"), 1):
+        expected.enroll(name, [(CLUTTER, label)])
+        embeddings = thor2.Recognizer.load(path).gallery.objects[name].embeddings
+        np.testing.assert_array_equal(embeddings, expected.gallery.objects[name].embeddings)
     assert json.loads((path / "gallery" / "index.json").read_text())["embedding"] == other.fingerprint
 
 

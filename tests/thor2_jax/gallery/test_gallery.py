@@ -109,8 +109,7 @@ def test_scores_of_views_and_looks_against_a_gaussian_process() -> None:
     views = np.concatenate([*(each.embeddings for each in gallery.objects.values()), gallery.references.embeddings])
     owner = np.repeat([0, 1, 2, 0, 4, 4], [4, 24, 12, 12, 12, 40])  # mug, bowl, class, forgotten class, background
     counts = np.array([4, 24, 14, 14, 14])[owner]  # of an owner that is not enrolled, the mean of those that are
-    noise = RIDGE * counts / counts.mean()
-    process = GaussianProcessRegressor(RBF(GAMMA**-0.5, "fixed"), alpha=noise, optimizer=None)
+    process = GaussianProcessRegressor(RBF(GAMMA**-0.5, "fixed"), alpha=RIDGE * counts / counts.mean(), optimizer=None)
     process.fit(views, np.eye(5)[owner])
     pairs = [(0, 5), (1, 5), (6, 5), (0, 6), (1, 9)]
     queries = np.concatenate([unit(views_around(a, 5, seed=1) + views_around(b, 5, seed=3)) for a, b in pairs])
@@ -178,8 +177,7 @@ def test_compact_clouds_keep_points_to_0_05_mm() -> None:
         np.testing.assert_allclose(restored.points, expected.points, atol=3e-5)
         np.testing.assert_array_equal(restored.colors, expected.colors)
         np.testing.assert_array_equal(restored.boundary, expected.boundary)
-    again = CompactClouds.of(list(clouds.views()))
-    np.testing.assert_array_equal(again.points, clouds.points)
+    np.testing.assert_array_equal(CompactClouds.of(list(clouds.views())).points, clouds.points)
 
 
 def test_clouds_without_points_or_too_large_are_refused() -> None:

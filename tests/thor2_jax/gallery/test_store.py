@@ -61,7 +61,7 @@ def assert_unusable(match: str, directory: Path, fingerprint: str = FINGERPRINT)
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    path = tmp_path / "run" / "gallery"
+    path = tmp_path / "my run" / "gallery"
     for seed, name in enumerate(("mug", "bowl")):
         update_gallery(path, add(name, seed), FINGERPRINT)
     return path
@@ -98,12 +98,10 @@ def test_a_missing_gallery_is_empty_and_not_created(tmp_path: Path) -> None:
 
 
 def test_a_file_is_no_gallery(tmp_path: Path) -> None:
-    (tmp_path / "gallery").write_text("mine")
-    with pytest.raises(GalleryError, match="is no directory"):
-        check_index(tmp_path / "gallery")
-    (tmp_path / "objects").write_text("mine")
-    with pytest.raises(GalleryError, match="objects is no directory"):
-        check_index(tmp_path)
+    for name, gallery in (("gallery", tmp_path / "gallery"), ("objects", tmp_path)):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(GalleryError, match=f"{name} is no directory"):
+            check_index(gallery)
 
 
 def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -> None:
@@ -223,7 +221,7 @@ def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
     for names in (("index.json",), ("index.json", "previous.json")):
         for name in names:
             (directory / name).unlink(missing_ok=True)
-        assert_unusable(f"{directory}.*thor2 objects --reembed", directory)
+        assert_unusable(f"{directory}.*thor2 objects --reembed .* '{directory}'", directory)
         rebuilt = update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT))
         assert rebuilt.generation == {1: expected.generation + 1, 2: 1}[len(names)]
         if len(names) == 1:  # Without the former index, the two files of the mug are equally old.
@@ -280,6 +278,12 @@ def edit(path: Path, **changes: object) -> None:
 def test_damage_is_refused_in_one_line(damage: str, directory: Path) -> None:
     DAMAGES[damage](directory)
     assert_unusable(f"^gallery: .*{directory}", directory)
+    if damage in (
+        "missing file",
+        "cut file",
+    ):  # The advice keeps the other object.
+        (directory / "index.json").unlink()
+        assert len(update_gallery(directory, functools.partial(dataclasses.replace, embedding=FINGERPRINT)).names) == 1
 
 
 PROGRAM = """

@@ -58,8 +58,7 @@ def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None
     assert after["record"].pop("color_transform") == vars(transform)
     assert after["record"].pop("adapted_to") == {"instances": 12}
     assert before == after
-    names = {path.name for path in model.iterdir()}
-    assert {path.name for path in adapted.iterdir()} == names - {"checkpoints"}
+    assert {path.name for path in adapted.iterdir()} == {path.name for path in model.iterdir()} - {"checkpoints"}
 
 
 def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, printed: Command) -> None:
@@ -89,8 +88,7 @@ def test_uncertainty_that_does_not_decrease_is_noted(
     model: Path, video: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for after, is_noted in ((0.6, True), (0.4, False)):
-        adaptation = Adaptation(ColorTransform(), 12, 0.5, after)
-        monkeypatch.setattr(Recognizer, "adapt", lambda *_, adaptation=adaptation: adaptation)
+        monkeypatch.setattr(Recognizer, "adapt", lambda *_, after=after: Adaptation(ColorTransform(), 12, 0.5, after))
         out = printed("adapt", "--model", model, video, "--out", tmp_path / f"{after}", "--quiet")
         assert (f"{model} may serve as well" in out) == is_noted
 

@@ -61,13 +61,10 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
         (frame / name).parent.mkdir()
         (frame / name).write_text("a user's")
 
-    def write(unfinished: Path, **_: Any) -> None:
-        unfinished.write_text("a page")
-
     values = {"label": 1, "explained_name": "mug", "faithfulness": {}}
     explanation = SimpleNamespace(title="mug", as_json=lambda: values)
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", lambda *_: explanation)
-    monkeypatch.setattr(explanation_page, "write_page", write)
+    monkeypatch.setattr(explanation_page, "write_page", lambda unfinished, **_: unfinished.write_text("a page"))
     for name, nothing in (("pictures", []), ("_lead", ""), ("_page_sections", [])):
         monkeypatch.setattr(explanation_page, name, lambda *_, nothing=nothing: nothing)
     command = ("explain", "--model", model, frame.parent, "--out", frame.parent, "--instance")
@@ -122,6 +119,7 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
     monkeypatch.setattr(explanation_page, "write_explanation", lambda *_: None)
     gallery = tmp_path / "gallery"
+    Recognizer.load(model, gallery=gallery).objects.add({})
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
     text = printed("explain", *given, frame, "--out", tmp_path / "out")
     assert f" NAME {frame} --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
@@ -138,6 +136,7 @@ def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, t
     command = ("explain", "--model", model, frame, "--out", out)
     assert "table: --instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
     assert "--answer-by is gallery" in refused(*command, "--answer-by", "gallery")
+    assert "none has no index.json" in refused(*command, "--gallery", tmp_path / "none")
     (frame / "mask.png").unlink()
     assert "error: table: labels is None" in refused(*command)
     out.mkdir()  # The error has not created it.
