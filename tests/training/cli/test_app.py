@@ -181,6 +181,7 @@ def command(**_):
         os.kill(os.getpid(), int(sys.argv[3]))
 
 sys.modules["training.cli.app"].app = command
+signal.signal(int(sys.argv[3]), signal.SIG_DFL)  # under nohup, it is ignored
 sys.modules["training.cli.app"].main()
 """
     done = run_python("-c", code, str(tmp_path), workers, str(int(number)))
