@@ -385,9 +385,8 @@ def reliability(ax: Axes, bins: Mapping[str, Sequence[Any]], *, counts: Axes | N
         raise InputError(
             f"bins is {reprlib.repr(dict(bins))}; expected answers and accuracy, one number in each for every bin"
         )
-    answers = np.array(bins["answers"])
+    answers, accuracy = (np.array(bins[key], float) for key in ("answers", "accuracy"))  # None becomes NaN
     edges = np.linspace(0, 1, len(answers) + 1)
-    accuracy = np.array([np.nan if value is None else value for value in bins["accuracy"]])
     ax.bar(edges[:-1], accuracy, 1 / len(answers), align="edge", color=PALETTE[0], edgecolor="white")
     ax.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="perfect calibration")
     ax.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
