@@ -57,7 +57,8 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
     folder = FrameFolder(given.sources())
-    dataset = ", ".join(str(path.resolve()) for path in given.frames or filter(None, [given.color]))
+    files = filter(None, [given.color, given.depth, given.labels, given.intrinsics])
+    dataset = ", ".join(str(path.resolve()) for path in given.frames or files)
     if folder.note:
         console.print(f"skipped: {folder.note}")
     _evaluate("frames", folder, dataset, job, runs, given=given)
