@@ -35,7 +35,7 @@ from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.surfaces.evidence import fit_rows, sample_points
+from thor2_jax.surfaces.evidence import sample_points, search_poses
 from thor2_jax.types import Diagrams, PointClouds
 
 __all__ = [
@@ -293,7 +293,7 @@ def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str])
     unused = model.run.surfaces if model.answers_by() == "gallery" else None
     known = ((name, found) for name in names if (found := model.surface_of(name)) and found[0] is not unused)
     for name, (surfaces, index) in itertools.islice(known, OBJECTS):
-        (values,), (pose,) = map(np.asarray, fit_rows(surfaces, samples, jnp.array([index])))
+        (values,), (pose,) = map(np.asarray, search_poses(surfaces, samples, jnp.array([index])))
         fit, chroma, lightness, free = values.tolist()
         of_points = surfaces.distances(index, pose, instance.points)
         yield SurfaceFit(name, math.exp(fit), chroma, lightness, free, of_points)

@@ -282,17 +282,17 @@ class Gallery:
         arrays = {number: views.surface for number, views in enumerate(self.objects.values())}
         return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
 
-    def compared(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
-        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surfaces.evidence.compared`.
+    def with_evidence(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:
+        """Return scores [B, n_objects], changed by the evidence of the surfaces, see `surfaces.evidence`.
 
         The probability of an object is its share of the odds of all objects with a surface and of 1. If a changed score
         exceeds 1, those of all objects with a surface are divided by it. Other objects keep their scores.
         """
-        from thor2_jax.surfaces.evidence import compared
+        from thor2_jax.surfaces.evidence import with_evidence_on_host
 
-        number = list(self.surfaces)
+        number, surfaces = list(self.surfaces), list(self.surfaces.values())
         odds = _score_odds(scores[:, number].astype(np.float64))
-        known = compared(odds / (1 + odds.sum(axis=1, keepdims=True)), list(self.surfaces.values()), samples)
+        known = with_evidence_on_host(odds / (1 + odds.sum(axis=1, keepdims=True)), surfaces, samples)
         odds = known / np.maximum(1 - known.sum(axis=1, keepdims=True), TINY)
         changed = EVEN * odds ** (1 / STEEPNESS)
         result = scores.copy()

@@ -27,7 +27,7 @@ function, of the log-odds of the score: the fraction of correct answers to known
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 FusionRule = Literal["max", "mean", "log-mean"]
-FUSION_RULES: tuple[FusionRule, ...] = ("max", "mean", "log-mean")
+FUSION_RULES: tuple[FusionRule, ...] = get_args(FusionRule)
 """All fusion rules, the paper's first."""
 
 DEFAULT_RULE: FusionRule = "log-mean"

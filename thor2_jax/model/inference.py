@@ -141,19 +141,20 @@ def infer(
         return Inference(oriented.overflow, probabilities)
     samples = sample_points(clouds)
     if surfaces is not None:
-        probabilities[EMBEDDING] = _with_evidence(probabilities[EMBEDDING], surfaces, samples)
+        probabilities[EMBEDDING] = _with_evidence_in_threads(probabilities[EMBEDDING], surfaces, samples)
     if not embeds:
         return Inference(oriented.overflow, probabilities)
     embedding, run = model.embedding, model.run
+    # Neither the homology nor the number of looks changes a look.
     config = dataclasses.replace(embedding.config, homology=run.config.homology, looks=run.config.looks)
     if run.network == embedding.network and run.config == config and oriented.shape[1] >= LOOKS:
-        first = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
+        looks = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
     else:
-        first = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
-    return Inference(oriented.overflow, probabilities, embedding.embed_oriented(first, clouds), samples=samples)
+        looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
+    return Inference(oriented.overflow, probabilities, embedding.embed_oriented(looks, clouds), samples=samples)
 
 
-def _with_evidence(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
+def _with_evidence_in_threads(probabilities: jax.Array, surfaces: Surfaces, samples: Sample) -> jax.Array:
     """Return `with_evidence`, computed in threads on CPUs, where XLA computes the calls of a thread one by one."""
     is_traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((probabilities, surfaces, samples)))
     if jax.default_backend() != "cpu" or is_traced or not len(probabilities):
@@ -204,7 +205,7 @@ def object_scores(model: Model, inference: Inference) -> NDArray[np.float32] | N
         return inference.scores
     gallery, samples = model.gallery, inference.samples
     scores = gallery.scores(inference.embeddings)
-    return gallery.compared(scores, samples) if gallery.surfaces and samples is not None else scores
+    return gallery.with_evidence(scores, samples) if gallery.surfaces and samples is not None else scores
 
 
 def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:

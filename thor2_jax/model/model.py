@@ -249,8 +249,8 @@ class Model:
         the largest fused probability is scaled.
         """
         others = {name: values for name, values in probabilities.items() if name != EMBEDDING}
-        # The default rule normalizes the embedding's probabilities, whose sum is below 1 because of the distractors.
-        fused = fused_probabilities(others or probabilities, self.rule if others else DEFAULT_RULE)
+        # This rule normalizes the embedding's probabilities, whose sum is below 1 because of the distractors.
+        fused = fused_probabilities(others or probabilities, self.rule if others else "log-mean")
         if self.calibration is None or EMBEDDING not in probabilities:
             return fused
         return self.calibration.calibrated(fused, probabilities[EMBEDDING])

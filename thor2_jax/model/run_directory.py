@@ -58,7 +58,7 @@ __all__ = ["EMBEDDING_FILE", "TrainedRun", "load_run", "save_run", "weights_file
 EMBEDDING_FILE = "embedding.safetensors"
 """File of a run's embedding, which replaces the packaged one."""
 
-INTACT_FILE = "the file of this run; copy the whole run directory"
+EXPECTED_FILE = "the file of this run; copy the whole run directory"
 """What messages about damaged files expect."""
 
 
@@ -152,7 +152,7 @@ def load_run(path: str | Path) -> TrainedRun:
         raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
     if names and not classes:
         raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
-    with decoding(f"model: {path / 'network.npz'} cannot be read", INTACT_FILE):
+    with decoding(f"model: {path / 'network.npz'} cannot be read", EXPECTED_FILE):
         network = colornet.load(path / "network.npz")
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
@@ -206,5 +206,5 @@ def _intact(path: Path, digest: str | bool) -> bytes:
 
 def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
     content = _intact(path, digest)
-    with decoding(f"model: {path} does not fit the classifier", INTACT_FILE):
+    with decoding(f"model: {path} does not fit the classifier", EXPECTED_FILE):
         return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), unpack_arrays(content)[0])

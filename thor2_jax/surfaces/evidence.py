@@ -25,12 +25,12 @@ from thor2_jax.types import PointClouds, matmul
 
 __all__ = [
     "Sample",
-    "compared",
     "compile_comparison",
     "fit_poses",
-    "fit_rows",
     "sample_points",
+    "search_poses",
     "with_evidence",
+    "with_evidence_on_host",
 ]
 
 SAMPLED = 256
@@ -57,9 +57,9 @@ distance, metres, at which points have half of the weight in `fit_poses`. REFINE
 N_COMPARED, GOOD_FIT, NAME_WEIGHTS = 5, 1.5, np.array([-7, 2.7, 1.5, 0], np.float32)
 KNOWN_WEIGHTS, KNOWN_BIAS = np.array([-2.8, 1.5, 1.8, -15], np.float32), np.float32(2.1)
 EXPONENT = np.float32(0.5)
-"""See `with_evidence`. Logistic regressions on rendered views of four runs give similar weights, except the last one of
-`KNOWN_WEIGHTS`, of free space. The other values are from real frames, since the probabilities of the networks depend
-more on the camera than surfaces do."""
+"""See `with_evidence`; the weights are in the order of `search_poses`. Logistic regressions on rendered views of four
+runs give similar weights, except the last one of `KNOWN_WEIGHTS`, of free space. The values other than weights are from
+real frames, since the probabilities of the networks depend more on the camera than surfaces do."""
 
 
 class Sample(NamedTuple):
@@ -70,8 +70,8 @@ class Sample(NamedTuple):
         lab: [B, 3, SAMPLED], smoothed L*a*b* colours.
         rough: [B], roughness, metres.
         rim: [B, SAMPLED] bool, see `PointClouds.rim`.
-        around: [B, G, G, 3], see `PointClouds.around`.
-        is_empty: [B] bool.
+        around: [B, A, A, 3], see `PointClouds.around`.
+        is_skipped: [B] bool: no points, or not compared.
     """
 
     points: jax.Array
@@ -79,7 +79,7 @@ class Sample(NamedTuple):
     rough: jax.Array
     rim: jax.Array
     around: jax.Array
-    is_empty: jax.Array
+    is_skipped: jax.Array
 
 
 def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
@@ -94,19 +94,19 @@ def fit_poses(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -
         class_index: [B] int.
     """
     index = jnp.asarray(class_index)
-    return _refined_poses(surfaces, clouds, index, fit_rows(surfaces, sample_points(clouds), index)[1])
+    return _refined_poses(surfaces, clouds, index, search_poses(surfaces, sample_points(clouds), index)[1])
 
 
 @jax.jit
 def _refined_poses(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array, poses: jax.Array) -> jax.Array:
     def refine(row: tuple[jax.Array, ...]) -> jax.Array:
         points, mask, camera, index, pose = row
-        surface, places = jax.tree.map(lambda field: field[index], surfaces), _homogeneous(points - camera)
+        surface, points = jax.tree.map(lambda field: field[index], surfaces), _homogeneous(points - camera)
 
         def weigh(distance: jax.Array, residual: jax.Array) -> jax.Array:
             return mask * (distance < NEAR) / (1 + jnp.square(residual / SCALE))
 
-        return jax.lax.fori_loop(0, REFINEMENTS, lambda _, pose: _refined(surface, pose, places, weigh), pose[None])[0]
+        return jax.lax.fori_loop(0, REFINEMENTS, lambda _, p: _refined(surface, p, points, weigh), pose[None])[0]
 
     return jax.lax.map(refine, (clouds.points, clouds.mask, clouds.camera, class_index, poses))
 
@@ -134,12 +134,12 @@ def with_evidence(
     def compare(best: jax.Array, name: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         probability, logit, index = name
         is_compared = (probability > 0) & (logit + GOOD_FIT >= best)
-        values, _ = fit_rows(surfaces, samples._replace(is_empty=samples.is_empty | ~is_compared), index)
+        values, _ = search_poses(surfaces, samples._replace(is_skipped=samples.is_skipped | ~is_compared), index)
         return jnp.maximum(best, logit + matmul(values, NAME_WEIGHTS)), (is_compared, values)
 
     _, results = jax.lax.scan(compare, jnp.full_like(logits[:, 0], -jnp.inf), (largest.T, logits.T, index.T))
     is_compared, values = (each.swapaxes(0, 1) for each in results)  # [B, K], [B, K, 4]
-    changed, factor = _changed(largest, probabilities.sum(axis=1), is_compared, values)
+    changed, factor = _probabilities_with(largest, probabilities.sum(axis=1), is_compared, values)
     return jnp.put_along_axis(probabilities, index, changed, axis=1, inplace=False) * factor[:, None]
 
 
@@ -155,12 +155,12 @@ def sample_points(clouds: PointClouds) -> Sample:
         points, colors, mask, rim, camera, around = row
         number, count = jnp.arange(min(len(points), LARGEST)), mask.sum()
         # The order of the points is spatial. Equal steps through it, and multiples of the golden ratio, spread evenly.
-        every = (number * jnp.maximum(count / len(number), 1)).astype(int)
-        points, lab = points[every] - camera, to_lab(colors[every])
+        index = (number * jnp.maximum(count / len(number), 1)).astype(int)
+        points, lab = points[index] - camera, to_lab(colors[index])
         golden = np.arange(1, SAMPLED + 1) * (5**0.5 - 1) / 2 % 1
         chosen = (golden.astype(np.float32) * jnp.minimum(count, len(number))).astype(int)
         described = _describe_neighbourhoods(points[chosen], points, lab, number < count)
-        return Sample(points[chosen], *described, rim[every][chosen], around, count == 0)
+        return Sample(points[chosen], *described, rim[index][chosen], around, count == 0)
 
     around = jnp.zeros((len(clouds.points), 1, 1, 3), jnp.float32) if clouds.around is None else clouds.around
     rim = jnp.zeros(clouds.mask.shape, bool) if clouds.rim is None else clouds.rim
@@ -169,7 +169,7 @@ def sample_points(clouds: PointClouds) -> Sample:
 
 
 @jax.jit
-def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
+def search_poses(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return how well each instance fits a class.
 
     Args:
@@ -189,14 +189,14 @@ def fit_rows(surfaces: Surfaces, samples: Sample, class_index: jax.Array) -> tup
     nothing = jnp.zeros(4, jnp.float32), jnp.zeros((3, 4), jnp.float32)
 
     def of_row(row: tuple[Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return jax.lax.cond(row[0].is_empty, lambda *_: nothing, fit, *row)
+        return jax.lax.cond(row[0].is_skipped, lambda *_: nothing, fit, *row)
 
     # One by one on CPUs, where padding can be skipped, else at once.
     map_rows = functools.partial(jax.lax.map, of_row)
     return jax.lax.platform_dependent((samples, class_index), cpu=map_rows, default=jax.vmap(of_row))
 
 
-def compared(
+def with_evidence_on_host(
     probabilities: NDArray[np.floating], surfaces: Sequence[Surfaces], samples: Sample
 ) -> NDArray[np.floating]:
     """Return probabilities [B, n] on the host, changed as by `with_evidence`, for n surfaces of one class each.
@@ -214,27 +214,27 @@ def compared(
         is_compared[:, k] = (largest[:, k] > 0) & (logits[:, k] + GOOD_FIT >= best)
         rows = np.flatnonzero(is_compared[:, k])
         # All are dispatched before the first result is awaited.
-        fits = [fit_rows(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
+        fits = [search_poses(surfaces[index[row, k]], alone[row], np.zeros(1, int))[0] for row in rows]
         values[rows, k] = np.concatenate([values[:0, k], *fits])
         best[rows] = np.maximum(best[rows], logits[rows, k] + values[rows, k] @ NAME_WEIGHTS)
     arguments = largest, probabilities.sum(axis=1), is_compared, values
     for row in range(len(probabilities)):
-        shares, factor = map(np.asarray, _changed(*(jnp.asarray(each[row : row + 1]) for each in arguments)))
+        shares, factor = map(np.asarray, _probabilities_with(*(jnp.asarray(each[row : row + 1]) for each in arguments)))
         probabilities[row, index[row]] = shares[0]
         probabilities[row] *= factor[0]
     return probabilities[:, : len(surfaces)]
 
 
 def compile_comparison(samples: Sample) -> None:
-    """Compile the programs of `compared`, which do not depend on the number of instances and names."""
-    compared(np.ones((1, 1)) / 2, [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
+    """Compile the programs of `with_evidence_on_host`, which do not depend on the number of instances and names."""
+    with_evidence_on_host(np.ones((1, 1)) / 2, [Surfaces.empty()], jax.tree.map(lambda a: np.asarray(a)[:1], samples))
 
 
 @jax.jit
-def _changed(
+def _probabilities_with(
     largest: jax.Array, total: jax.Array, is_compared: jax.Array, values: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the changed probabilities [B, K] of names that share theirs, and a factor [B] of all probabilities.
+    """Return the probabilities [B, K] with the evidence, and a factor [B] of all probabilities.
 
     Args:
         largest: [B, K], the largest probabilities.

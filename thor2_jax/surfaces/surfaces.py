@@ -95,7 +95,7 @@ class Surfaces:
 
         Args:
             index: the class.
-            pose: [3, 4], from `fit_poses` or `fit_rows`.
+            pose: [3, 4], from `fit_poses` or `search_poses`.
             points: [n, 3], metres, relative to the camera.
 
         Returns:

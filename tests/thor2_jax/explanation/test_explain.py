@@ -30,7 +30,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances,
 from thor2_jax.model.fusion import Calibration
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.surfaces.evidence import fit_rows, sample_points
+from thor2_jax.surfaces.evidence import sample_points, search_poses
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 from training.rendering.camera import camera_pose
@@ -315,7 +315,7 @@ def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Expla
         assert [fit.name for fit in fits] == names[1:]
         assert np.quantile(first.of_points, 0.95) < 0.004 and first.distance < min(fit.distance for fit in others)
         samples = sample_points(pack_instances([instance], 1))
-        of_own = fit_rows(surfaces, samples, jnp.array([CLASSES.index(own)]))[0][0]
+        of_own = search_poses(surfaces, samples, jnp.array([CLASSES.index(own)]))[0][0]
         values = np.log(first.distance), first.chroma, first.lightness, first.free_space
         np.testing.assert_allclose(values, of_own, atol=1e-5)
     recognizer.enroll(own, [(FRAME, 3)], extend=True)  # only its views answer

@@ -19,7 +19,7 @@ from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
 from thor2_jax.gallery.search import ExactSearch, IndexSearch
 from thor2_jax.networks.embedding import BACKGROUND, References
-from thor2_jax.surfaces.evidence import compared, sample_points
+from thor2_jax.surfaces.evidence import sample_points, with_evidence_on_host
 from thor2_jax.types import PointClouds
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
@@ -58,10 +58,10 @@ def test_surfaces_change_the_scores_of_their_objects_only(gallery: Gallery) -> N
     with_surfaces = dataclasses.replace(gallery, objects={**objects, "mug": gallery.objects["mug"]})
     clouds = PointClouds.pack([view_cloud(mesh, camera_pose(0.4, 1.1, mesh.centre)), *random_clouds(0, [500, 0])])
     scores = np.random.default_rng(0).uniform(0.1, 0.3, (3, 3)).astype(np.float32)
-    changed = with_surfaces.compared(scores, sample_points(clouds))
+    changed = with_surfaces.with_evidence(scores, sample_points(clouds))
     np.testing.assert_array_equal(changed[:, 0], scores[:, 0])
     odds = (scores[:, 1:].astype(np.float64) / 0.2) ** 3
-    known = compared(odds / (1 + odds.sum(axis=1, keepdims=True)), [surface] * 2, sample_points(clouds))
+    known = with_evidence_on_host(odds / (1 + odds.sum(axis=1, keepdims=True)), [surface] * 2, sample_points(clouds))
     expected = 0.2 * (known / (1 - known.sum(axis=1, keepdims=True))) ** (1 / 3)
     expected[0] /= expected[0].max()  # it is above 1
     np.testing.assert_allclose(changed[:, 1:], expected, rtol=1e-3)

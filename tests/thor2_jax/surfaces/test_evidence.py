@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from small_clouds import random_clouds
 
-from thor2_jax.model.inference import _with_evidence as in_threads
+from thor2_jax.model.inference import _with_evidence_in_threads as in_threads
 from thor2_jax.surfaces.evidence import (
     REACH,
     SAMPLED,
     Sample,
-    compared,
     fit_poses,
-    fit_rows,
     sample_points,
+    search_poses,
     with_evidence,
+    with_evidence_on_host,
 )
 from thor2_jax.surfaces.surfaces import Surfaces
 from thor2_jax.types import Cloud, PointClouds
@@ -48,7 +48,7 @@ OWN = np.repeat(np.arange(3), 3)
 
 
 def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
-    return fit_rows(surfaces, sample_points(clouds), class_index)[0]
+    return search_poses(surfaces, sample_points(clouds), class_index)[0]
 
 
 def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
@@ -135,7 +135,7 @@ def test_points_off_the_surface_hardly_change_a_pose(
     packed = PointClouds.pack(clouds, camera=np.ones((9, 3), np.float32))
     after, before = (
         [np.median(surfaces.distances(OWN[k], np.asarray(poses[k]), xyz)) for k, (xyz, _) in enumerate(views)]
-        for poses in (fit_poses(surfaces, packed, OWN), fit_rows(surfaces, sample_points(packed), OWN)[1])
+        for poses in (fit_poses(surfaces, packed, OWN), search_poses(surfaces, sample_points(packed), OWN)[1])
     )
     assert max(after) < 0.0008 < np.median(before), (after, before)
 
@@ -206,11 +206,11 @@ def test_accelerators_compare_all_rows_at_once(
     clouds = PointClouds.pack(views)
     expected = np.asarray(evidence(surfaces, clouds, OWN))
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, default: default(*arguments))
-    fit_rows.clear_cache()
+    search_poses.clear_cache()
     try:
         np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
     finally:
-        fit_rows.clear_cache()
+        search_poses.clear_cache()
 
 
 @pytest.mark.parametrize("n_classes", [6, 1])
@@ -251,17 +251,17 @@ def test_names_are_compared_while_they_may_come_first(
 ) -> None:
     """The last name fits best, but comes first only if it is compared."""
 
-    def fit_rows(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
-        return jnp.where(samples.is_empty[:, None], 0, values[index]), None
+    def search_poses(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
+        return jnp.where(samples.is_skipped[:, None], 0, values[index]), None
 
-    monkeypatch.setattr("thor2_jax.surfaces.evidence.fit_rows", fit_rows)
+    monkeypatch.setattr("thor2_jax.surfaces.evidence.search_poses", search_poses)
     probabilities = np.exp(2 * np.array([logits], np.float32))
     probabilities /= 2 * probabilities.sum()
     values = np.zeros((len(fits), 4), np.float32)
     values[:, 2] = np.array(fits) / 1.5  # the weight of the lightness
-    samples = Sample(*[jnp.zeros(1)] * 5, is_empty=jnp.zeros(1, bool))
+    samples = Sample(*[jnp.zeros(1)] * 5, is_skipped=jnp.zeros(1, bool))
     on_device = with_evidence(jnp.asarray(probabilities), jnp.asarray(values), samples)
-    on_host = compared(probabilities, list(jnp.asarray(values)[:, None]), samples)
+    on_host = with_evidence_on_host(probabilities, list(jnp.asarray(values)[:, None]), samples)
     assert on_device.argmax() == on_host.argmax() == first
     np.testing.assert_allclose(on_host, on_device, atol=1e-6)
 
@@ -274,8 +274,8 @@ def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfa
         p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 10)[:, :n].astype(np.float32)
         p[2] = 0
         expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), samples)
-        np.testing.assert_allclose(compared(p, each[:n], samples), expected, atol=1e-5)
-    assert compared(p[:0], each[:1], jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
+        np.testing.assert_allclose(with_evidence_on_host(p, each[:n], samples), expected, atol=1e-5)
+    assert with_evidence_on_host(p[:0], each[:1], jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
 
 
 def test_threads_compare_the_same_rows(surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch) -> None:
