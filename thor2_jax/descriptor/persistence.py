@@ -57,7 +57,7 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
 
 
 def _load_gudhi() -> Any:
-    # gudhi has no wheels for ARM, where the closed form is used.
+    # It is neither on ARM nor in the small installation.
     try:
         return importlib.import_module("gudhi")
     except ModuleNotFoundError:
@@ -79,10 +79,10 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
     if len(strip):
         vertex_at = np.broadcast_to(births, shape).reshape(-1)[strip].astype(np.float64)
         edge_at = np.broadcast_to(edges, shape).reshape(-1)[strip].astype(np.float64)
-        low = np.arange(len(strip), dtype=np.int32) * 2
+        first = np.arange(len(strip), dtype=np.int32) * 2
         tree = _load_gudhi().SimplexTree()
-        tree.insert_batch(np.concatenate([low, low + 1])[None], np.concatenate([vertex_at, vertex_at]))
-        tree.insert_batch(np.stack([low, low + 1]), edge_at)
+        tree.insert_batch(np.concatenate([first, first + 1])[None], np.concatenate([vertex_at, vertex_at]))
+        tree.insert_batch(np.stack([first, first + 1]), edge_at)
         tree.compute_persistence(min_persistence=-1)
         pairs = tree.flag_persistence_generators()[0]  # rows: birth vertex, the death edge's two vertices
         death = strip[pairs[:, 1] // 2]

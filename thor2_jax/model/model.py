@@ -242,7 +242,7 @@ class Model:
             return instance
         return dataclasses.replace(instance, colors=self.color_transform(instance.colors))
 
-    def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
+    def fused(self, probabilities: Mapping[str, NDArray[np.floating[Any]]]) -> NDArray[np.floating[Any]]:
         """Return the fused class probabilities [B, C] of the classifiers.
 
         The embedding is not fused with other classifiers. In a calibrated run, it determines the confidence, to which

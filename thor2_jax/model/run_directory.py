@@ -144,7 +144,7 @@ def load_run(path: str | Path) -> TrainedRun:
     try:
         config = DescriptorConfig.of_record(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
-        # A run with enrolled objects only has neither.
+        # A run with enrolled objects only has no classifiers.
         names = check_features(description["classifiers"]) if description["classifiers"] else ()
         fingerprint = description["color_network"]
         digests = {name: description["weights"][name] for name in names}
@@ -162,8 +162,8 @@ def load_run(path: str | Path) -> TrainedRun:
         classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
     embedding = Embedding.load(file, network) if file.is_file() else None
-    stored = None if embedding is None else embedding.fingerprint
-    if description.get("embedding", stored) != stored:
+    actual = None if embedding is None else embedding.fingerprint
+    if description.get("embedding", actual) != actual:
         raise _unfit(file, "is missing" if embedding is None else "is not the embedding that run.json names")
     if digest := description.get("references"):
         _intact(path / REFERENCES_FILE, digest)

@@ -15,7 +15,7 @@ from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import ObjectGallery
-from thor2_jax.model.fusion import fused_probabilities, with_temperature
+from thor2_jax.model.fusion import with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -119,7 +119,7 @@ def calibrated_confidence(model: Model, recognition: Recognition, inference: Inf
         return None
     probabilities: dict[str, NDArray[np.float32]] = {name: inference.probabilities[name][None] for name in THOR2}
     scaled = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
-    return float(fused_probabilities(scaled)[0, fused_probabilities(probabilities)[0].argmax()])
+    return float(model.fused(scaled)[0, model.fused(probabilities)[0].argmax()])
 
 
 def _details(
