@@ -11,17 +11,17 @@ first look. The points are removed from all looks, whose frames remain those of 
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.stats import spearmanr
 
-from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.descriptor.slicing import RegionSets, region_sets, relaxed_strips, slices_and_strips
-from thor2_jax.explanation.class_scores import ClassScores, repeat_cloud
+from thor2_jax.config import Relaxation
+from thor2_jax.descriptor.slicing import region_sets, relaxed_strips, slices_and_strips
+from thor2_jax.explanation.class_scores import COMPILER_OPTIONS, ClassScores
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
@@ -82,15 +82,19 @@ def select_points(instance: PreparedInstance, kept: NDArray[np.bool_ | np.intp])
     return dataclasses.replace(instance, points=points, colors=colors, boundary=instance.boundary[kept], rim=rim)
 
 
-@partial(jax.jit, static_argnums=3)
-def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    """Return the relaxed strips [T * K, ...] of K looks at a cloud, whose points have weights [T, N]."""
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@jax.grad
+def _gradients(weights: jax.Array, scores: ClassScores, looks: PointClouds, index: int) -> Any:
+    """Return the sum of the margins for T versions of a cloud, from its K looks, whose points have weights [T, N]."""
+    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
 
     def one(cloud: PointClouds, weight: jax.Array) -> Strips:
-        return relaxed_strips(cloud.points.T, cloud.colors, cloud.mask, sets, config, weight)
+        return relaxed_strips(cloud.points.T, cloud.colors, cloud.mask, region_sets(scores.network), config, weight)
 
-    each = jax.lax.map(lambda weight: jax.vmap(one, in_axes=(0, None))(aligned, weight), weights)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each)
+    each = jax.lax.map(lambda weight: jax.vmap(one, in_axes=(0, None))(looks, weight), weights)
+    cut = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each)
+    oriented = scores.describe(scores.repeat(looks, len(weights)), cut, config)
+    return scores.margin(scores.of_descriptors(oriented), index).sum()
 
 
 def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArray[np.float32]:
@@ -101,17 +105,8 @@ def path_gradients(scores: ClassScores, looks: PointClouds, index: int) -> NDArr
         looks: the looks at the instance, see `ClassScores.orient`.
         index: number of the name.
     """
-    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
-    sets = region_sets(scores.network)
-    repeated = repeat_cloud(looks, STEPS)
-
-    def total(weights: jax.Array) -> jax.Array:
-        oriented = scores.describe(repeated, _weighted_strips(looks, weights, sets, config), config)
-        return scores.margin(scores.of_descriptors(oriented), index).sum()
-
-    levels = (1 + (np.arange(STEPS) + 0.5) / STEPS) / 2
-    weights = np.repeat(levels[:, None], looks.mask.shape[1], axis=1)
-    return np.asarray(jax.grad(total)(jnp.asarray(weights, jnp.float32)))
+    levels = ((1 + (np.arange(STEPS) + 0.5) / STEPS) / 2).astype(np.float32)
+    return np.asarray(_gradients(np.repeat(levels[:, None], looks.mask.shape[1], axis=1), scores, looks, index))
 
 
 def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
@@ -149,7 +144,7 @@ def attribute_points(scores: ClassScores, looks: PointClouds, instance: Prepared
     tenths += [rng.choice(n, tenth_of(n), replace=False) for _ in range(RANDOM_TENTHS)]
     rests = [select_points(instance, np.delete(np.arange(n), tenth)) for tenth in tenths]
     exact = scores.of_instances([instance, *rests])
-    margins = np.asarray(scores.margin(jnp.asarray(exact), index))
+    margins = scores.margin(exact, index)
     losses = margins[0] - margins[1:]
     best = int(losses[: len(candidates)].argmax())
     random = float(losses[len(candidates) :].mean())
@@ -191,7 +186,7 @@ def leave_out(scores: ClassScores, looks: PointClouds, index: int, attributions:
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
     cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])
     masks = [np.ones(n, bool), *(slice_of != k for k in used_slices), *(cell_of != k for k in cells)]
-    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(looks, np.array(masks))), index))
+    margins = scores.margin(scores.of_masks(looks, np.array(masks)), index)
     losses = (margins[0] - margins[1:]).astype(np.float32)
 
     slices = np.full(config.n_slices, np.nan, np.float32)

@@ -7,22 +7,22 @@ the smallest change with another answer is searched for: each changed cloud is r
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.capacity import batch_points
+from thor2_jax.config import Relaxation
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks
-from thor2_jax.descriptor.view_normalization import normalization_of
-from thor2_jax.explanation.class_scores import ClassScores, packed
-from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.explanation.class_scores import COMPILER_OPTIONS, ClassScores
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds, matmul
 
-__all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "smallest_change"]
+__all__ = ["CHANGES", "Change", "Kind", "changed_instance", "smallest_change"]
 
 Kind = Literal["color", "extent"]
 CHANGES: tuple[Kind, ...] = ("color", "extent")
@@ -56,22 +56,26 @@ class Change:
         values: the shift of red, green and blue in units of 255, or the factors of the sides, longest first.
         size: length of the shift, in units of 255, or the largest relative change of a side.
         answer: the other answer.
+        instance: the changed instance.
     """
 
     kind: Kind
-    values: tuple[float, float, float]
+    values: tuple[float, ...]
     size: float
     answer: str
+    instance: PreparedInstance
 
 
-@partial(jax.jit, static_argnums=1)
-def _axes(clouds: PointClouds, config: DescriptorConfig) -> jax.Array:
-    """Return the axes [3, 3] of the box of the first cloud of a batch, longest first."""
-    cloud = jax.tree.map(lambda a: a[0], clouds)
-    return normalization_of(cloud, np.float32(config.sigma_s)).rotation
+def _axes(instance: PreparedInstance, aligned: ArrayLike, alpha: float) -> NDArray[np.float64]:
+    """Return the axes [3, 3] of the box of an instance as rows, longest first, from its aligned points [N, 3]."""
+    x, y, z = np.asarray(aligned, np.float64)[: len(instance.points)].T
+    c, s = np.cos(alpha), np.sin(alpha)
+    placed = np.stack([c * x + s * z, y, c * z - s * x])
+    u, _, vt = np.linalg.svd((placed - placed.mean(axis=1, keepdims=True)) @ instance.points)
+    return np.asarray(u @ vt)
 
 
-def _changed(clouds: PointClouds, axes: NDArray[np.float32], parameters: jax.Array) -> PointClouds:
+def _changed(clouds: PointClouds, axes: NDArray[np.float64], parameters: jax.Array) -> PointClouds:
     """Return clouds after both kinds of changes, whose parameters are [2, 3]; so both need the same programs."""
     shift, factors = parameters
     centre = clouds.points.mean(axis=1, keepdims=True, where=clouds.mask[..., None])
@@ -101,30 +105,28 @@ def changed_instance(
     return dataclasses.replace(instance, points=points.astype(np.float32))
 
 
-def apply_change(instance: PreparedInstance, change: Change, config: DescriptorConfig) -> PreparedInstance:
-    """Return an instance after a change from `smallest_change`; `config` is the descriptor's configuration."""
-    values = np.array(change.values)
-    parameters = values / 255 if change.kind == "color" else np.log(values)
-    return changed_instance(instance, change.kind, parameters, np.asarray(_axes(packed(instance), config), np.float64))
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@jax.value_and_grad
+def _lead(parameters: jax.Array, scores: ClassScores, clouds: PointClouds, axes: Any, index: int) -> jax.Array:
+    """Return how far the score of a name exceeds those of all others after changes of a cloud, and the gradient.
+
+    If the only enrolled object is the answer, other names are those of trained classes; then this is its score.
+    """
+    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
+    aligned = aligned_looks(_changed(clouds, axes, parameters), config, scores.count)
+    (values,) = scores.of_descriptors(scores.describe(aligned, strips(aligned, scores.network, config), config))
+    return values[index] - jnp.where(np.arange(len(values)) == index, -np.inf, values).max()
 
 
 def _gradient_directions(
-    scores: ClassScores, clouds: PointClouds, axes: NDArray[np.float32], index: int, kind: Kind
+    scores: ClassScores, clouds: PointClouds, axes: NDArray[np.float64], index: int, kind: Kind
 ) -> NDArray[np.float64]:
     """Return directions [d, 3] of unit length that lead towards another answer."""
-    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
-
-    def lead(parameters: jax.Array) -> jax.Array:
-        aligned = aligned_looks(_changed(clouds, axes, parameters), config, scores.count)
-        oriented = scores.describe(aligned, strips(aligned, scores.network, config), config)
-        values = scores.of_descriptors(oriented)[0]
-        return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()
-
     parameters, path = np.zeros(3), []
     for _ in range(STEPS):
-        both = [parameters * (each == kind) for each in CHANGES]
-        value, gradient = jax.value_and_grad(lead)(jnp.asarray(both, jnp.float32))
-        slope = np.asarray(gradient[CHANGES.index(kind)], np.float64)
+        both = np.array([parameters * (each == kind) for each in CHANGES], np.float32)
+        value, gradient = _lead(both, scores, clouds, axes.astype(np.float32), index)
+        slope = np.asarray(gradient, np.float64)[CHANGES.index(kind)]
         norm = float(np.linalg.norm(slope))
         if not np.isfinite(norm) or norm == 0:
             break
@@ -148,14 +150,11 @@ def smallest_change(
         kind: kind of the change.
 
     Returns:
-        The change; None if there is no other name, or if no change is found up to a shift of 127 of 255 or a factor
-        of 2.
+        The change; None if none is found up to a shift of 127 of 255 or a factor of 2.
     """
-    if len(scores.names) < 2:
-        return None
-    clouds = packed(instance)
-    axes = np.asarray(_axes(clouds, scores.config))
-    directions = _gradient_directions(scores, jax.tree.map(lambda a: a[:1], clouds), axes, index, kind)
+    axes = _axes(instance, scores.orient(instance).points[0], scores.config.alpha)
+    clouds = pack_instances([instance], 1, batch_points([len(instance.points)]))
+    directions = _gradient_directions(scores, clouds, axes, index, kind)
     lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES
 
     def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], str] | None:
@@ -171,5 +170,4 @@ def smallest_change(
     parameters, answer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None]) or changed
     shown = 255 * parameters if kind == "color" else np.exp(parameters)
     size = np.linalg.norm(shown) if kind == "color" else np.abs(shown - 1).max()
-    first, second, third = (float(value) for value in shown)
-    return Change(kind, (first, second, third), float(size), answer)
+    return Change(kind, tuple(shown.tolist()), float(size), answer, changed_instance(instance, kind, parameters, axes))

@@ -6,13 +6,16 @@ the embedding determines only the confidence and is not explained.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from colornet import ColorNetwork
 from thor2_jax.capacity import batch_points
@@ -22,10 +25,9 @@ from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.fusion import fused_probabilities
-from thor2_jax.model.inference import infer
+from thor2_jax.model.fusion import FusionRule, fused_probabilities
 from thor2_jax.model.model import Model
-from thor2_jax.networks.networks import EMBEDDING
+from thor2_jax.networks.networks import EMBEDDING, Classifier
 from thor2_jax.types import PointClouds, Strips, matmul
 
 __all__ = ["ClassScores", "classifier_scores", "gallery_scores"]
@@ -33,52 +35,60 @@ __all__ = ["ClassScores", "classifier_scores", "gallery_scores"]
 ROWS = 8
 """Number of versions of a cloud that are described in one call."""
 
+COMPILER_OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+"""XLA options for gradients, which are then compiled in half of the time and take little longer."""
+
+MIN_VIEWS = 256
+"""Smallest number of enrolled views after padding, which is a power of two."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ClassScores:
     """Scores of all names that an answer can have.
 
     Attributes:
-        names: n names.
         unit: "log-odds": the scores are fused log-probabilities; "similarity": cosines with the nearest enrolled view.
         config: descriptor, in closed form.
         network: colour network of the descriptor.
         count: number K of looks.
-        of_descriptors: function of the descriptors of B clouds, from `describe`, that returns scores [B, n];
-            differentiable.
+        of_descriptors: function of the descriptors of B clouds, from `describe`, that returns scores [B, m], of which
+            the first n belong to the names; differentiable, a pytree.
+        names: n names.
     """
 
-    names: tuple[str, ...]
     unit: Literal["log-odds", "similarity"]
     config: DescriptorConfig
     network: ColorNetwork
     count: int
     of_descriptors: Callable[[LookDescriptors], jax.Array]
+    names: tuple[str, ...] = ()
 
-    def margin(self, scores: jax.Array, index: int) -> jax.Array:
+    def margin(self, scores: Any, index: Any) -> Any:
         """Return the margins [B] of the name `index` from scores [B, n], the quantity that is explained.
 
         For classifiers, the margin is the log-odds log(p / (1 - p)) of the name; for a gallery, it is the difference to
-        the score of the most similar other object. If there is only one name, the margin is its score.
+        the score of the most similar other object. If there is only one name, the margin is its score. NumPy arrays
+        give a NumPy array, and compile nothing.
         """
-        own, others = scores[:, index], jnp.delete(scores, index, axis=1, assume_unique_indices=True)
-        if not others.shape[1]:
-            return own
-        return own - (jax.nn.logsumexp(others, axis=1) if self.unit == "log-odds" else others.max(axis=1))
+        xp, sum_of = (np, logsumexp) if isinstance(scores, np.ndarray) else (jnp, jax.nn.logsumexp)
+        own, n = scores[:, index], scores.shape[1]
+        others = xp.where(np.arange(n) == index, -np.inf if n > 1 else 0, scores)
+        return own - (sum_of(others, axis=1) if self.unit == "log-odds" else others.max(axis=1))
 
     def orient(self, instance: PreparedInstance) -> PointClouds:
         """Return the K looks at an instance, [K, N] aligned clouds, the paper's look first; each has its own mask."""
-        return jax.tree.map(lambda a: a[: self.count], aligned_looks(packed(instance), self.config, self.count))
+        every = aligned_looks(next(packed([instance])), self.config, self.count)
+        return jax.tree.map(lambda a: np.asarray(a)[: self.count], every)
+
+    def repeat(self, looks: PointClouds, times: int = ROWS) -> PointClouds:
+        """Repeat the K looks at a cloud, [K, N] to [times * K, N]."""
+        return jax.tree.map(lambda a: a[None].repeat(times, axis=0).reshape(-1, *a.shape[1:]), looks)
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as in recognition."""
-        capacity = batch_points(len(instance.points) for instance in instances)
-
-        def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
-            clouds = pack_instances(rows, ROWS, capacity)
-            return self._complete(describe_looks(clouds, self.network, self.config, self.count), clouds)
-
-        return self._of_rows(instances, describe)
+        rows = packed(instances)
+        described = (self._complete(describe_looks(row, self.network, self.config, self.count), row) for row in rows)
+        return self._of_rows(described, len(instances))
 
     def of_masks(self, looks: PointClouds, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Return the exact scores [B, n] of parts of a cloud in the frames of the whole cloud.
@@ -87,14 +97,12 @@ class ClassScores:
             looks: [K, N] looks at the cloud, from `orient`.
             masks: [B, n] bool, points of each part.
         """
-        repeated = repeat_cloud(looks, ROWS)
-
-        def describe(rows: NDArray[np.bool_]) -> LookDescriptors:
-            padded = np.pad(rows, ((0, ROWS - len(rows)), (0, repeated.mask.shape[1] - rows.shape[1])))
-            part = dataclasses.replace(repeated, mask=repeated.mask & jnp.repeat(padded, self.count, axis=0))
-            return self.describe(part, strips(part, self.network, self.config), self.config)
-
-        return self._of_rows(masks, describe)
+        repeated, (n_parts, n_points) = self.repeat(looks), masks.shape
+        padded = np.pad(masks, ((0, -n_parts % ROWS), (0, repeated.mask.shape[1] - n_points)))
+        rows = padded.repeat(self.count, axis=0).reshape(-1, *repeated.mask.shape)
+        parts = (dataclasses.replace(repeated, mask=repeated.mask & row) for row in rows)
+        described = (self.describe(part, strips(part, self.network, self.config), self.config) for part in parts)
+        return self._of_rows(described, n_parts)
 
     def describe(self, aligned: PointClouds, cut: Strips, config: DescriptorConfig) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
@@ -105,24 +113,24 @@ class ClassScores:
         """Add what only galleries read: the programs of classifiers are those of recognition without it."""
         return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
 
-    def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
-        """Return the scores [B, n] of items, described `ROWS` at a time."""
-        starts = range(0, max(len(items), 1), ROWS)
-        scores = [np.asarray(self.of_descriptors(describe(items[k : k + ROWS]))) for k in starts]
-        return np.concatenate(scores)[: len(items)]
+    def _of_rows(self, rows: Iterable[LookDescriptors], count: int) -> NDArray[np.float32]:
+        """Return the scores [B, n] of the first B clouds, which are described `ROWS` at a time."""
+        scores = [np.asarray(self.of_descriptors(row)) for row in rows]
+        return np.concatenate(scores)[:count, : len(self.names)]
 
 
-def packed(instance: PreparedInstance) -> PointClouds:
-    """Return an instance as the first of `ROWS` clouds in metres, of which the others are empty.
+# The functions that are compiled for it do not depend on the names.
+jax.tree_util.register_dataclass(ClassScores, ["of_descriptors"], ["unit", "config", "network", "count"], ["names"])
+
+
+def packed(instances: Sequence[PreparedInstance]) -> Iterator[PointClouds]:
+    """Yield instances as batches of `ROWS` clouds in metres; in the last one, empty clouds follow.
 
     Recognition has compiled its programs for this size.
     """
-    return pack_instances([instance], ROWS, batch_points([len(instance.points)]))
-
-
-def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:
-    """Repeat the K looks at a cloud, [K, N] to [times * K, N]."""
-    return jax.tree.map(lambda a: jnp.tile(a, (times,) + (1,) * (a.ndim - 1)), aligned)
+    capacity = batch_points(len(instance.points) for instance in instances)
+    for start in range(0, max(len(instances), 1), ROWS):
+        yield pack_instances(instances[start : start + ROWS], ROWS, capacity)
 
 
 def _checked(config: DescriptorConfig) -> DescriptorConfig:
@@ -146,13 +154,19 @@ def classifier_scores(model: Model) -> ClassScores:
     classes, hidden = model.run.classes, set(model.gallery.hidden)
     columns = np.array([k for k, name in enumerate(classes) if name not in hidden], int)
 
-    def of_descriptors(oriented: LookDescriptors) -> jax.Array:
-        fused = fused_probabilities(infer(model, oriented, classifiers=names).probabilities, model.rule)
+    config = _checked(model.run.config)
+    of_descriptors = Partial(_log_probabilities(model.rule), {name: model.classifiers[name] for name in names}, columns)
+    shown = tuple(classes[k] for k in columns)
+    return ClassScores("log-odds", config, model.run.network, config.looks, of_descriptors, shown)
+
+
+@cache  # so that equal functions are identical, and compile once
+def _log_probabilities(rule: FusionRule) -> Callable[..., jax.Array]:
+    def scores(classifiers: Mapping[str, Classifier], columns: Any, oriented: LookDescriptors) -> jax.Array:
+        fused = fused_probabilities({name: each(oriented) for name, each in classifiers.items()}, rule)
         return jnp.log(jnp.maximum(fused, np.finfo(np.float32).tiny))[:, columns]
 
-    config = _checked(model.run.config)
-    shown = tuple(classes[k] for k in columns)
-    return ClassScores(shown, "log-odds", config, model.run.network, config.looks, of_descriptors)
+    return scores
 
 
 def gallery_scores(model: Model) -> ClassScores:
@@ -166,15 +180,17 @@ def gallery_scores(model: Model) -> ClassScores:
     """
     objects = model.gallery.objects
     embedding, each = model.embedding, [views.embeddings for views in objects.values()]
-    views: Any = jnp.asarray(np.concatenate(each), jnp.float32)
-    ends = np.cumsum([len(one) for one in each])
-
-    def of_descriptors(oriented: LookDescriptors) -> jax.Array:
-        first: LookDescriptors = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
-        cosines = jnp.split(matmul(embedding.embed_oriented(first), views.T), ends[:-1], axis=-1)
-        nearest = jnp.stack([of_object.max(axis=-1) for of_object in cosines], axis=-1)
-        return nearest.mean(axis=1)
-
+    views, owners = np.concatenate(each), np.repeat(np.arange(len(each)), [len(one) for one in each])
+    # The last view is repeated up to one of few sizes, which compile few programs.
+    padded = np.arange(max(MIN_VIEWS, 1 << len(views).bit_length())).clip(max=len(views) - 1)
+    of_descriptors = Partial(_similarities, embedding.embed_described, views[padded].astype(np.float32), owners[padded])
     count = max(model.run.config.looks, LOOKS)  # as `infer`
     config = _checked(embedding.config)
-    return ClassScores(tuple(objects), "similarity", config, embedding.network, count, of_descriptors)
+    return ClassScores("similarity", config, embedding.network, count, of_descriptors, tuple(objects))
+
+
+def _similarities(embed: Any, views: Any, owners: Any, oriented: LookDescriptors) -> jax.Array:
+    embeddings = embed(jax.tree.map(lambda a: a[:, :LOOKS], oriented))
+    cosines = jnp.moveaxis(matmul(embeddings, views.T), -1, 0)
+    nearest = jax.ops.segment_max(cosines, owners, len(owners), indices_are_sorted=True)
+    return jnp.maximum(nearest, -2).mean(axis=-1).T  # finite without views, and less than any cosine

@@ -15,21 +15,18 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.describe import describe_strips, strips
-from thor2_jax.descriptor.persistence import diagrams_of_strips
+from thor2_jax.descriptor.describe import describe_strips, diagrams, strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_points, leave_out
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
-from thor2_jax.explanation.class_scores import ROWS, ClassScores, classifier_scores, gallery_scores, packed
+from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view, pack_instances
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, instance_view
 from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.inference import answers, infer_clouds, object_scores
 from thor2_jax.model.model import Model
@@ -170,10 +167,8 @@ class Explanation:
             "slices": [{"slice": i, "loss": float(loss)} for i, loss in enumerate(left.slices) if np.isfinite(loss)],
             "strips": [{"slice": int(i), "strip": int(j), "loss": float(left.strips[i, j])} for i, j in cells],
             "agreement": left.agreement,
-            "changes": [dataclasses.asdict(change) for change in self.changes],
-            "surfaces": [
-                {key: value for key, value in vars(fit).items() if key != "of_points"} for fit in self.surfaces
-            ],
+            "changes": [{k: v for k, v in vars(change).items() if k != "instance"} for change in self.changes],
+            "surfaces": [{k: v for k, v in vars(fit).items() if k != "of_points"} for fit in self.surfaces],
             "nearest": [{"name": v.name, "view": v.number, "similarity": v.similarity} for v in self.nearest],
             "points": self.instance.points.astype(float).round(5).tolist(),
             "colors": self.instance.colors.tolist(),
@@ -229,7 +224,7 @@ def _parts(
     def recognize(instances: Sequence[PreparedInstance]) -> list[str]:
         return [model.names[best] for best in _recognized(model, instances)[1][:, 0]]
 
-    changes = [smallest_change(scores, recognize, instance, index, kind) for kind in CHANGES]
+    changes = [smallest_change(scores, recognize, instance, index, kind) for kind in CHANGES if len(model.names) > 1]
     yield "changes", tuple(change for change in changes if change is not None)
     yield "described", _described(scores, looks, len(instance.points))
     yield "surfaces", tuple(surface_fits(model, instance, names))
@@ -268,34 +263,32 @@ def _scores(model: Model, by_classifiers: bool) -> ClassScores:
 
 
 def _recognized(model: Model, instances: Sequence[PreparedInstance]) -> tuple[list[Recognition], NDArray[np.intp]]:
-    """Return the answers for instances, described `ROWS` at a time, and their ranked names [B, n], the best first."""
+    """Return the answers for instances, and their ranked names [B, n], the best first."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    capacity = batch_points(len(instance.points) for instance in instances)
-    starts = range(0, max(len(instances), 1), ROWS)
-    rows = [infer_clouds(model, pack_instances(instances[k : k + ROWS], ROWS, capacity)) for k in starts]
+    rows = [infer_clouds(model, clouds) for clouds in packed(instances)]
     inference = jax.tree.map(lambda *arrays: np.concatenate(arrays)[: len(instances)], *rows)
     probabilities = model.combined(inference.probabilities, object_scores(model, inference))
     return answers(model, instances, inference), np.argsort(-probabilities, kind="stable")
 
 
 def _described(scores: ClassScores, looks: PointClouds, n: int) -> DescribedSlices:
-    cut = strips(jax.tree.map(lambda a: a[:1], looks), scores.network, scores.config)
-    diagrams = diagrams_of_strips(cut, scores.config)
+    repeated = scores.repeat(looks)  # recognition has compiled programs for this number
+    cut = strips(repeated, scores.network, scores.config)
     images = describe_strips(cut, scores.network, scores.config).images
-    first = jax.tree.map(lambda a: np.asarray(a[0]), (diagrams, images, cut.color))
-    return DescribedSlices(np.asarray(looks.points[0, :n]), *first)
+    every = diagrams(repeated, scores.config), images, cut.color
+    return DescribedSlices(np.asarray(looks.points)[0, :n], *jax.tree.map(lambda a: np.asarray(a)[0], every))
 
 
 def surface_fits(model: Model, instance: PreparedInstance, names: Sequence[str]) -> Iterator[SurfaceFit]:
     """Yield the comparison with the surfaces of the first `OBJECTS` of the named objects that have one."""
-    samples = jax.tree.map(lambda a: a[:1], sample_points(packed(instance)))
+    samples = sample_points(next(packed([instance])))  # The further rows are empty, and take no time.
     unused = model.run.surfaces if model.answers_by() == "gallery" else None
     known = ((name, found) for name in names if (found := model.surface_of(name)) and found[0] is not unused)
     for name, (surfaces, index) in itertools.islice(known, OBJECTS):
-        (values,), (pose,) = map(np.asarray, search_poses(surfaces, samples, jnp.array([index])))
-        fit, chroma, lightness, free = values.tolist()
-        of_points = surfaces.distances(index, pose, instance.points)
+        values, poses = map(np.asarray, search_poses(surfaces, samples, np.full(len(samples.is_skipped), index)))
+        fit, chroma, lightness, free = values[0].tolist()
+        of_points = surfaces.distances(index, poses[0], instance.points)
         yield SurfaceFit(name, math.exp(fit), chroma, lightness, free, of_points)
 
 

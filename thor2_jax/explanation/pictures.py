@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from thor2_jax import plot
-from thor2_jax.explanation.changes import Change, apply_change
+from thor2_jax.explanation.changes import Change
 from thor2_jax.explanation.explain import Explanation, pixel_attributions
 from thor2_jax.figures import name_style, plain_text
 from thor2_jax.frames.frames import RGBDFrame
@@ -169,7 +169,7 @@ def loss_text(explanation: Explanation, loss: float) -> str:
 def change_text(change: Change) -> str:
     """Return a change in words.
 
-    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl"))
+    >>> change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", None))
     'longest side -10 %, middle side +0 %, shortest side +25 %'
     """
     if change.kind == "color":
@@ -179,11 +179,9 @@ def change_text(change: Change) -> str:
 
 
 def _changes(explanation: Explanation) -> ExplanationPicture:
+    titles = {"color": "other colour", "extent": "other side lengths"}
     shown = [(f"as it is:\n{explanation.name}", explanation.instance)]
-    for change in explanation.changes:
-        title = "other colour" if change.kind == "color" else "other side lengths"
-        changed = apply_change(explanation.instance, change, explanation.config)
-        shown.append((f"{title}:\n{change.answer}", changed))
+    shown += [(f"{titles[change.kind]}:\n{change.answer}", change.instance) for change in explanation.changes]
     figure = _clouds(shown)
     caption = (
         "The smallest changes of the object's colour and of its side lengths that were found to make another name most "

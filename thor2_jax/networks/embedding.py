@@ -239,7 +239,8 @@ class Embedding:
         return _split(self.model)
 
     @functools.cached_property
-    def _embed_looks(self) -> Callable[[LookDescriptors], jax.Array]:
+    def embed_described(self) -> Callable[[LookDescriptors], jax.Array]:
+        """Function from K looks at clouds, `with_balanced`, to embeddings [B, K, D]."""
         return Compiled(_embed_looks, [self._embedder])
 
     def embed(self, clouds: PointClouds) -> jax.Array:
@@ -258,7 +259,7 @@ class Embedding:
         """
         if self.sizes.balanced and clouds is not None:
             oriented = oriented.with_balanced(clouds)
-        return self._embed_looks(oriented)
+        return self.embed_described(oriented)
 
     @functools.cached_property
     def class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:

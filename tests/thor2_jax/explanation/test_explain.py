@@ -18,10 +18,10 @@ from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_ru
 import colornet
 import thor2_jax as thor2
 from thor2_jax import capacity
-from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks, side_lengths
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
 from thor2_jax.explanation import attributions, pictures
-from thor2_jax.explanation.changes import CHANGES, Change, apply_change, changed_instance, smallest_change
+from thor2_jax.explanation.changes import CHANGES, Change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions, surface_fits
 from thor2_jax.explanation.pictures import change_text
@@ -68,7 +68,7 @@ def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig 
         value = score(oriented)
         return jnp.stack([jnp.zeros_like(value), value], axis=1)
 
-    return ClassScores(("plain", "special"), "log-odds", config, NETWORK, config.looks, scores)
+    return ClassScores("log-odds", config, NETWORK, config.looks, jax.tree_util.Partial(scores), ("plain", "special"))
 
 
 @pytest.fixture(autouse=True)
@@ -186,8 +186,7 @@ def test_attributions_are_complete(recognizer: Recognizer, monkeypatch: pytest.M
         cut = jax.vmap(lambda *cloud, w=weights: relaxed_strips(cloud[0].T, *cloud[1:], sets, config, w))
         oriented = scores.describe(aligned, cut(aligned.points, aligned.colors, aligned.mask), config)
         ends.append(float(scores.margin(scores.of_descriptors(oriented), 1)[0]))
-    slope = (ends[1] - ends[0]) / 0.5
-    assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
+    assert gradients.mean(axis=0).sum() == pytest.approx((ends[1] - ends[0]) / 0.5, rel=0.1, abs=0.02)
 
 
 def test_weightless_points_are_left_out() -> None:
@@ -240,10 +239,14 @@ def test_smallest_change_is_smallest_and_confirmed() -> None:
 
     change = smallest_change(scores, best, INSTANCE, 0, "extent")
     assert change is not None and change.answer == "special"
-    less = dataclasses.replace(change, values=tuple(float(v) ** 0.9 for v in change.values))
-    assert best([apply_change(INSTANCE, each, SMALL_CONFIG) for each in (change, less)]) == ["special", "plain"]
+    less = dataclasses.replace(INSTANCE, points=0.1 * INSTANCE.points + 0.9 * change.instance.points)
+    assert best([change.instance, less]) == ["special", "plain"]
+    sides = [side_lengths(scores.orient(each), SMALL_CONFIG.alpha)[0] for each in (INSTANCE, change.instance)]
+    np.testing.assert_allclose(sides[1] / sides[0], change.values, rtol=0.01)
+    alone = dataclasses.replace(scores, names=("plain",))  # as the only enrolled object beside trained classes
+    assert getattr(smallest_change(alone, best, INSTANCE, 0, "extent"), "values", None) == change.values
     for kind in CHANGES:  # recognition gives no other name, whatever the scores are
-        assert smallest_change(scores, lambda instances: ["plain"] * len(instances), INSTANCE, 0, kind) is None
+        assert smallest_change(scores, lambda rows: ["plain"] * len(rows), INSTANCE, 0, kind) is None
 
 
 def test_changed_extents_keep_the_other_sides() -> None:
@@ -254,7 +257,7 @@ def test_changed_extents_keep_the_other_sides() -> None:
     shifted = changed_instance(INSTANCE, "color", np.array([0.1, 0, -1]), axes)
     np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(INSTANCE.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
-    assert " -0 " not in change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl"))
+    assert " -0 " not in change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", INSTANCE))
 
 
 @pytest.mark.slow
@@ -284,8 +287,7 @@ def test_an_explanation_has_its_parts(explanation: Explanation, recognizer: Reco
     row, column = np.argwhere(known)[100]
     depth = FRAME.depth[row, column] / 1000
     point = np.array([(column - 79.5) / 300 * depth, (row - 59.5) / 300 * depth, depth])
-    nearest = np.linalg.norm(instance.points - point, axis=1).argmin()
-    assert painted[row, column] == check.values[nearest]
+    assert painted[row, column] == check.values[np.linalg.norm(instance.points - point, axis=1).argmin()]
 
 
 @pytest.mark.slow
