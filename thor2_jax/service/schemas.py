@@ -307,9 +307,7 @@ _ENROLLMENT: dict[str, Any] = {
 ENROLLMENT_FORM = _form(_ENROLLMENT, "extend", "replace")
 """OpenAPI schema of the body of POST /v1/objects."""
 
-UNDO_FORM = _form(
-    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the response to the change."}}
-)
+UNDO_FORM = _form({"generation": {"type": "integer", "minimum": 0, "description": "Generation after the change."}})
 """OpenAPI schema of the body of POST /v1/objects/undo."""
 
 

@@ -136,7 +136,7 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         else:
             # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
             names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
-            images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
+            images = [file for name in names for start in ("", "*/**/") for file in path.glob(start + name)]
             of_path = []
             for folder in sorted({file.parent for file in images}):
                 name = folder.name if folder == path else folder.relative_to(path).as_posix()
