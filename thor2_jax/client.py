@@ -19,6 +19,7 @@ With `thor2 serve --teach`, clients can enroll and forget objects:
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import ssl
@@ -293,8 +294,12 @@ class Client(_Connection):
 def _coroutine(
     method: Callable[Concatenate[Client, P], T],
 ) -> Callable[Concatenate["AsyncClient", P], Coroutine[Any, Any, T]]:
-    """Return a method of `Client` for `AsyncClient`, where it returns a coroutine because `_send` does."""
-    return cast(Any, method)
+    """Return a method of `Client` as a coroutine of `AsyncClient`, where `_send` is one; errors are raised by await."""
+
+    async def awaited(*args: Any, **kwargs: Any) -> T:
+        return await cast(Any, method(*args, **kwargs))
+
+    return cast(Any, functools.wraps(method)(awaited))
 
 
 class AsyncClient(_Connection):

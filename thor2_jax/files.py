@@ -130,9 +130,10 @@ def has_json(path: Path, keys: Collection[str]) -> bool:
 
 
 def check_writable(directory: Path) -> None:
-    """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
+    """Raise OSError unless a file can be written in a directory, or in the nearest of its parents that exists."""
     existing = next(path for path in (directory, *directory.absolute().parents) if path.is_symlink() or path.exists())
-    tempfile.TemporaryFile(dir=existing).close()
+    with tempfile.TemporaryFile(dir=existing) as file:
+        file.write(bytes(1000))  # fails on a full disk
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from failures import small_disk
 from processes import HANG
 from refusals import assert_refused
 from written_files import killed
@@ -75,17 +76,15 @@ def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     assert_refused("contains .lock, a, marker; expected", check_output_directory, tmp_path)
 
 
-def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(dir: Path) -> None:
-        raise OSError(errno.EROFS, "Read-only file system", str(dir))
-
+def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path) -> None:
+    """A full disk, too, is noticed before the work begins."""
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to(tmp_path / "absent")
     for name in ("file", "file/below", "link", "link/below"):
         assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
     assert_refused("File name too long", check_output_directory, tmp_path / ("x" * 300), "marker")
-    monkeypatch.setattr("tempfile.TemporaryFile", fail)
-    assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*Read-only", check_output_directory, tmp_path / "new" / "deep")
+    with small_disk(500):
+        assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*large", check_output_directory, tmp_path / "new" / "deep")
 
 
 def test_digests_are_those_of_earlier_versions() -> None:

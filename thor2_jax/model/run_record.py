@@ -33,7 +33,8 @@ def read_description(path: Path) -> dict[str, Any]:
     try:
         description = json.loads(read_file(path / RUN_FILE))
     except FileNotFoundError:
-        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
+        fold = "".join(f", such as {run}" for run in run_directories(path)[:1])
+        raise InputError(f"model: {path} is not a run directory; expected one with run.json{fold}") from None
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None

@@ -214,9 +214,9 @@ class Bag:
                 f"bag: {self.path} has {overlap} bytes of images in chunks of the same time; expected at most "
                 f"{MAX_OVERLAPPING}; record it with smaller chunks"
             )
-        if self.is_truncated and not types:
-            raise self._truncation()
         first = {topic: message for topic in images for _, message, _ in itertools.islice(self._messages(topic), 1)}
+        if self.is_truncated and not first:
+            raise self._truncation()
         kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}
         types |= {t: f"{types[t]} without messages" for t in images if t not in first}
         types |= {t: f"{types[t]}, {m.encoding!r}" for t, m in first.items() if hasattr(m, "encoding")}

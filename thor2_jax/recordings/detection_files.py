@@ -7,7 +7,6 @@ with DetectionBag(Path("answers.mcap")) as bag, RerunFile(Path("answers.rrd")) a
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,10 +15,11 @@ from typing import Any, Self
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.files import as_path, check_output_file, errors_name, temporary_directory
+from thor2_jax.files import as_path, check_output_file, check_writable, errors_name, new_directory, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame, encode_image
 from thor2_jax.frames.overlay import annotate, answer_paints
 from thor2_jax.model.recognition import Detection
+from thor2_jax.printable import escape_characters
 from thor2_jax.recordings.messages import detection_array, ros_time
 
 __all__ = ["COMPRESSED_IMAGE", "DetectionBag", "MessageBag", "RerunFile"]
@@ -45,12 +45,6 @@ VISION_MSGS = {
 """Definitions of the messages of vision_msgs 4 (ROS 2 Humble and later) that rosbags does not ship."""
 
 _JPEG_QUALITY = 85
-
-
-def _check_folder(path: Path) -> None:
-    """Raise OSError if a file cannot be written in the folder of `path`; Rerun would wait forever on a full disk."""
-    with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent) as file:
-        file.write(bytes(1000))
 
 
 @contextlib.contextmanager
@@ -95,8 +89,7 @@ class MessageBag:
             topics: topic -> type of its messages.
 
         Raises:
-            InputError: `path` exists or names a ROS 1 bag, or the package rosbags is missing.
-            OSError: the parent directory does not exist or cannot be written.
+            InputError: `path` exists, names a ROS 1 bag or cannot be written, or the package rosbags is missing.
         """
         path = as_path(path, self.argument)
         if path.suffix == ".bag":
@@ -106,7 +99,7 @@ class MessageBag:
             )
         if path.exists() or path.is_symlink():
             raise InputError(f"{self.argument} is {path}, which exists; choose another name")
-        _check_folder(path)
+        check_output_file(self.argument, path, Path.is_file)
         with needs_extra(f"{self.argument} is {path}, which", "rosbags", "bags"):
             self._types = detection_types()
         self._path, self._topics, self._n_messages = path, topics, 0
@@ -117,7 +110,8 @@ class MessageBag:
 
         plugin = StoragePlugin.MCAP if self._path.suffix == ".mcap" else StoragePlugin.SQLITE3
         with _file_errors(self._path), contextlib.ExitStack() as stack:
-            folder = stack.enter_context(temporary_directory(self._path.absolute().parent))
+            stack.enter_context(new_directory(parent := self._path.absolute().parent))
+            folder = stack.enter_context(temporary_directory(parent))
             # ROS 2 names the files of a bag after its directory.
             self._bag = folder / self._path.stem
             self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
@@ -212,15 +206,13 @@ class RerunFile:
         """Check that `path` can be written.
 
         Raises:
-            InputError: the suffix is not .rrd, the file is a recording of another program, or rerun-sdk is missing or
-                disabled.
-            OSError: the parent directory does not exist or cannot be written.
+            InputError: the suffix is not .rrd, the file is a recording of another program or cannot be written, or
+                rerun-sdk is missing or disabled.
         """
         path = as_path(path, "rerun")
         if path.suffix != ".rrd" or path.is_dir():
             raise InputError(f"rerun is {path}; expected a file with the suffix .rrd")
-        _check_folder(path)
-        check_output_file("rerun", path, _is_own)
+        check_output_file("rerun", path, _is_own)  # Rerun would wait forever on a full disk.
         with needs_extra(f"rerun is {path}, which", "rerun-sdk", "rerun"):
             import rerun
         self._rerun: Any = rerun
@@ -233,6 +225,7 @@ class RerunFile:
         """Create a temporary file beside `path`."""
         parent = self.path.absolute().parent
         with errors_name(self.path):
+            self._folder.enter_context(new_directory(parent))
             self._temporary = self._folder.enter_context(temporary_directory(parent)) / self.path.name
         self._recording.save(self._temporary)
         # Camera coordinates are those of OpenCV: x right, y down, z forward.
@@ -244,7 +237,7 @@ class RerunFile:
         with self._folder, _file_errors(self.path):
             self._recording.flush()
             self._recording.disconnect()
-            _check_folder(self.path)  # If the disk is full, Rerun leaves out the end of the file without an error.
+            check_writable(self._temporary.parent)  # On a full disk, Rerun leaves out the end without an error.
             if self.n_frames:
                 self._temporary.chmod(0o644)
                 self._temporary.replace(self.path)
@@ -269,7 +262,7 @@ class RerunFile:
             focal_length=(k.fx, k.fy), principal_point=(k.cx, k.cy), resolution=frame.depth.shape[::-1]
         )
         log("camera", pinhole)
-        log("camera/name", rerun.TextDocument(name))
+        log("camera/name", rerun.TextDocument(escape_characters(name)))
         log("camera/color", rerun.Image(frame.color).compress(jpeg_quality=_JPEG_QUALITY))
         log("camera/depth", rerun.DepthImage(frame.depth_m, meter=1.0))
         if frame.label_image.max() <= _MAX_CLASS:

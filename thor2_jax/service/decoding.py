@@ -264,9 +264,8 @@ def _decode_npz(content: bytes) -> dict[str, NDArray[Any]]:
         entries = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
     except Exception:  # Damaged archives raise many types of exception.
         raise RequestError(422, "body", "The body is not an npz file, or is damaged.") from None
-    for name in names:
-        if name not in entries:
-            raise RequestError(422, name, f"{name} is missing from the npz file.")
+    if missing := [name for name in names if name not in entries]:
+        raise RequestError(422, missing[0], f"{missing[0]} is missing from the npz file.")
     if any(entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for entry in entries.values()):
         raise RequestError(422, "body", "The npz file must be uncompressed or deflated.")
     total = sum(entry.file_size for entry in entries.values())

@@ -51,9 +51,7 @@ class InstanceAnswer(BaseModel):
     classifier: str | None = Field(
         description="Classifier that gives this class the highest probability: tops, tops2 or embedding, or gallery."
     )
-    top: dict[str, list[Candidate]] = Field(
-        description="Five most probable classes of each classifier, and of the gallery."
-    )
+    top: dict[str, list[Candidate]] = Field(description="Five most probable names of each classifier and the gallery.")
     occluded: bool = Field(description="Partly occluded by another instance or cut off by the image border.")
     overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
     points_used: int = Field(description="Number of points of the described cloud.")
@@ -307,9 +305,7 @@ _ENROLLMENT: dict[str, Any] = {
 ENROLLMENT_FORM = _form(_ENROLLMENT, "extend", "replace")
 """OpenAPI schema of the body of POST /v1/objects."""
 
-UNDO_FORM = _form(
-    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the response to the change."}}
-)
+UNDO_FORM = _form({"generation": {"type": "integer", "minimum": 0, "description": "Generation after the change."}})
 """OpenAPI schema of the body of POST /v1/objects/undo."""
 
 

@@ -147,8 +147,7 @@ class LiveView:
 def _order(detection: Detection) -> tuple[bool, int]:
     """Return the sort key of a detection in the list: recognized objects first, then by track or label."""
     answer = detection.recognition
-    track = getattr(answer, "track", None)
-    return answer.name is None, answer.label if track is None else track
+    return answer.name is None, getattr(answer, "track", None) or answer.label
 
 
 def _annotation(answer: Recognition, number: int) -> Annotation:

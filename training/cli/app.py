@@ -234,6 +234,8 @@ def main() -> None:
     sys.unraisablehook = functools.partial(_repeat_interrupt, report)
     try:
         _check_not_empty(sys.argv[1:])
+        home = os.path.expanduser("~/")  # many shells do not replace it in --out=~/x
+        sys.argv = [re.sub("^(--[a-z-]+=)~/", lambda m: m[1] + home, each) for each in sys.argv]
         # If a signal ends this process, the process that then removes the semaphores of its workers would warn of them.
         sys.warnoptions.append("ignore:resource_tracker")
         enable_compilation_cache()

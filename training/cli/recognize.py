@@ -84,7 +84,7 @@ class _Answers:
         check_output_file("bop", given.bop, result_files.is_bop_file)
 
     def write(self, answers: Iterable["FrameAnswer"], classes: Sequence[str]) -> None:
-        """Print and write all answers; the error of a damaged recording says where those before it are."""
+        """Print and write all answers, those before an interrupt, too; an error of a recording says where they are."""
         from thor2_jax.model.result_files import ResultTables
 
         self._tables = ResultTables(self._frames, classes, self._numbers)
@@ -97,7 +97,9 @@ class _Answers:
                 raise
             place = f", written to {self._written}" if self._written else ""
             raise InputError(f"{error}; frames recognized before: {len(self.failures)}{place}") from None
-        self._tables.write(self._given.coco, self._given.bop)
+        finally:
+            if self.failures or self._failed:
+                self._tables.write(self._given.coco, self._given.bop)
 
     def _add(self, answer: "FrameAnswer") -> None:
         from thor2_jax.model.result_files import RESULT_FILES, write_recognitions
@@ -194,8 +196,7 @@ def recognize(
     if pool is not None and (track or not frames):
         reason = "--track, which takes the frames in turn" if track else "one frame"
         raise InputError(
-            f"workers is {processes.workers} and engine is {processes.engine}; they are of no use for {reason}: leave "
-            "them out"
+            f"workers is {processes.workers} and engine is {processes.engine}, of no use for {reason}; leave them out"
         )
     arguments = RecognizerArguments(model, unknown_below, answer_by)
     load = functools.cache(arguments.load)

@@ -113,8 +113,8 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """Find the frames in folders and return them sorted by name; the names are unique.
 
     Args:
-        paths: frame folders, folders that contain frame folders (at any depth) or links to them, and BOP splits or
-            scenes.
+        paths: frame folders, folders that contain frame folders (at any depth) or links to them or to their parents,
+            and BOP splits or scenes. A frame with several names in a folder counts once.
         depth_scale: see `read_frame`.
 
     Raises:
@@ -136,9 +136,10 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         else:
             # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
             names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
-            images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
+            images = [file for name in names for start in ("", "*/**/") for file in path.glob(start + name)]
             of_path = []
-            for folder in sorted({file.parent for file in images}):
+            # A link such as "latest" would add a frame a second time.
+            for folder in sorted({file.parent.resolve(): file.parent for file in sorted(images)[::-1]}.values()):
                 name = folder.name if folder == path else folder.relative_to(path).as_posix()
                 of_path.append((folder, frame_files(folder).source(name, depth_scale)))
         if not of_path:

@@ -52,7 +52,7 @@ def cache_directory(kind: str) -> Path | None:
     if value == "off":
         return None
     try:
-        directory = Path(value) if value else platformdirs.user_cache_path("thor2-jax") / kind
+        directory = Path(value).expanduser() if value else platformdirs.user_cache_path("thor2-jax") / kind
     except RuntimeError:  # a user without a home directory
         return None
     if os.path.exists(directory) and not directory.is_dir():  # False if it cannot be accessed

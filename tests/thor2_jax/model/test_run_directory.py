@@ -113,7 +113,7 @@ def other_embedding(path: Path) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
+    "folds": (lambda path: shutil.copytree(path, path / "fold-0") and (path / "run.json").unlink(), "run/fold-0"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),

@@ -50,14 +50,14 @@ def test_frames_and_detections_are_read_back(reader: Any, tmp_path: Path) -> Non
 
 
 def test_files_without_instances_or_frames(reader: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.rrd"
+    path = tmp_path / "new" / "a.rrd"
     with RerunFile(path):
         pass
     assert list(tmp_path.iterdir()) == []
     for count in (1, 2):  # A recording of this software is replaced.
         with RerunFile(path) as file:
             for _ in range(count):
-                file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="x")
+                file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="\udcff")
     assert read(reader, path)["/camera/name"]["frame"] == [0, 1]
     monkeypatch.setenv("RERUN", "off")
     assert_refused("RERUN", RerunFile, path)
@@ -68,8 +68,6 @@ def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     users.write_bytes(b"RRF2 another program")
     assert_refused(r"rerun is .*a\.rrd", RerunFile, users)
     assert users.read_bytes() == b"RRF2 another program"
-    with pytest.raises(OSError, match="No such file"):
-        RerunFile(tmp_path / "none" / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert_refused(r"\.\[rerun\]", RerunFile, tmp_path / "b.rrd")
 
@@ -84,6 +82,6 @@ def test_a_database_on_a_full_disk_is_named(tmp_path: Path, size: int) -> None:
 
 
 def test_a_full_disk_is_noticed_before_rerun_waits_for_it(reader: Any, tmp_path: Path) -> None:
-    with small_disk(500), pytest.raises(OSError, match="large") as caught:
-        RerunFile(tmp_path / "a.rrd")
-    assert caught.value.filename == str(tmp_path / "a.rrd") and list(tmp_path.iterdir()) == []
+    with small_disk(500):
+        assert_refused(f"rerun: {tmp_path / 'a.rrd'} .*large", RerunFile, tmp_path / "a.rrd")
+    assert list(tmp_path.iterdir()) == []

@@ -53,7 +53,7 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("recognize --model '' f", "--model is empty"),
         ("recognize --model m f --out=", "--out is empty"),
         ("recognize --model m ''", "the argument after m is empty"),
-        ("objects --model=m=", "m= is not a run directory"),
+        ("objects --model=~/m=", f"{Path.home()}/m= is not a run directory"),
         ("train --dataset m --out o --frames", "'--frames' requires an argument"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
         ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
@@ -119,8 +119,7 @@ def test_objects_without_jax_or_all_characters(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "run.json").write_text(json.dumps(description))
     code = (
         "import training.cli, thor2_jax, sys; assert not {'jax', 'scipy'} & {*sys.modules};"
-        "import thor2_jax.service.preparation;"
-        "sys.exitfunc = None\ntry: training.cli.main()\n"
+        "import thor2_jax.service.preparation\ntry: training.cli.main()\n"
         "except SystemExit as end: assert not end.code and 'jax' not in sys.modules"
     )
     done = run_python("-c", code, "objects", "--model", str(tmp_path))
@@ -322,7 +321,8 @@ def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, m
     (tmp_path / "file").touch()
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
     assert_refused("THOR2_CACHE", enable_compilation_cache)
-    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("THOR2_CACHE", "~/elsewhere")
     enable_compilation_cache()
     assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone

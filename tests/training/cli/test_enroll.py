@@ -21,7 +21,7 @@ from written_files import files_of
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 from training.enrollment import enroll_objects
-from training.readers.frames import FrameFolder, find_frames
+from training.readers.frames import FrameFolder
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
@@ -259,8 +259,7 @@ def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path,
     def create(*_: object) -> None:
         shutil.copytree(model, tmp_path / "other", dirs_exist_ok=True)
 
-    folder = FrameFolder(find_frames([frames]))
-    assert_refused("created by another", enroll_objects, tmp_path / "other", folder, progress=create)
+    assert_refused("created by another", enroll_objects, tmp_path / "other", FrameFolder(frames), progress=create)
     assert files_of(tmp_path / "other") == files_of(model)
 
 
