@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError, decoding
-from thor2_jax.files import remove_written
+from thor2_jax.files import locked, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines import cloud_baselines as clouds
 from training.baselines import image_baselines as images
@@ -109,7 +109,7 @@ def train_baselines(
     Raises:
         InputError: `path` is not a run directory; the run was trained on other views; a baseline cannot be trained on
             them; `weights` lacks a file or has a file of another architecture; or a network of the run was trained
-            without these weights.
+            without these weights; or another process is training a baseline.
         OSError: a file cannot be written.
     """
     for directory in find_run_directories([Path(path)]):
@@ -121,17 +121,18 @@ def train_baselines(
             )
         shown = progress if run.record["folds"] == 1 else add_prefix(progress, f"fold {run.record['fold']}")
         for name in names:
-            file = baseline_file(directory, name)
+            file, task = baseline_file(directory, name), FitTask(name, source, run, directory, weights, shown)
             if not file.is_file():
-                task, start = FitTask(name, source, run, directory, weights, shown), time.perf_counter()
-                _METHODS[name][0](task).write(file, run.classes, time.perf_counter() - start)
-                # Checkpoints, including those of earlier versions.
-                remove_written(task.scratch, r"[^/]+/[0-9]+(\.safetensors|/.*)")
-            elif weights is not None and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
+                with locked(task.scratch):
+                    start = time.perf_counter()
+                    _METHODS[name][0](task).write(file, run.classes, time.perf_counter() - start)
+            elif weights and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
                 raise InputError(
                     f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
                     "or leave out weights"
                 )
+            # Checkpoints, including those of earlier versions and those of a process that was killed here.
+            remove_written(task.scratch, r"\.lock", r"[^/]+/[0-9]+(\.safetensors|/.*)")
 
 
 def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
@@ -141,11 +142,10 @@ def load_baselines(path: Path, run: TrainedRun) -> dict[str, TrainedBaseline]:
         InputError: a file is damaged or does not match the run.
     """
     loaded = {}
-    for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
-        if not file.is_file():
-            continue
-        stored = StoredBaseline.read(file, run.classes)
-        with decoding(f"model: {file} does not match its run", advice="delete it and train the baseline again"):
-            predict = _METHODS[name][1](stored.arrays, run)
-        loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
+    for name in BASELINES:
+        if (file := baseline_file(path, name)).is_file():
+            stored = StoredBaseline.read(file, run.classes)
+            with decoding(f"model: {file} does not match its run", advice="delete it and train the baseline again"):
+                predict = _METHODS[name][1](stored.arrays, run)
+            loaded[name] = TrainedBaseline(predict, stored.temperature, stored.weights)
     return loaded

@@ -99,6 +99,9 @@ def check_depth(
     extents = instance_extents(frame) if labelled and trust_camera else {}
     median = float(np.median(valid))
     own = {label: mesh_sides[name] for label, name in names.items() if label in extents and name in mesh_sides}
+    if not own and len(set(names.values())) > len(mesh_sides) > 0:
+        mesh_sides = {}  # of other objects
+        diagnosis.notes.append("meshes: of no object in labels.json, so the sizes of the objects were not compared")
     compared, sides = [extents[label] for label in own or extents], [*(own or mesh_sides).values()]
     if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, compared, sides, bool(own)):
         return

@@ -122,10 +122,11 @@ def answer_texts(report: Mapping[str, Any]) -> list[str]:
     without = counts["known"] - counts["correct"] - counts["wrong"]
     # The runs of sequences have no threshold.
     of = "without rejection" if report["rejection"]["threshold"]["mean"] is None else "of thor2 recognize"
+    models = f", summed over {n} models" if (n := len(report["runs"])) > 1 else ""
     texts = [
         f"Accuracy of the answers {of}: {counts['correct'] / counts['known']:.3f}. "
         f"Of {counts['known']:,} instances of known objects, {counts['correct']:,} are recognized correctly, "
-        f"{counts['wrong']:,} get a wrong name and {without:,} get no name.",
+        f"{counts['wrong']:,} get a wrong name and {without:,} get no name{models}.",
         f"Unknown objects: {counts['unknown_named']:,} of {counts['unknown']:,} instances get a name."
         if counts["unknown"]
         else "The dataset has no unknown objects, so it does not show whether they are rejected.",
@@ -140,8 +141,7 @@ def _answer_section(report: Mapping[str, Any], out: Path) -> Section:
         truth, name = f"{pair['truth']}{'' if pair['known'] else ' (unknown object)'}", pair["answer"]
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
         shown.append(Picture(f"confusions/{k}.jpg", f"{truth}, recognized as {name}", "small"))
-    models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
-    text = " ".join(answer_texts(report)[:2]) + models
+    text = " ".join(answer_texts(report)[:2])
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
     draw_confusion(np.array(report["confusion"]), report["classes"], report["main"], out / "confusion.png")
     caption = f"Confusion matrix of {report['main']} without rejection, summed over all models."

@@ -166,16 +166,11 @@ def load_runs(paths: Sequence[Path], frames: Sequence[str] | None = None) -> Seq
 
 
 def _check_same_descriptor(run: Run, first: Run, directory: Path, first_directory: Path) -> None:
-    a, b = run.model.run, first.model.run
-    if a.config != b.config or a.network.fingerprint != b.network.fingerprint:
-        raise InputError(
-            f"model: {first_directory} and {directory} have different descriptors or colour networks; "
-            "evaluate them separately"
-        )
-    if run.model.color_transform != first.model.color_transform:
-        raise InputError(
-            f"model: {first_directory} and {directory} are adapted to different cameras; evaluate them separately"
-        )
+    a, b = run.model, first.model
+    is_same = a.run.config == b.run.config and a.run.network.fingerprint == b.run.network.fingerprint
+    if not is_same or a.color_transform != b.color_transform:
+        reason = "are adapted to different cameras" if is_same else "have different descriptors or colour networks"
+        raise InputError(f"model: {first_directory} and {directory} {reason}; evaluate them separately")
 
 
 def all_predictors(runs: Sequence[Run]) -> tuple[tuple[int, str], ...]:

@@ -77,15 +77,15 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
-    if visual.kind == "vertex":
+    if visual.kind in ("vertex", "face"):
         ply = geometry.metadata.get("_ply_raw")
-        stored = [] if ply is None else [ply["vertex"]["data"][name] for name in ("red", "green", "blue")]
+        stored = [] if ply is None else [ply[visual.kind]["data"][name] for name in ("red", "green", "blue")]
         if any(each.dtype.kind == "f" and each.max() > 1 for each in stored):
             raise InputError("its colours cannot be read, which are floats above 1; expected 0 to 1, or integers")
-        return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
-    if visual.kind == "face":
-        colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
-        return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
+        colors = visual.vertex_colors[faces] if visual.kind == "vertex" else visual.face_colors[:, None].repeat(3, 1)
+        if len(colors) != len(faces):
+            raise InputError("colours of polygons, which cannot be assigned to triangles; triangulate the mesh")
+        return TexturedMesh(vertices, faces, corner_colors=np.asarray(colors, np.uint8)[..., :3])
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours; export the mesh with its colours")
     uv, texture = _texture(visual, faces)

@@ -131,6 +131,7 @@ def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
     assert_found("depth-unit", check_depth, near, sides | {"pin": side / 10}, names)
     longest = max(sides, key=lambda name: sides[name])  # is not compared with the objects without a mesh
     assert_found("", check_depth, frame, {longest: sides[longest], "other": side}, names)
+    assert assert_found("", check_depth, frame, {"other": side / 3}, names).notes
     assert_found("", check_depth, frame, {"pin": 0.01}, trust_camera=False)
 
 
