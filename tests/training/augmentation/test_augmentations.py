@@ -11,6 +11,7 @@ from rendered_objects import full_image
 from scipy.ndimage import binary_dilation, distance_transform_cdt
 from scipy.special import ndtr
 
+from thor2_jax.files import json_digest
 from thor2_jax.frames.frames import backproject
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.masks import Base, Occlusion, Segmentation, _silhouettes
@@ -49,6 +50,8 @@ def test_the_record_is_json_and_no_augmentation_changes_nothing() -> None:
     record = on.record()
     assert record == json.loads(json.dumps(record)) and set(record) == {*AUGMENTATIONS, "copies"}
     assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.7]
+    # With other defaults, views and trainings that users have could not be resumed.
+    assert json_digest(Augmentations.of_names(KINDS).record())[:16] == "8e559ff909f28997"
     for copies in (0, 1001):
         assert_refused(f"^copies is {copies}", Augmentations, copies=copies)
 
@@ -100,23 +103,22 @@ def test_all_objects_from_all_sides() -> None:
 def test_a_view_most_of_whose_pixels_fly_keeps_them() -> None:
     steep = flat_view(np.tile(1000 + 40 * np.arange(60, dtype=np.uint16), (60, 1)))
     assert same(augmented_view(steep, 0, segmentation=Segmentation(pixels=(0, 0))), steep)
+    step = flat_view(np.tile(np.array([1000, 1000, 1000, 1000, 1030, 1060, 1060, 1060], np.uint16), (60, 1)))
+    kept = augmented_view(step, 0, segmentation=Segmentation(pixels=(0, 0))).depth > 0
+    assert not kept[:, 4:6].any() and kept[:, [0, 1, 2, 3, 6, 7]].all()
 
 
 # Illumination.
 
 
 def test_gain_and_cast() -> None:
+    """Repeats the draws: the gain is the second of six numbers before the cast of each channel."""
     view, light = flat_view(wall(), (120, 100, 80)), dataclasses.replace(NO_LIGHT, gain=(0.4, 1.6), cast=0.1)
-    colors = np.array([augmented_view(view, seed, illumination=light).color for seed in range(300)])
-    assert np.array_equal(colors, np.broadcast_to(colors[:, :1, :1], colors.shape))
-    ratios_to_input = colors[:, 0, 0] / np.array([120, 100, 80])
-    gain = ratios_to_input.mean(axis=1)
-    assert 0.36 < gain.min() < 0.5 and 1.5 < gain.max() < 1.76 and gain.mean() == pytest.approx(1.0, abs=0.06)
-    # Ratios of channels do not depend on the gain; they are (1 + a) / (1 + b) with a and b uniform within 0.1.
-    ratio = ratios_to_input[:, 0] / ratios_to_input[:, 2]
-    assert 0.9 / 1.1 - 0.03 < ratio.min() < 0.87 and 1.13 < ratio.max() < 1.1 / 0.9 + 0.03
-    expected = np.random.default_rng(0).uniform(0.9, 1.1, (2, 100_000))
-    assert ratio.std() == pytest.approx((expected[0] / expected[1]).std(), rel=0.12)
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        color = (0.4 + 1.2 * rng.random(6)[1]) * rng.uniform(0.9, 1.1, 3) * (120, 100, 80)
+        augmented = augmented_view(view, seed, illumination=light).color
+        np.testing.assert_allclose(augmented, np.broadcast_to(color, augmented.shape), atol=0.51)
 
 
 def test_the_order_of_illumination_steps() -> None:
@@ -144,7 +146,6 @@ def test_shading_follows_normals() -> None:
     rise = 0.8 * 1500 / 1099 * np.abs(np.arange(120) - 59.5)
     depth = np.rint(np.tile(1500 + rise + 300 * (np.arange(120) > 59), (100, 1))).astype(np.uint16)
     normals = np.array([[-0.8, 0, -1], [0.8, 0, -1]]) / np.hypot(0.8, 1)
-    ratios = []
     for seed in range(20):
         color = augmented_view(flat_view(depth), seed, illumination=light).color[:, :, 0].astype(float) / 100
         left, right = color[10:-10, 10:50].mean(), color[10:-10, 70:110].mean()
@@ -157,10 +158,6 @@ def test_shading_follows_normals() -> None:
         direction[2] = -abs(direction[2])
         lit = (normals @ (direction / np.linalg.norm(direction))).clip(0)
         assert left - right == pytest.approx(lit[0] - lit[1], abs=0.08)
-        ratios.append(left - right)
-    assert min(ratios) < -0.2 and max(ratios) > 0.2
-    plain = augmented_view(flat_view(wall()), 0, illumination=light).color
-    assert np.abs(plain.astype(int) - 100).max() <= 1
 
 
 # Occlusion.
@@ -182,31 +179,21 @@ def test_occluded_share(straight: float) -> None:
         assert np.mean(shares) == pytest.approx(0.35, abs=0.06)
 
 
-def test_share_of_views_without_occlusion() -> None:
-    rng, augmentations = np.random.default_rng(0), Augmentations(occlusion=Occlusion(none=0.4))
-    occluded = [not same(augment(MUG, augmentations, rng), MUG) for _ in range(600)]
-    assert np.mean(occluded) == pytest.approx(0.6, abs=0.06)
-
-
 def test_edges_are_straight_or_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A half-plane separates occluded from visible pixels by a line; a silhouette seldom does, and keeps its shape."""
+    """A half-plane separates occluded from visible pixels by a line, and a silhouette keeps its shape."""
     disc = np.hypot(*(np.indices((161, 161)) - 80)) < 78
     view = flat_view(np.where(disc, 1500, 0).astype(np.uint16))
     places = np.argwhere(disc) - 80.0
-
-    def separated_by_a_line(seed: int, straight: float) -> bool:
-        augmented = augmented_view(view, seed, occlusion=Occlusion(share=(0.3, 0.4), none=0, straight=straight))
+    for seed in range(20):
+        augmented = augmented_view(view, seed, occlusion=Occlusion(share=(0.3, 0.4), none=0, straight=1))
         hidden = augmented.depth[disc] == 0
         direction = places[hidden].mean(axis=0)
         along = places @ direction / np.linalg.norm(direction)
-        return bool(along[hidden].min() > along[~hidden].max() - 3)
-
-    assert all(separated_by_a_line(seed, 1.0) for seed in range(20))
-    assert sum(separated_by_a_line(seed, 0.0) for seed in range(40)) < 20
+        assert along[hidden].min() > along[~hidden].max() - 3
     monkeypatch.setattr("training.augmentation.masks._silhouettes", lambda: [disc[::3, ::3]])
-    occluded = augmented_view(view, 0, occlusion=Occlusion((0.23, 0.24), none=0, straight=0, nearer=(1, 1)))
+    occluded = augmented_view(view, 0, occlusion=Occlusion((0.33, 0.35), none=0, straight=0, nearer=(1.2, 1.2)))
     spread = np.linalg.eigvalsh(np.cov(places[occluded.depth[disc] == 0].T)) ** 0.5
-    assert spread == pytest.approx([26 * 2 / 1.365 / 2] * 2, rel=0.05)  # a disc of 26 pixels of 2 mm
+    assert spread == pytest.approx([1.2 * 26 * 2 / 1.365 / 2] * 2, rel=0.05)  # a disc of 26 pixels of 2 mm, nearer
 
 
 def test_silhouettes_are_those_of_the_built_in_objects() -> None:
@@ -242,17 +229,17 @@ def test_erosion(name: str, steps: int) -> None:
 @pytest.mark.parametrize("steps", [1, 2, 4])
 def test_dilation(steps: int) -> None:
     """A dilated mask on a touching background is filled with one colour, also beyond the border of the view."""
-    view = flat_view(wall(size=40))
+    view = dataclasses.replace(flat_view(wall(size=40)), corner=(steps - 1, 300))  # near the border of the image
     pixels = steps * 1.5 / 1.099
     augmented = augmented_view(view, 3, segmentation=Segmentation(pixels=(pixels, pixels), tilt=(0, 0), touching=1))
-    expected = binary_dilation(np.pad(wall(size=40) > 0, steps), iterations=steps)
+    expected = binary_dilation(np.pad(wall(size=40) > 0, steps), iterations=steps)[1:]
     assert np.array_equal(augmented.depth > 0, expected) and set(np.unique(augmented.depth)) == {0, 1500}
-    assert augmented.corner == (200 - steps, 300 - steps)
-    added = augmented.color[expected & ~np.pad(wall(size=40) > 0, steps)]
-    assert len(np.unique(added, axis=0)) == 1
+    assert augmented.corner == (0, 300 - steps)
+    added = augmented.color[expected & ~np.pad(wall(size=40) > 0, steps)[1:]]
+    assert len(np.unique(added, axis=0)) == 1 and (added != 100).all()
     # Points of the object do not move.
     at = [backproject(v.depth / 1000, v.intrinsics) for v in (view, augmented)]
-    np.testing.assert_allclose(at[1][steps:-steps, steps:-steps], at[0], atol=1e-12)
+    np.testing.assert_allclose(at[1][steps - 1 : -steps, steps:-steps], at[0], atol=1e-12)
     # Background within 2 cm remains; what is farther away is removed, as recognition does.
     for gap, remaining in ((0.018, expected.sum()), (0.022, 40 * 40)):
         settings = Segmentation(pixels=(pixels, pixels), tilt=(0, 0), touching=0, gap=(gap, gap))
@@ -281,24 +268,25 @@ def test_the_background_is_a_plane_behind_the_object() -> None:
 
 
 def test_colors_are_shifted_and_the_background_shows_at_the_outline() -> None:
-    view = flat_view(wall(), f=1500.0)  # pixels are 1 mm wide, as in a real frame
-    view.color[:, 30:] = (200, 50, 25)
-    shifts = set()
+    view = flat_view(wall(margin=4), f=1500.0)  # pixels are 1 mm wide, as in a real frame
+    view.color[4:-4, 34:-4] = (200, 50, 25)
+    shifts, colors = set(), []
     for seed in range(60):
         result = augmented_view(view, seed, registration=Registration(shifted=1, shift=4, **NO_BLUR))
         assert np.array_equal(result.depth, view.depth)
-        shifts.add(np.flatnonzero((result.color[30, 10:50] == (200, 50, 25)).all(axis=1))[0] - 20)
-        assert 2 <= len(np.unique(result.color.reshape(-1, 3), axis=0)) <= 3
-    assert shifts == set(range(-4, 5))
+        shifts.add(np.flatnonzero((result.color[34, 14:54] == (200, 50, 25)).all(axis=1))[0] - 20)
+        colors.append(np.unique(result.color[view.depth > 0], axis=0))
+        assert 2 <= len(colors[-1]) <= 3
+    assert shifts == set(range(-4, 5)) and len(np.unique(np.concatenate(colors), axis=0)) > 50
 
 
 def test_blur_keeps_a_uniform_color() -> None:
-    view = flat_view(wall(margin=9), f=1500.0)
+    view = flat_view(wall(margin=9), (160, 80, 100), f=1500.0)
     result = augmented_view(view, 0, registration=Registration(shifted=0, blur=(3, 3)))
     np.testing.assert_allclose(result.color, view.color, atol=1)
     view.color[39, 39] = 255
     result = augmented_view(view, 0, registration=Registration(shifted=0, blur=(3, 3)))
-    assert 100 < result.color[39, 39, 0] < 110
+    assert 80 < result.color[39, 39, 1] < 90
 
 
 def test_colour_differences_are_blurred_and_luma_stays() -> None:
@@ -317,17 +305,10 @@ def test_colour_differences_are_blurred_and_luma_stays() -> None:
 
 
 def test_the_lowest_1_cm_is_removed() -> None:
-    for seed in range(5):
-        result = augmented_view(MUG, seed, base=Base(missing=1, height=(0.01, 0.01), upright=1))
-        points = backproject(MUG.depth / 1000, MUG.intrinsics) @ MUG.pose[:3, :3].T + MUG.pose[:3, 3]
-        z = points[..., 2] - points[..., 2][MUG.depth > 0].min()
-        # The depth is rounded to 1 mm.
-        assert not result.depth[(z < 0.008) & (MUG.depth > 0)].any()
-        kept = (z > 0.012) & (MUG.depth > 0)
-        assert np.array_equal(result.depth[kept], MUG.depth[kept])
-
-
-def test_flat_objects_keep_their_base() -> None:
-    plate = view_of("white_plate", polar=0.1)
-    assert same(augmented_view(plate, 0, base=Base(missing=1, height=(0.1, 0.1), upright=1)), plate)
-    assert same(augmented_view(MUG, 0, base=Base(missing=0)), MUG)
+    result = augmented_view(MUG, 0, base=Base(missing=1, height=(0.01, 0.01), upright=1))
+    points = backproject(MUG.depth / 1000, MUG.intrinsics) @ MUG.pose[:3, :3].T + MUG.pose[:3, 3]
+    z = points[..., 2] - points[..., 2][MUG.depth > 0].min()
+    # The depth is rounded to 1 mm.
+    assert not result.depth[(z < 0.008) & (MUG.depth > 0)].any()
+    kept = (z > 0.012) & (MUG.depth > 0)
+    assert np.array_equal(result.depth[kept], MUG.depth[kept])

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
 from failures import Interrupted
@@ -18,7 +19,7 @@ from small_runs import SMALL_CONFIG
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import describe_aligned_looks
+from thor2_jax.descriptor.looks import N_SCALARS, describe_aligned_looks, is_color
 from thor2_jax.networks.embedding import REFERENCES_FILE, Embedding
 from thor2_jax.networks.networks import EmbeddingSizes, model_arrays
 from training.embedding import build, fit
@@ -26,6 +27,7 @@ from training.embedding import distractors as module
 from training.embedding.build import build_embedding
 from training.embedding.distractors import render_clouds, sample_objects
 from training.embedding.fit import fit_embedding
+from training.fitting.fit import network_step
 from training.fitting.loop import Checkpoints
 from training.fitting.samples import Samples, describe_batch
 from training.storage.jobs import save_arrays
@@ -77,12 +79,6 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
         oriented = describe_aligned_looks(aligned, described, NETWORK, embedding.config, 1)
         similarity.append((actual * embedding.embed_oriented(oriented, aligned)[:, 0]).sum(axis=1))
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
-
-
-def test_a_selection_has_the_samples_in_its_order(views: Samples) -> None:
-    rows = np.array([5, 0, 5])
-    chosen, batch = views.select(rows), views.take(rows, NETWORK, SMALL_CONFIG)
-    np.testing.assert_equal(chosen.take(np.arange(3), NETWORK, SMALL_CONFIG), batch)
 
 
 def test_samples_depend_on_neither_workers_nor_interruptions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -140,17 +136,31 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
 
 
 def test_further_networks_keep_the_first(views: Samples, fitted: tuple[Embedding, list[Any]], tmp_path: Path) -> None:
-    done = []
-    show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
+    """Each step has other samples, .12 is subtracted from the cosine of a label, and the second reads no colours."""
+
+    def with_margin(graph: Any, state: Any, optimizer: Any, label: Any, outputs_of: Callable[[Any], Any]) -> Any:
+        logits, cosines = outputs_of(nnx.merge(graph, state.params, state.rest, copy=True))
+        error = cosines - logits / jax.numpy.exp(state.params["log_scale"][...]) - 0.12 * jax.nn.one_hot(label, 8)
+        after, (_, accuracy) = network_step(graph, state, optimizer, label, outputs_of)
+        return after, (abs(error).max(), accuracy)
+
+    progress = list[Any]()
+    show = lambda *numbers: progress.append(numbers)  # noqa: E731
+    fit_two = functools.partial(fit_embedding, views, NETWORK, SMALL_CONFIG, EPOCHS, Checkpoints(tmp_path), SIZES, show)
     programs = fit._step._cache_size()
-    two = fit_embedding(views, NETWORK, SMALL_CONFIG, EPOCHS, Checkpoints(tmp_path), SIZES, show, CLASSES, networks=2)
-    assert fit._step._cache_size() == programs + 1  # all steps share one
-    assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
-    (second,) = two.further
+    with mock.patch.multiple(fit, _step=mock.Mock(wraps=fit._step), network_step=with_margin):
+        two = fit_two(CLASSES, networks=2)
+        assert fit._step._cache_size() == programs + 1  # all steps share one
+        assert len({call.args[5].length.tobytes() for call in fit._step.call_args_list}) == 36
+    assert [numbers[:2] for numbers in progress] == [(3 * epoch, 36) for epoch in range(1, 13)]
+    assert max(metrics.loss for *_, metrics in progress) < 1e-5
     assert dataclasses.replace(two, further=()).fingerprint == fitted[0].fingerprint
     np.testing.assert_equal(model_arrays(two.model), model_arrays(fitted[0].model))
-    assert second.proxies[...].shape == two.model.proxies[...].shape
-    assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
+    assert np.abs(two.further[0].proxies[...] - two.model.proxies[...]).max() > 0.1
+    colors = np.flatnonzero(is_color(NETWORK.n_regions)) - N_SCALARS - NETWORK.n_regions
+    untrained = Embedding.create(SMALL_CONFIG, NETWORK, SIZES, 0, CLASSES, 6).model
+    initial, first, second = (each.layers[0].kernel[...][colors] for each in (untrained, two.model, *two.further))
+    assert np.ptp(first / initial) > 0.1 and not second.any()
 
 
 def test_few_samples_and_invisible_objects(views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

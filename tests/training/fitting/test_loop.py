@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from failures import small_disk
 from refusals import assert_refused
+from written_files import files_of
 
 from colornet import files
 from training.fitting.loop import Checkpoints
@@ -24,12 +25,7 @@ def state(seed: int, size: int = 100) -> dict[str, Any]:
     return {"weights": weights, "count": jnp.int32(seed), "key": jnp.asarray([seed], jnp.uint32)}
 
 
-def assert_equal(a: Any, b: Any) -> None:
-    jax.tree.map(functools.partial(np.testing.assert_array_equal, strict=True), a, b)
-
-
-def epochs(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
+assert_equal = functools.partial(jax.tree.map, functools.partial(np.testing.assert_array_equal, strict=True))
 
 
 def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
@@ -39,7 +35,7 @@ def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
     assert_equal(checkpoints.last(state(0)), state(0))
     for epoch, score in enumerate((-3.0, 0.9, 0.9, -0.3), 1):
         checkpoints.save(epoch, state(epoch), score)
-    assert epochs(tmp_path / "c") == {"3.safetensors", "4.safetensors"}
+    assert files_of(tmp_path / "c").keys() == {"3.safetensors", "4.safetensors"}
     (tmp_path / "c" / "notes.txt").touch()
     (tmp_path / "c" / ".thor2-x").mkdir()
     (tmp_path / "c" / ".thor2-x" / ".thor2").write_bytes(files._MARKER_TEXT)
@@ -50,7 +46,7 @@ def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
     assert_refused("checkpoint: ", checkpoints.last, state(0, 99))  # has another shape
     checkpoints.save(5, state(5), 0.95)
     assert (checkpoints.last_epoch, checkpoints.best_epoch) == (5, 5)
-    assert epochs(tmp_path / "c") == {"5.safetensors", "notes.txt"}
+    assert files_of(tmp_path / "c").keys() == {"5.safetensors", "notes.txt"}
 
 
 def test_arrays_of_any_order_are_restored(tmp_path: Path) -> None:
@@ -66,7 +62,8 @@ def test_the_last_checkpoint_survives_a_full_disk(tmp_path: Path) -> None:
     with small_disk(1000), pytest.raises(OSError, match="too large") as caught:
         checkpoints.save(2, state(2), 1.0)
     assert caught.value.errno == errno.EFBIG and caught.value.filename == str(tmp_path / "2.safetensors")
-    assert epochs(tmp_path) == {"1.safetensors"} and Checkpoints(tmp_path).last_epoch == checkpoints.last_epoch == 1
+    assert files_of(tmp_path).keys() == {"1.safetensors"}
+    assert Checkpoints(tmp_path).last_epoch == checkpoints.last_epoch == 1
     assert_equal(checkpoints.last(state(0)), state(1))
 
 

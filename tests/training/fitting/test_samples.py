@@ -13,7 +13,7 @@ from small_clouds import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
-from training.fitting.samples import Form, describe_batch, sample_views
+from training.fitting.samples import OF_EMBEDDING, Form, describe_batch, sample_views
 from training.protocol import PAPER
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
@@ -72,6 +72,11 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     np.testing.assert_allclose(np.sort(samples.strips.data), np.sort(expected.strips.data), atol=1e-6)
     # A fifteenth of the TOPS2 descriptor.
     assert sum(array.nbytes for array in samples.arrays().values()) / len(samples) < 4 * 11942 / 15
+
+    # Orientations differ between equal shards and between seeds: two shards of two clouds, two copies, two seeds.
+    equal: Any = SimpleNamespace(shards=[shards[0]] * 2, read=lambda _: first)
+    turned = [sample_views(equal, NETWORK, CONFIG, OF_EMBEDDING, seed)[0].strips.toarray() for seed in (0, 1)]
+    assert len(np.unique(np.concatenate(turned), axis=0)) == 2 * 2 * 2 * 2
 
     held_out = {0: np.array([9]), 1: np.array([7])}  # the box has a view 9 and no view 7
     fitted, kept = sample_views(source, NETWORK, CONFIG, held_out=held_out)

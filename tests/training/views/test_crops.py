@@ -133,7 +133,7 @@ def dataset(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> ViewDatas
 
 
 def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDataset) -> None:
-    """A dataset without the brick has the crops of the box."""
+    """The brick is the second class, and the only one of a dataset without the first class."""
     mesh = load_mesh(meshes / "brick.ply")
     index = dataset.classes.index("brick")
     views, crops = dataset.read(index), dataset.read_crops(index, SIZE)
@@ -144,8 +144,8 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
         color, normals = rgbd_crop(view.frame, 1, SIZE)
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
-    box = WithoutClasses(dataset, ["brick"]).read_crops(0, SIZE)
-    np.testing.assert_array_equal(box.color, dataset.read_crops(1 - index, SIZE).color)
+    alone = WithoutClasses(dataset, [dataset.classes[0]])
+    assert index == 1 and np.array_equal(alone.read_crops(0, SIZE).color, crops.color)
 
 
 def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset) -> None:
@@ -181,6 +181,7 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     for content, message in ((other, "crops of other views"), ([], "manifest.json is damaged")):
         manifest.write_text(json.dumps(content))
         assert_refused(message, plain.read_crops, 0, 8)
+        assert_refused("dataset", render_crops, job, plain, 8)
 
 
 def test_reduced_crops_are_means_of_areas() -> None:

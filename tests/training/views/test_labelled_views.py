@@ -37,7 +37,8 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     """The largest class has 30 clouds: 4 mugs get 30 // 4 - 1 copies, 40 pens none, and 2 boxes the most of 8."""
     instances = {"mug": 4, "pen": 40, "box": 2}
     views = {name: [instance(100 + k) for k in range(n)] for name, n in instances.items()}
-    source = WithLabelledViews(LabelledInstances(views, ["too few points"]), CONFIG, rendered())
+    crops = {"mug": [(np.full((4, 4, 3), k, np.uint8), np.full((4, 4, 3), -k, np.int8)) for k in range(4)]}
+    source = WithLabelledViews(LabelledInstances(views, ["too few points"], crops), CONFIG, rendered())
     assert source.classes == ("bowl", "mug", "pen", "box")
     shards = [(shard.label, shard.views) for shard in source.shards]
     assert shards == [(0, 30), (1, 3), (1, 4 * 7), (2, 40), (3, 2 * 9)]
@@ -49,6 +50,8 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     assert (mugs.label, len(mugs)) == (1, 28)
     assert mugs.view.tolist() == [FIRST_VIEW + k for k in range(4) for _ in range(7)]
     assert mugs.copy.tolist() == list(range(7)) * 4
+    of_mugs, of_views = source.read_crops(2, 2), (mugs.view - FIRST_VIEW)[:, None, None, None]
+    assert (of_mugs.color == of_views).all() and (of_mugs.normals == -of_views).all()
     np.testing.assert_array_equal(source.read(1).xyz, rendered().read(1).xyz)
     only = WithoutClasses(source, ["bowl", "pen"])
     assert only.classes == ("mug", "box") and only.record["views"] == 3 + 28 + 18
@@ -71,11 +74,11 @@ def test_surfaces_need_a_mesh_of_every_class() -> None:
 
 def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clouds with an occlusion boundary may take another half turn than the same points without one."""
-    monkeypatch.setattr("training.views.labelled_views.CLOUDS", 12)
+    monkeypatch.setattr("training.views.labelled_views.CLOUDS", 18)
     views = [instance(seed, 40 + seed) for seed in range(6)]
     source = WithLabelledViews(LabelledInstances({"mug": views}), CONFIG)
-    assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [12]
-    flat = [each for view in views for each in (view, augmented_view(view, 0))]
+    assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [18]
+    flat = [each for view in views for each in (view, *(augmented_view(view, k) for k in (0, 1)))]
     normal = view_normalize(pack_instances(flat, len(flat)), CONFIG)
     expected = np.asarray(normal.points)[np.asarray(normal.mask)]
     read = source.read(0)
