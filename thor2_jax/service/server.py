@@ -115,6 +115,12 @@ class _Supervisor(Multiprocess):
             mark_process_dead(pid)
         self._close_ends_of_workers()
 
+    def terminate_all(self) -> None:
+        """End the workers; new connections are refused at once, since no process accepts them any longer."""
+        for listener in self.sockets:
+            listener.close()
+        super().terminate_all()
+
     def _close_ends_of_workers(self) -> None:
         """Leave each worker's end of its pipe to the worker: a health check then ends at once if the worker dies."""
         for process in self.processes:
