@@ -84,7 +84,7 @@ def _part(geometry: "trimesh.Trimesh", transform: NDArray[np.float64]) -> Textur
             raise InputError("its colours cannot be read, which are floats above 1; expected 0 to 1, or integers")
         colors = visual.vertex_colors[faces] if visual.kind == "vertex" else visual.face_colors[:, None].repeat(3, 1)
         if len(colors) != len(faces):
-            raise InputError("colours of polygons, which cannot be assigned to triangles; triangulate the mesh")
+            raise InputError("its colours cannot be read, which are of polygons; triangulate the mesh")
         return TexturedMesh(vertices, faces, corner_colors=np.asarray(colors, np.uint8)[..., :3])
     if visual.kind != "texture":
         raise InputError("no texture and no vertex colours; export the mesh with its colours")

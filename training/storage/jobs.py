@@ -162,7 +162,7 @@ def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mappin
         field, old, new = difference
         raise InputError(
             f"out: {directory} was written with {field} {_shown(old)}, not {_shown(new)}; "
-            "repeat the command with the same options, or choose another directory"
+            "repeat the command with the same options and unchanged files, or choose another directory"
         )
 
 

@@ -64,6 +64,7 @@ def trained(module_patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathF
 def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Baselines that a run has are not trained again."""
     monkeypatch.setitem(job._METHODS, "forest", (lambda task: pytest.fail("trained again"), load_forest))
+    (trained / "baselines" / ".forest" / "fit").mkdir(parents=True)  # left by a process that was killed at its end
     train_baselines(trained, SOURCE, names)
     assert {path.name for path in (trained / "baselines").iterdir()} == {f"{name}.safetensors" for name in names}
     (run,) = load_runs([trained])
@@ -84,6 +85,7 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
     def interrupted(task: Any) -> Any:
         marks.append(task.held_out(label, view))
         task.progress("grow forest", 1, 1, "")
+        assert_refused("another process", train_baselines, task.directory, SOURCE, ["forest"])
         raise KeyboardInterrupt
 
     monkeypatch.setattr(job, "_METHODS", {"forest": (interrupted, None)})

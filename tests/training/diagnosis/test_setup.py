@@ -135,11 +135,7 @@ def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
     assert_found("", check_depth, frame, {"pin": 0.01}, trust_camera=False)
 
 
-def blobs(n: int) -> np.ndarray:
-    labels = np.zeros((90, 120), np.uint8)
-    for k in range(n):
-        labels[10:40, 5 + 30 * k : 25 + 30 * k] = 1
-    return labels
+BLOB = np.pad(np.ones((30, 20), np.uint8), ((10, 50), (5, 5)))
 
 
 def test_labels(frame: RGBDFrame) -> None:
@@ -150,8 +146,8 @@ def test_labels(frame: RGBDFrame) -> None:
         (_interpolated, "labels-(thin|many)"),
         (lambda labels: np.tile(np.arange(120) % 4 // 2 * (np.arange(120) // 4 + 1), (90, 1)), "labels-thin"),
         (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), "labels-many"),
-        (lambda labels: blobs(2), ""),
-        (lambda labels: blobs(3) * 255, "labels-foreground"),
+        (lambda labels: np.tile(BLOB, 2), ""),
+        (lambda labels: np.tile(BLOB, 3) * 255, "labels-foreground"),
     ):
         assert_found(expected, check_labels, make(frame.label_image))
 

@@ -104,5 +104,4 @@ def test_incompatible_sequence_runs_are_refused(tmp_path: Path) -> None:
         ("s4", "s4"),
         ("s5", "has no run for s5"),
     ):
-        frames = ["s1/frame", f"{other}/frame"]
-        assert_refused(f"^model: .*{message}", load_sequence_runs, tmp_path / "runs", frames)
+        assert_refused(f"^model: .*{message}", load_sequence_runs, tmp_path / "runs", ["s1/frame", f"{other}/frame"])

@@ -36,8 +36,7 @@ def archive(files: dict[str, bytes]) -> bytes:
 
 def mesh_files(folder: str = f"{NAME}/google_16k/") -> dict[str, bytes]:
     texture = encode_image(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
-    material = b"newmtl m\nmap_Kd texture_map.png\n"
-    files = {"textured.mtl": material, "texture_map.png": texture, "textured.obj": OBJ}
+    files = {"textured.mtl": b"newmtl m\nmap_Kd texture_map.png\n", "texture_map.png": texture, "textured.obj": OBJ}
     return {folder + name: data for name, data in files.items()}
 
 
