@@ -42,7 +42,7 @@ from benchmarks.timing import print_step
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
+from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, load_mesh
 from training.objects.surfaces import surfaces_of
@@ -102,7 +102,7 @@ LEVERS = (
     Lever("4 looks in recognition", train=PLAIN, looks=4),
     Lever("orientation copies in training", train=ORIENTED),
     Lever("orientation copies, 4 looks", train=ORIENTED, looks=4),
-    Lever("embedding fitted on distractors, alone", train=DISTRACTED, looks=4, fusion=EMBEDDED),
+    Lever("embedding fitted on distractors, alone", train=DISTRACTED, looks=4, fusion="embedding"),
     Lever("with THOR2", train=DISTRACTED, looks=4, fusion=ALL_CLASSIFIERS),
     Lever('fusion rule "max"', train=PLAIN, rule="max"),
     Lever('fusion rule "mean"', train=PLAIN, rule="mean"),

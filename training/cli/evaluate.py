@@ -112,7 +112,7 @@ def _evaluate(
     from training.evaluation.job import answer_frames_in_pool, evaluate_dataset, load_runs
 
     models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
-    load = (models, tuple(frames.identifiers)) if per_sequence else (models,)
+    load = models, tuple(frames.identifiers) if per_sequence else None
     description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = file_digest(names)

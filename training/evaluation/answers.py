@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import decoding
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
-from thor2_jax.networks.networks import FEATURES
+from thor2_jax.networks.networks import EMBEDDING, FEATURES
 from training.baselines.job import TITLES
 from training.storage.jobs import check_same_job
 
@@ -26,7 +26,6 @@ __all__ = [
     "ALL_CLASSIFIERS",
     "AnswerFile",
     "BOTH",
-    "EMBEDDED",
     "FrameAnswers",
     "GALLERY",
     "InstancePrediction",
@@ -159,11 +158,11 @@ Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fused_probabilities`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
-EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "classifiers", "gallery", "both"
-"""Columns of the embedding alone, the classifiers with its confidence, the gallery alone, and all; none has a rule."""
+ALL_CLASSIFIERS, GALLERY, BOTH = "classifiers", "gallery", "both"
+"""Columns of the classifiers with the embedding's confidence, the gallery alone, and all."""
 
-WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
-"""All columns that are computed without a fusion rule."""
+WITHOUT_RULE = (EMBEDDING, ALL_CLASSIFIERS, GALLERY, BOTH)
+"""All columns that are computed without a fusion rule; the first one is the embedding alone."""
 
 
 def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -176,7 +175,7 @@ def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
     groups = [group for size in range(1, len(features) + 1) for group in itertools.combinations(features, size)]
     baselines: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in names}
     classifiers = {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
-    return baselines | classifiers | {name: (name,) for name in WHOLE if name in names}
+    return baselines | classifiers | {name: (name,) for name in WITHOUT_RULE if name in names}
 
 
 def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
@@ -188,8 +187,8 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
             available one of: THOR2, TOPS, TOPS2, the embedding, the last title (see `Model.chosen_classifiers`).
     """
     titles = list(titles)
-    last = [title for title in titles if title not in WHOLE][-1:]
-    return next(title for title in (answer_by, "THOR2", "TOPS", "TOPS2", EMBEDDED, *last) if title in titles)
+    last = [title for title in titles if title not in WITHOUT_RULE][-1:]
+    return next(title for title in (answer_by, "THOR2", "TOPS", "TOPS2", EMBEDDING, *last) if title in titles)
 
 
 class Predictions(NamedTuple):
@@ -214,7 +213,7 @@ class Predictions(NamedTuple):
             probabilities: [B, C] class probabilities of each classifier.
             temperatures: temperature of each classifier; read for "calibrated" only.
         """
-        if set(probabilities) <= set(WHOLE):
+        if set(probabilities) <= set(WITHOUT_RULE):
             (values,) = probabilities.values()  # scores, which need not sum to 1
             return cls(values.argmax(axis=1), values.max(axis=1))
         if rule == "calibrated":

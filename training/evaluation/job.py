@@ -40,7 +40,7 @@ ANSWERS = "answers.jsonl"
 NO_PIXELS = "no pixels in the label image"
 """Reason of a labelled instance that has no pixels and therefore cannot be described."""
 
-Load = tuple[tuple[Path, ...]] | tuple[tuple[Path, ...], tuple[str, ...]]
+Load = tuple[tuple[Path, ...], tuple[str, ...] | None]
 """Arguments of `load_runs`."""
 
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from thor2_jax.networks.networks import EMBEDDING
 from training.baselines.job import TITLES
-from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, main_fusion
+from training.evaluation.answers import ALL_CLASSIFIERS, RULES, main_fusion
 from training.evaluation.published import published_seconds
 from training.evaluation.scores import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
@@ -180,11 +181,11 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
             "CE uses colour only, TOPS uses shape only, TOPS2 uses both. THOR2 is the fusion of TOPS and TOPS2; a plus "
             f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
         )
-    elif EMBEDDED in report["fusions"]:
-        text += f"The column {EMBEDDED} shows the answers of the embedding, which uses shape and colour. "
+    elif EMBEDDING in report["fusions"]:
+        text += f"The column {EMBEDDING} shows the answers of the embedding, which uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         named_by = main_fusion(title for title in report["fusions"] if title != ALL_CLASSIFIERS)
-        names = f"the names from {named_by} with" if named_by != EMBEDDED else "these names with"
+        names = f"the names from {named_by} with" if named_by != EMBEDDING else "these names with"
         text += (
             f"The column {ALL_CLASSIFIERS} shows {names} the confidence from the embedding; answers below the "
             "threshold keep their names in this table. "

@@ -26,7 +26,7 @@ from thor2_jax.recognizer import DescribedFrame, Recognizer
 from training.baselines.architectures import ARCHITECTURES
 from training.baselines.baseline import BaselineInputs, baseline_file
 from training.baselines.job import TITLES, TrainedBaseline, load_baselines
-from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
+from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, GALLERY
 from training.readers.labelled import named_path, path_ends, sequence_of
 from training.train_run import find_run_directories
 
@@ -73,7 +73,7 @@ class Run:
         model = self.model
         names = (*model.run.classifiers, *self.baselines)
         if EMBEDDING in model.classifiers:
-            names += (EMBEDDED, ALL_CLASSIFIERS) if model.run.classifiers else (EMBEDDED,)
+            names += (EMBEDDING, ALL_CLASSIFIERS) if model.run.classifiers else (EMBEDDING,)
         if model.gallery.objects:
             names += (GALLERY, BOTH) if model.classifiers else (GALLERY,)
         return names
@@ -105,7 +105,7 @@ class Run:
         default = {name: inference.probabilities[name] for name in model.chosen_classifiers()}
         values = dict(inference.probabilities)
         if EMBEDDING in default:
-            column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
+            column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDING
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
             values |= {name: baseline.predict(inputs) for name, baseline in self.baselines.items()}

@@ -1,1 +1,1 @@
-"""Datasets of labelled RGB-D frames, read one frame at a time."""
+"""Datasets of labelled RGB-D frames: subclasses of `labelled.LabelledFrames`, each with a command in `cli.evaluate`."""

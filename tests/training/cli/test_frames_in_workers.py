@@ -57,7 +57,7 @@ def test_workers_segment_and_recognize_as_one_process_does(model: Path, tmp_path
 
 
 def test_answers_before_an_unreadable_frame_are_kept(model: Path, folder: Path, tmp_path: Path) -> None:
-    arguments, damaged = ((model,),), Path(shutil.copytree(folder, tmp_path / "frames"))
+    arguments, damaged = ((model,), None), Path(shutil.copytree(folder, tmp_path / "frames"))
     expected = answer_frames(load_runs(*arguments), FrameFolder(folder))
     (damaged / "006" / "depth.png").write_bytes(b"damaged")
     frames, answers = FrameFolder(damaged), []

@@ -5,10 +5,9 @@ import pytest
 from sklearn.metrics import confusion_matrix
 from toy_recognizers import ToyRun, UntaughtRecognizer, toy_answer
 
-from thor2_jax.networks.networks import FEATURES
+from thor2_jax.networks.networks import EMBEDDING, FEATURES
 from training.evaluation.answers import (
     ALL_CLASSIFIERS,
-    EMBEDDED,
     FrameAnswers,
     InstancePrediction,
     Predictions,
@@ -69,9 +68,9 @@ def test_main_fusion_is_that_of_what_answers() -> None:
 @pytest.mark.parametrize(
     ("columns", "shown"),
     [
-        ((EMBEDDED,), "column embedding shows the answers"),
-        (("tops", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows the names from TOPS with"),
-        (("ce", EMBEDDED, ALL_CLASSIFIERS), "column classifiers shows these names with"),
+        ((EMBEDDING,), "column embedding shows the answers"),
+        (("tops", EMBEDDING, ALL_CLASSIFIERS), "column classifiers shows the names from TOPS with"),
+        (("ce", EMBEDDING, ALL_CLASSIFIERS), "column classifiers shows these names with"),
     ],
 )
 def test_the_page_says_which_column_gives_the_names(columns: tuple[str, ...], shown: str) -> None:
