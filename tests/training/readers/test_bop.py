@@ -77,7 +77,7 @@ def test_instances_that_are_scored(tmp_path: Path) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """There are two scenes; in the second, an object is almost hidden and one is absent, which needs no name."""
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
-    monkeypatch.setattr("training.evaluation.job.load_runs", lambda paths: runs)
+    monkeypatch.setattr("training.evaluation.job.load_runs", lambda *_: runs)
     objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
     write_bop(tmp_path / "test" / "000048", objects=objects, visible=[1, 1, 1])
     write_bop(tmp_path / "test" / "000049", objects=[*objects, (5, band(0, 0))], visible=[0.05, 1, 1, 0])

@@ -142,7 +142,7 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
     accuracy = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in cells["sequence",]}
     assert accuracy == dict(zip(sequences, (1, 1, pytest.approx(2 / 3)), strict=True))
     assert "2 models are given" in refused(*command, "--per-sequence", tmp_path)
-    monkeypatch.setattr(job, "load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
+    monkeypatch.setattr(job, "load_runs", lambda *_: [EvaluatedRun("run", "0", NamesInOrder())])
     output = printed(*command)  # one run for all sequences
     assert "instances scored: " in output and "Published table 3" in output and "Published table 1" not in output
     names.unlink()
