@@ -15,6 +15,7 @@ that objects of one shape with different prints differ, and depends less on the 
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -224,13 +225,17 @@ def is_color(n_regions: int) -> NDArray[np.bool_]:
     return result
 
 
+def before_turn(alpha: float, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+    """Return the coordinates of aligned points before the rotation by alpha."""
+    c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
+    return c * x + s * z, y, c * z - s * x
+
+
 @partial(jax.jit, static_argnums=1)
 def side_lengths(aligned: PointClouds, alpha: float) -> jax.Array:
     """Return the side lengths [B, 3] of the boxes of aligned clouds before the rotation by alpha, longest first."""
-    c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
-    x, y, z = jnp.moveaxis(aligned.points, -1, 0)
     sides = []
-    for values in (c * x + s * z, y, c * z - s * x):
+    for values in before_turn(alpha, *jnp.moveaxis(aligned.points, -1, 0)):
         high = jnp.where(aligned.mask, values, -jnp.inf).max(axis=1)
         sides.append(high - jnp.where(aligned.mask, values, jnp.inf).min(axis=1))
     lengths = jnp.stack(sides, axis=1)

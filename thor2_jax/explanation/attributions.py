@@ -85,7 +85,7 @@ def select_points(instance: PreparedInstance, kept: NDArray[np.bool_ | np.intp])
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 @jax.grad
 def _gradients(weights: jax.Array, scores: ClassScores, looks: PointClouds, index: int) -> Any:
-    """Return the sum of the margins for T versions of a cloud, from its K looks, whose points have weights [T, N]."""
+    """Return the gradients [T, N] of the margins of T versions of a cloud, of K looks each, by the weights [T, N]."""
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
 
     def one(cloud: PointClouds, weight: jax.Array) -> Strips:

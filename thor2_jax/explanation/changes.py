@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.capacity import batch_points
 from thor2_jax.config import Relaxation
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import aligned_looks
+from thor2_jax.descriptor.looks import aligned_looks, before_turn
 from thor2_jax.explanation.class_scores import COMPILER_OPTIONS, ClassScores
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds, matmul
@@ -67,10 +67,11 @@ class Change:
 
 
 def _axes(instance: PreparedInstance, aligned: ArrayLike, alpha: float) -> NDArray[np.float64]:
-    """Return the axes [3, 3] of the box of an instance as rows, longest first, from its aligned points [N, 3]."""
-    x, y, z = np.asarray(aligned, np.float64)[: len(instance.points)].T
-    c, s = np.cos(alpha), np.sin(alpha)
-    placed = np.stack([c * x + s * z, y, c * z - s * x])
+    """Return the axes [3, 3] of the box of an instance as rows, longest first, from its aligned points [N, 3].
+
+    They are the rotation that fits the instance to these points (Kabsch, 1976), which compiles nothing.
+    """
+    placed = np.stack(before_turn(alpha, *np.asarray(aligned, np.float64)[: len(instance.points)].T))
     u, _, vt = np.linalg.svd((placed - placed.mean(axis=1, keepdims=True)) @ instance.points)
     return np.asarray(u @ vt)
 
@@ -138,7 +139,7 @@ def _gradient_directions(
 
 
 def smallest_change(
-    scores: ClassScores, recognize: Recognize, instance: PreparedInstance, index: int, kind: Kind
+    scores: ClassScores, recognize: Recognize, instance: PreparedInstance, looks: PointClouds, index: int, kind: Kind
 ) -> Change | None:
     """Return the smallest change of a kind that gives another answer than the name `index`.
 
@@ -146,13 +147,14 @@ def smallest_change(
         scores: class scores, whose gradients give the directions.
         recognize: function of the whole model, since class scores alone need not determine the answer.
         instance: an instance whose most probable name is `index`.
+        looks: the looks at it, see `ClassScores.orient`.
         index: number of the name in `scores.names`.
         kind: kind of the change.
 
     Returns:
         The change; None if none is found up to a shift of 127 of 255 or a factor of 2.
     """
-    axes = _axes(instance, scores.orient(instance).points[0], scores.config.alpha)
+    axes = _axes(instance, looks.points[0], scores.config.alpha)
     clouds = pack_instances([instance], 1, batch_points([len(instance.points)]))
     directions = _gradient_directions(scores, clouds, axes, index, kind)
     lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES

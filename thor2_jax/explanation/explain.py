@@ -224,7 +224,8 @@ def _parts(
     def recognize(instances: Sequence[PreparedInstance]) -> list[str]:
         return [model.names[best] for best in _recognized(model, instances)[1][:, 0]]
 
-    changes = [smallest_change(scores, recognize, instance, index, kind) for kind in CHANGES if len(model.names) > 1]
+    kinds = CHANGES if len(model.names) > 1 else ()
+    changes = [smallest_change(scores, recognize, instance, looks, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)
     yield "described", _described(scores, looks, len(instance.points))
     yield "surfaces", tuple(surface_fits(model, instance, names))

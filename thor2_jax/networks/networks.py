@@ -312,18 +312,18 @@ class Compiled:
         self._arguments = function, models, *static
         graphs, states = zip(*models, strict=True)
         leaves, structure = jax.tree.flatten(states)
-        self.call: Any = jax.tree_util.Partial(_compiled(function, graphs, structure, static), leaves)
+        self._call: Any = jax.tree_util.Partial(_compiled(function, graphs, structure, static), leaves)
 
     def __call__(self, inputs: Any) -> jax.Array:
         """Return the result for the inputs."""
-        return self.call(inputs)
+        return self._call(inputs)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Compiled, self._arguments
 
 
-# As an argument of a compiled function, it is its weights, so that other weights compile nothing.
-jax.tree_util.register_pytree_node(Compiled, lambda each: ((each.call,), None), lambda _, children: children[0])
+# As an argument of a compiled function, it is a `Partial` of its weights, so that other weights compile nothing.
+jax.tree_util.register_pytree_node(Compiled, lambda each: ((each._call,), None), lambda _, children: children[0])
 
 
 @lru_cache(maxsize=32)

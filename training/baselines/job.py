@@ -126,7 +126,7 @@ def train_baselines(
                 with locked(task.scratch):
                     start = time.perf_counter()
                     _METHODS[name][0](task).write(file, run.classes, time.perf_counter() - start)
-            elif weights and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
+            elif weights is not None and StoredBaseline.read(file, run.classes).weights != check_weights(weights, name):
                 raise InputError(
                     f"weights is {weights}, but {file} was trained without these files; delete it to train it again, "
                     "or leave out weights"

@@ -139,7 +139,8 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
             images = [file for name in names for start in ("", "*/**/") for file in path.glob(start + name)]
             of_path = []
             # A link such as "latest" would add a frame a second time.
-            for folder in sorted({file.parent.resolve(): file.parent for file in sorted(images)[::-1]}.values()):
+            folders = sorted({file.parent for file in images}, reverse=True)
+            for folder in sorted({each.resolve(): each for each in folders}.values()):
                 name = folder.name if folder == path else folder.relative_to(path).as_posix()
                 of_path.append((folder, frame_files(folder).source(name, depth_scale)))
         if not of_path:

@@ -237,16 +237,17 @@ def test_smallest_change_is_smallest_and_confirmed() -> None:
     def best(instances: Sequence[PreparedInstance]) -> list[str]:
         return [scores.names[k] for k in scores.of_instances(instances).argmax(axis=1)]
 
-    change = smallest_change(scores, best, INSTANCE, 0, "extent")
+    looks = scores.orient(INSTANCE)
+    change = smallest_change(scores, best, INSTANCE, looks, 0, "extent")
     assert change is not None and change.answer == "special"
     less = dataclasses.replace(INSTANCE, points=0.1 * INSTANCE.points + 0.9 * change.instance.points)
     assert best([change.instance, less]) == ["special", "plain"]
-    sides = [side_lengths(scores.orient(each), SMALL_CONFIG.alpha)[0] for each in (INSTANCE, change.instance)]
+    sides = [side_lengths(each, SMALL_CONFIG.alpha)[0] for each in (looks, scores.orient(change.instance))]
     np.testing.assert_allclose(sides[1] / sides[0], change.values, rtol=0.01)
     alone = dataclasses.replace(scores, names=("plain",))  # as the only enrolled object beside trained classes
-    assert getattr(smallest_change(alone, best, INSTANCE, 0, "extent"), "values", None) == change.values
+    assert getattr(smallest_change(alone, best, INSTANCE, looks, 0, "extent"), "values", None) == change.values
     for kind in CHANGES:  # recognition gives no other name, whatever the scores are
-        assert smallest_change(scores, lambda rows: ["plain"] * len(rows), INSTANCE, 0, kind) is None
+        assert smallest_change(scores, lambda rows: ["plain"] * len(rows), INSTANCE, looks, 0, kind) is None
 
 
 def test_changed_extents_keep_the_other_sides() -> None:
