@@ -7,9 +7,10 @@
 >>> [(track.track, track.name, track.frames) for track in tracker.tracks()]        # doctest: +SKIP
 [(1, 'mug', 5), (2, 'bowl', 4)]
 
-Clouds of two frames are matched so that their overlap is largest. The overlap is the fraction of the smaller cloud's
-voxels that the other cloud also occupies, averaged over the voxel sizes `VOXELS`. Small voxels distinguish neighbouring
-objects; large voxels allow for motion between the frames.
+Clouds of two frames are matched so that their overlap is largest. The overlap is the number of voxels that both clouds
+occupy, divided by the geometric mean of their numbers of voxels, averaged over the voxel sizes `VOXELS`. An object that
+is largely occluded is still matched; a small object near the place of a large one is not. Small voxels distinguish
+neighbouring objects; large voxels allow for motion between the frames.
 
 The log-probabilities of each classifier and the scores of the gallery are averaged, with the weights of the views.
 Successive frames are nearly the same, so their probabilities are not multiplied like those of independent observations:
@@ -18,6 +19,7 @@ if all frames of a track have the same probabilities, the track has the confiden
 
 import dataclasses
 import itertools
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, Self
@@ -70,7 +72,7 @@ def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
 def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
     """Return the overlap of two clouds that are not empty, from 0 to 1."""
     pairs = zip(first, second, strict=True)
-    shares = [len(np.intersect1d(*pair, assume_unique=True)) / min(map(len, pair)) for pair in pairs]
+    shares = [len(np.intersect1d(a, b, assume_unique=True)) / math.sqrt(len(a) * len(b)) for a, b in pairs]
     return float(np.mean(shares))
 
 

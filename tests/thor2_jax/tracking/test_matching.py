@@ -19,7 +19,7 @@ def test_overlap_is_the_share_of_common_voxels() -> None:
     shares = []
     for size in VOXELS:
         a, b = ({tuple(v) for v in np.floor(p / size).astype(int).tolist()} for p in (first, second))
-        shares.append(len(a & b) / min(len(a), len(b)))
+        shares.append(len(a & b) / np.sqrt(len(a) * len(b)))
     assert overlap(occupied_voxels(first), occupied_voxels(second)) == pytest.approx(np.mean(shares))
     assert overlap(occupied_voxels(first), occupied_voxels(first + 1)) == 0
 
@@ -37,6 +37,12 @@ def test_a_match_has_the_largest_total_overlap() -> None:
     pairs = match(first, second)
     assert total(pairs) == pytest.approx(best) and best > 0.5
     assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
-    here, near, beside = (occupied_voxels(patch(place, place)) for place in (0.0, 0.05, 0.06))
-    assert match([], second) == match(first, []) == [] and 0.1 < overlap(here, beside) < overlap(here, near) < 0.22
+    here, near, beside = (occupied_voxels(patch(place, place)) for place in (0.0, 0.042, 0.044))
+    assert match([], second) == match(first, []) == [] and 0.19 < overlap(here, beside) < overlap(here, near) < 0.26
     assert match([here], [beside, near]) == [(0, 1)] and match([here], [beside]) == []
+
+
+def test_a_small_object_does_not_continue_a_large_one() -> None:
+    large, small, occluded = patch(0.0, size=0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)
+    assert match([occupied_voxels(large)], [occupied_voxels(small), occupied_voxels(occluded)]) == [(0, 1)]
+    assert match([occupied_voxels(large)], [occupied_voxels(small)]) == []
