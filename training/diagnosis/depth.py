@@ -115,6 +115,9 @@ def check_depth(
             f"{median:.2f} m) and is not used.",
             "Bring the camera to 0.5 to 1.5 m from the objects; if it is there already, depth_scale is wrong.",
         )
+    elif np.ptp(frame.depth_m[frame.depth_m > 0]) == 0:
+        message = f"All pixels with depth have the same value, {_length(median)}."
+        diagnosis.add("depth-constant", message, "Check that the camera measures depth, and that its file is used.")
 
 
 def _check_focal_length(

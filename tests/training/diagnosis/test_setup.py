@@ -92,6 +92,7 @@ DEPTH: dict[str, tuple[Callable[[RGBDFrame], RGBDFrame], str]] = {
     "floats in metres": (lambda f: change(f, depth=f.depth_m), ""),
     "no labels, metres per unit": (lambda f: change(with_scale(f, 0.001), labels=None), "depth-unit: .*1000"),
     "no depth": (lambda f: change(f, depth=f.depth * 0), "depth-missing"),
+    "one depth": (lambda f: change(f, depth=(f.depth > 0) * np.uint16(900)), "depth-constant: .* 0.9 m"),
     "little depth": (lambda f: change(f, depth=f.depth * (np.indices(f.depth.shape)[1] % 10 == 0)), "depth-missing"),
     "far": (lambda f: with_focal_factor(change(f, depth=f.depth * np.uint16(5)), 5), "distance: .*0.5 to 1.5 m"),
     "a mask of touching objects": (with_one_mask_of_two_thirds, "labels-foreground"),
