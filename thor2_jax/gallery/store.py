@@ -94,9 +94,17 @@ def check_exists(directory: Path | None) -> None:
 
 
 def check_open_to_changes(directory: Path) -> None:
-    """Raise InputError unless the gallery in a directory can be written."""
+    """Raise InputError unless the gallery in a directory can be written, and no other writer holds the lock."""
     with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
         check_writable(directory)
+        with _writing(directory, LOCK_SECONDS) if directory.is_dir() else contextlib.nullcontext():
+            pass
+
+
+def _writing(directory: Path, seconds: float) -> contextlib.AbstractContextManager[None]:
+    """Return the lock of a writer; it raises GalleryBusyError if another one holds it for some seconds."""
+    busy = f"another process or thread has been writing to {directory} for {seconds:.2g} s; try again when it ends"
+    return locked(directory, GalleryBusyError(f"gallery: {busy}"), seconds)
 
 
 def check_index(directory: Path) -> None:
@@ -254,9 +262,7 @@ def update_gallery(
         GalleryBusyError: another process or thread holds the lock.
         OSError: a file cannot be written; the gallery is unchanged.
     """
-    busy = f"another process or thread has been writing to {directory} for {lock_seconds:.2g} s; try again when it ends"
-    lock = locked(directory, GalleryBusyError(f"gallery: {busy}"), lock_seconds)
-    with lock, new_directory(directory / "objects"):
+    with _writing(directory, lock_seconds), new_directory(directory / "objects"):
         before = load_gallery(directory, embedding, known, rebuild=embedding is None)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
         _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})

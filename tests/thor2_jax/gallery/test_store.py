@@ -19,6 +19,7 @@ from refusals import assert_refused
 from small_clouds import random_clouds
 from written_files import files_of, killed
 
+from thor2_jax.files import locked
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
@@ -352,3 +353,11 @@ def test_two_writers_at_once_both_succeed(directory: Path) -> None:
     names = [[f"a{k}" for k in range(12)], [f"b{k}" for k in range(12)]]
     assert write_at_once(*((directory, each, "", False) for each in names)) == [0, 0]
     assert set(load_gallery(directory).names) == {"mug", "bowl", *names[0], *names[1]}
+
+
+def test_a_locked_gallery_is_noticed_before_any_work(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "LOCK_SECONDS", 0.1)
+    with locked(directory):
+        assert_refused("gallery: another process .* for 0.1 s", store.check_open_to_changes, directory)
+    store.check_open_to_changes(directory / "new")
+    assert not (directory / "new").exists()
