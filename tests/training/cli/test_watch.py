@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder(model: Path, folder: Path, messages: list[dict[str, Any]], texts: Texts) -> None:
     _, err = texts("watch", "--model", model, "--folder", folder, "--port", 0)
     assert "watch at http://127.0.0.1:" in err and "2 of 3 were recognized (first error: 2: depth" in err
-    assert f"thor2 recognize {folder} --segment table --model {model} --out answers" in err
+    assert f"thor2 recognize {folder} --segment table --model {model} --track --out answers" in err
     assert [one["state"] for one in messages] == ["waiting", "live", "live", "live", "ended"]
     assert [one.get("frame") for one in messages] == [None, "0", "1", "2", "2"]
     assert [len(one["objects"]) for one in messages[1:4]] == [2, 2, 0] and "depth" in messages[3]["error"]
