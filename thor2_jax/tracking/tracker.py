@@ -19,7 +19,6 @@ if all frames of a track have the same probabilities, the track has the confiden
 
 import dataclasses
 import itertools
-import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, Self
@@ -72,7 +71,7 @@ def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
 def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
     """Return the overlap of two clouds that are not empty, from 0 to 1."""
     pairs = zip(first, second, strict=True)
-    shares = [len(np.intersect1d(a, b, assume_unique=True)) / math.sqrt(len(a) * len(b)) for a, b in pairs]
+    shares = [len(np.intersect1d(a, b, assume_unique=True)) / np.sqrt(len(a) * len(b)) for a, b in pairs]
     return float(np.mean(shares))
 
 

@@ -36,7 +36,5 @@ def adapt(
         f"before, {adaptation.uncertainty_after:.3f} after"
     )
     if adaptation.uncertainty_after >= adaptation.uncertainty_before:
-        console.print(
-            "these frames do not show that their colours need a correction; the run as trained may serve as well"
-        )
+        console.print("these frames do not show that a correction is needed; a run without one may serve as well")
     finish(f"written to {out}", "recognize a frame", "recognize", "FRAME", model=out)
