@@ -80,9 +80,8 @@ class Broadcast:
             timeout: seconds to wait.
         """
         with self._changed:
-            if self._changed.wait_for(lambda: self._number > after, timeout):
-                return self._number, self._text
-        return None
+            is_later = self._changed.wait_for(lambda: self._number > after, timeout)
+            return (self._number, self._text) if is_later else None
 
 
 class LiveView:

@@ -96,9 +96,7 @@ class OCID(LabelledFrames):
         color, labels, points = read_color(image), read_labels(label_file), read_organized_points(cloud_file)
         with with_context(str(cloud_file)):
             if points.shape[:2] != color.shape[:2]:
-                raise InputError(
-                    f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)"
-                )
+                raise InputError(f"the cloud has {points.shape[:2]} points, color {color.shape[:2]} (rows, columns)")
             intrinsics = fit_intrinsics(points)
         frame = RGBDFrame(color, read_depth(depth_file), labels * (labels >= first_object), intrinsics)
         unnamed = [label for label in frame.instances if label not in names]
@@ -113,9 +111,8 @@ class OCID(LabelledFrames):
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
         image = self.sources[number]
-        folder = image.parent.parent
-        cloud = folder / "pcd" / f"{image.stem}.pcd"
-        return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
+        others = (f"depth/{image.name}", f"label/{image.name}", f"pcd/{image.stem}.pcd")
+        return [image, *(image.parents[1] / other for other in others)]
 
     def names(self) -> set[str]:
         """Return the names of the objects in the table."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrames, named_labels
+from training.readers.labelled import LabelledFrames, named_labels, sequence_of
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
@@ -56,13 +56,13 @@ class UWISOccluded(LabelledFrames):
         self.sources = [color for video in videos for color in sorted((video / "images").glob("*_rgb.png"))]
         if not self.sources:
             raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
-        self.identifiers = [f"{_video(color)}/{_stem(color)}" for color in self.sources]
+        self.identifiers = [f"{color.parents[1].name}/{_stem(color)}" for color in self.sources]
 
     def read(self, number: int) -> tuple[RGBDFrame, dict[int, str], dict[str, str]]:
         """Read a frame, its names and the attributes of its video."""
         color, depth, labels, poses = self.files(number)
         frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
-        return frame, _truth(poses), video_attributes(int(_video(color)))
+        return frame, _truth(poses), video_attributes(int(sequence_of(self.identifiers[number])))
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
@@ -74,10 +74,6 @@ class UWISOccluded(LabelledFrames):
         """Yield the names of the objects in all frames, frame by frame."""
         for number in range(len(self)):
             yield from _truth(self.files(number)[-1]).values()
-
-
-def _video(color: Path) -> str:
-    return color.parent.parent.name
 
 
 def _stem(color: Path) -> str:

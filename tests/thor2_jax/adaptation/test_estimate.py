@@ -95,8 +95,7 @@ def none_is_known(clouds: thor2.PointClouds) -> jax.Array:
 
 @pytest.mark.slow
 def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
-    warm = np.array([150, 110, 90], np.uint8)
-    made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
+    made = [dataclasses.replace(each, colors=np.full_like(each.colors, (150, 110, 90))) for each in instances(40)]
     adaptation = estimate_transform(made, grey_is_known)
     assert -0.36 < adaptation.transform.warmth < -0.1
     assert adaptation.transform == ColorTransform(warmth=adaptation.transform.warmth)
@@ -150,8 +149,7 @@ def test_gallery_answers_are_its_scores() -> None:
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
     oriented = describe_looks(CLOUDS, embedding.network, embedding.config, 2).with_balanced(CLOUDS)
-    gallery = dataclasses.replace(recognizer.gallery, references=None)
-    scores = gallery.scores(embedding.embed_oriented(oriented))
+    scores = dataclasses.replace(recognizer.gallery, references=None).scores(embedding.embed_oriented(oriented))
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
     np.testing.assert_allclose(adaptation_criterion(recognizer.model)(CLOUDS), expected, atol=2e-3)
 

@@ -16,10 +16,8 @@ def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> 
 
 def test_overlap_is_the_share_of_common_voxels() -> None:
     first, second = patch(0.0), patch(0.03, 0.012, 0.05)
-    shares = []
-    for size in VOXELS:
-        a, b = ({tuple(v) for v in np.floor(p / size).astype(int).tolist()} for p in (first, second))
-        shares.append(len(a & b) / np.sqrt(len(a) * len(b)))
+    sets = [[{*map(tuple, (p // size).tolist())} for p in (first, second)] for size in VOXELS]
+    shares = [len(a & b) / np.sqrt(len(a) * len(b)) for a, b in sets]
     assert overlap(occupied_voxels(first), occupied_voxels(second)) == pytest.approx(np.mean(shares))
     assert overlap(occupied_voxels(first), occupied_voxels(first + 1)) == 0
 
@@ -43,6 +41,5 @@ def test_a_match_has_the_largest_total_overlap() -> None:
 
 
 def test_a_small_object_does_not_continue_a_large_one() -> None:
-    large, small, occluded = patch(0.0, size=0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)
-    assert match([occupied_voxels(large)], [occupied_voxels(small), occupied_voxels(occluded)]) == [(0, 1)]
-    assert match([occupied_voxels(large)], [occupied_voxels(small)]) == []
+    large, small, occluded = map(occupied_voxels, (patch(0, 0, 0.16), patch(0.14, 0.06, 0.04), patch(0.04, 0.06, 0.06)))
+    assert match([large], [small]) == [] and match([large], [small, occluded]) == [(0, 1)]

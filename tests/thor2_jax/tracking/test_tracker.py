@@ -88,8 +88,7 @@ def test_tracks_answer_as_their_last_views_after_enrolling(answer_by: str) -> No
     tracker = recognizer.track()
     first, _ = tracker.update(TWO)
     recognizer.enroll("mug", [(TWO, 2)])
-    labels = np.where(TWO.label_image == 2, 2, 0)
-    (second,) = tracker.update(dataclasses.replace(TWO, labels=labels))
+    (second,) = tracker.update(dataclasses.replace(TWO, labels=np.where(TWO.label_image == 2, 2, 0)))
     earlier, later = tracker.tracks()
     assert "gallery" in second.top and later == second and earlier.confidence == first.confidence
 

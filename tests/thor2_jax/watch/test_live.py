@@ -108,12 +108,10 @@ def test_messages_of_a_view() -> None:
 def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
     broadcast, labels = Broadcast(), np.zeros((240, 320), np.uint8)
     labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
-    view = LiveView(
-        lambda f: [TrackedRecognition(k, f"name {k}", track=2, frames=5) for k in f.instances], fail, broadcast
-    )
+    view = LiveView(lambda f: [TrackedRecognition(k, f"{k}", track=2, frames=5) for k in f.instances], fail, broadcast)
     view.show(recorded(1, lambda: dataclasses.replace(table_frame(), labels=labels)))
     objects = latest(broadcast)["objects"]
-    assert sorted(one["name"] for one in objects) == ["name 3", "name 7"]
+    assert sorted(one["name"] for one in objects) == ["3", "7"]
     assert {(one["color"], one["frames"]) for one in objects} == {("#f0e442", 5)}
 
 

@@ -18,6 +18,7 @@ from refusals import assert_refused
 from rendered_objects import write_box
 from written_files import files_of
 
+from thor2_jax.files import locked
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 from training.enrollment import enroll_objects
@@ -253,6 +254,9 @@ def test_a_gallery_that_cannot_be_written(
     monkeypatch.delattr("training.enrollment.read_instances")
     (tmp_path / "a").touch()
     assert "(--gallery)" in refused("enroll", "--frames", frames, "--model", model, "--gallery", tmp_path / "a" / "b")
+    monkeypatch.setattr("thor2_jax.gallery.store.LOCK_SECONDS", 0.1)
+    with locked(model / "gallery"):
+        assert "another process" in refused("enroll", "--frames", frames, "--model", model)
 
 
 def test_a_run_that_another_command_creates_meanwhile(model: Path, frames: Path, tmp_path: Path) -> None:

@@ -79,9 +79,8 @@ def test_the_order_of_the_dataset_and_the_longest_end_of_a_path(tmp_path: Path) 
 @pytest.mark.parametrize("sequence", ["YCB10/table/bottom/curved/seq36", "table/bottom/curved/seq36", "seq36"])
 def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
     """Names hold for all images of a sequence; labels without a name are not scored; unlisted frames are left out."""
-    write_ocid(tmp_path)
-    write_ocid(tmp_path, stem="later")
-    write_ocid(tmp_path, stem="unlisted")
+    for stem in (STEM, "later", "unlisted"):
+        write_ocid(tmp_path, stem=stem)
     write_ocid(tmp_path, "floor/top/mixed/seq08")
     mug = vlg_item(3, "mug", f"{sequence},{STEM}.png")
     dataset = OCID(tmp_path, write_names(tmp_path, [mug, mug, vlg_item("5", "bowl_1", f"{sequence},later.png")]))
