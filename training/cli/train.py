@@ -135,7 +135,7 @@ def train(
     process: Annotated[int, typer.Option(min=0, help="Index of this process.")] = 0,
     quiet: options.QuietOption = False,
 ) -> None:
-    """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
+    """Train a recognizer on views of meshes, labelled frames or both. An interrupted training resumes.
 
     A run recognizes objects by an embedding: several small networks, fitted on the views and on distractors. Since
     distractors are objects of none of the classes, unknown objects get a low confidence. The embedding is also used to
