@@ -97,7 +97,7 @@ def check_open_to_changes(directory: Path) -> None:
     """Raise InputError unless the gallery in a directory can be written, and no other writer holds the lock."""
     with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
         check_writable(directory)
-        with _writing(directory, LOCK_SECONDS) if directory.is_dir() else contextlib.nullcontext():
+        with _writing(directory, LOCK_SECONDS) if gallery_stamp(directory) else contextlib.nullcontext():
             pass
 
 
