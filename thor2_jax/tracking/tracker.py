@@ -50,8 +50,7 @@ VOXELS = (0.01, 0.02, 0.04)
 """Voxel sides, metres."""
 
 MIN_OVERLAP = 0.25
-"""Smallest overlap of two clouds of one object. With 0.2, twice as many objects continue the track of an object whose
-place they take; with 0.3, many tracks end if the camera moves by 3 cm between frames."""
+"""Smallest overlap of two clouds of one object. With 0.2, twice as many objects continue the track of another one."""
 
 _AXIS = 2**21
 """Number of voxels along each axis that have distinct numbers."""
