@@ -114,6 +114,7 @@ class Processes:
         self._start = lambda: _Process(context, initialize, blocked)
         self._threads = ThreadPoolExecutor(count)
         self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
+        self._busy, self._closed = set[_Process](), False
         for _ in range(count):
             self._idle.put(None)
 
@@ -123,7 +124,7 @@ class Processes:
         """Call `function`, which must be picklable like its arguments, in a process.
 
         The future raises the error of the function, TimeoutError if the call has not returned at `deadline` (a time of
-        `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other.
+        `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other, or after `close`.
         """
         return self._threads.submit(self._call, function, arguments, attempts, deadline)
 
@@ -137,16 +138,22 @@ class Processes:
                 # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
                 timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), idle.process.kill)
                 timer.start()
+                self._busy.add(idle)
                 try:
+                    if self._closed:
+                        break
                     idle.pipe.send((function, arguments))
                     result, error = idle.pipe.recv()
                 finally:
+                    self._busy.discard(idle)
                     timer.cancel()
                 if time.monotonic() >= limit:  # The timer may have ended the process after its answer.
                     raise TimeoutError
             except (EOFError, OSError):  # The process has ended, or will.
                 if idle is not None:
                     idle.stop()
+                if self._closed:
+                    break
                 if time.monotonic() >= limit:
                     raise TimeoutError("the deadline of a call was exceeded") from None
             else:
@@ -158,11 +165,11 @@ class Processes:
         raise ChildProcessError(f"{attempts} worker processes died at the same item, possibly because memory ran out")
 
     def close(self) -> None:
-        """Wait for running calls, cancel the others, and end the processes; Ctrl-C ends this process meanwhile."""
-        # With an exception here, Python would wait at its end, possibly forever. Only the main thread handles signals.
-        is_main = threading.current_thread() is threading.main_thread()
-        with ended_by_signals() if is_main else contextlib.nullcontext():
-            self._threads.shutdown(cancel_futures=True)
-            while not self._idle.empty():
-                if (idle := self._idle.get()) is not None:
-                    idle.stop()
+        """End the processes, also those with running calls, and cancel the calls that have not begun."""
+        self._closed = True
+        for busy in list(self._busy):
+            busy.process.kill()
+        self._threads.shutdown(cancel_futures=True)
+        while not self._idle.empty():
+            if (idle := self._idle.get()) is not None:
+                idle.stop()
