@@ -41,6 +41,11 @@ def test_missing_run_directory(workers: int, tmp_path: Path, serve: Command, cap
         server._create_worker(Settings(tmp_path), workers)
 
 
+def test_a_worker_refuses_a_run_that_was_trained_again(run_dir: Path) -> None:
+    with pytest.raises(SystemExit, match="has changed since the start; restart"):
+        server._create_worker(Settings(run_dir), 2, "the digest of the record that the other workers have read")
+
+
 def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
