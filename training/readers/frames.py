@@ -182,10 +182,9 @@ class FrameFolder(LabelledFrames):
         labelled = [each for each in sources if each.files and each.files.names.is_file()]
         self.named = bool(labelled)
         if named and not self.named:
-            raise InputError(
-                f"frames: {first_names([each.name for each in sources])} has no labels.json; expected the names of the "
-                "objects in the frames"
-            )
+            names = first_names([each.name for each in sources])
+            advice = "" if sources[0].files else "; `thor2 evaluate bop` reads the names of a BOP dataset"
+            raise InputError(f"frames: {names}: no labels.json; expected the names of the objects{advice}")
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
         used = set(self.identifiers)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from commands import Command
 from dataset_files import TWO, K, band, images, update, write_bop
+from refusals import assert_refused
 from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers.bop import BOP
-from training.readers.frames import find_frames
+from training.readers.frames import FrameFolder, find_frames
 
 
 def test_a_frame(tmp_path: Path) -> None:
@@ -23,6 +24,7 @@ def test_a_frame(tmp_path: Path) -> None:
     (item,) = BOP(tmp_path)
     assert item.identifier == "000048/000001" and item.attributes == {"scene": "000048"}
     assert item.truth == {1: "obj_000008", 2: "obj_000014"}
+    assert_refused("`thor2 evaluate bop` reads", FrameFolder, tmp_path)
     color = cv2.cvtColor(cv2.imread(str(scene / "rgb" / "000001.png")), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(item.frame.color, color)
     depth = cv2.imread(str(scene / "depth" / "000001.png"), cv2.IMREAD_UNCHANGED)
