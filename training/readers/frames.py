@@ -113,8 +113,8 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """Find the frames in folders and return them sorted by name; the names are unique.
 
     Args:
-        paths: frame folders, folders that contain frame folders (at any depth) or links to them or to their parents,
-            and BOP splits or scenes. A frame with several names in a folder counts once.
+        paths: frame folders, folders that contain frame folders or links to them, at any depth, and BOP splits or
+            scenes. A frame with several names in a folder counts once.
         depth_scale: see `read_frame`.
 
     Raises:
@@ -134,15 +134,17 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
-            # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
-            names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
-            images = [file for name in names for start in ("", "*/**/") for file in path.glob(start + name)]
-            of_path = []
-            # A link such as "latest" would add a frame a second time.
-            folders = sorted({file.parent for file in images}, reverse=True)
-            for folder in sorted({each.resolve(): each for each in folders}.values()):
-                name = folder.name if folder == path else folder.relative_to(path).as_posix()
-                of_path.append((folder, frame_files(folder).source(name, depth_scale)))
+            # A frame without colour is found, too, to report it. A link such as "latest" adds no frame a second time.
+            images, of_path, visited = {*FILE_NAMES["color"], *FILE_NAMES["depth"]}, [], set[str]()
+            for root, folders, files in os.walk(path, followlinks=True):
+                folders.sort()
+                if (real := os.path.realpath(root)) in visited:
+                    folders.clear()
+                elif not images.isdisjoint(files):
+                    folder = Path(root)
+                    name = folder.name if folder == path else folder.relative_to(path).as_posix()
+                    of_path.append((folder, frame_files(folder).source(name, depth_scale)))
+                visited.add(real)
         if not of_path:
             raise InputError(f"frames: {path} has no {', '.join(FILE_NAMES['color'])}; expected frames or a BOP split")
         located += of_path
