@@ -143,10 +143,9 @@ def _create_worker(settings: Settings, workers: int, digest: str | None = None) 
     end_with_parent(signal.SIGTERM)
     with ended_by_signals():  # uvicorn's handler would wait for the compilation.
         try:
-            app = create_app(settings, workers)
             if digest is not None and file_digest(settings.model / RUN_FILE) != digest:
                 raise InputError(f"model: {settings.model} has changed since the start; restart the service to use it")
-            return app
+            return create_app(settings, workers)
         except (InputError, OSError) as error:
             raise error if workers == 1 else SystemExit(f"error: a worker cannot start: {error}") from None
 

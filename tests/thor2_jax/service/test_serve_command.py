@@ -124,6 +124,14 @@ def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
 
 
+def test_metrics_of_workers_need_no_space_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write to a mapped file ends the process if its disk is full and the file has a hole there."""
+    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
+    finish_programs(start_program("from thor2_jax.service.metrics import Metrics; Metrics()"))
+    files = [path.stat() for path in tmp_path.iterdir()]
+    assert len(files) == 3 and all(file.st_blocks * 512 >= file.st_size for file in files)
+
+
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends a worker at once, which then does not compile for a minute; uvicorn handles it in a ready worker."""
     app, actions = create_app(Settings(run_dir), workers=2), []
