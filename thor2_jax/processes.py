@@ -124,7 +124,8 @@ class Processes:
         """Call `function`, which must be picklable like its arguments, in a process.
 
         The future raises the error of the function, TimeoutError if the call has not returned at `deadline` (a time of
-        `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other, or after `close`.
+        `time.monotonic`) or when the processes are closed, or ChildProcessError if `attempts` processes died one after
+        the other.
         """
         return self._threads.submit(self._call, function, arguments, attempts, deadline)
 
@@ -134,14 +135,12 @@ class Processes:
             try:
                 if idle is None or not idle.process.is_alive():
                     idle = self._start()
-                limit = max(deadline, time.monotonic() + MIN_SECONDS)
+                self._busy.add(idle)
+                limit = 0.0 if self._closed else max(deadline, time.monotonic() + MIN_SECONDS)
                 # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
                 timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), idle.process.kill)
                 timer.start()
-                self._busy.add(idle)
                 try:
-                    if self._closed:
-                        break
                     idle.pipe.send((function, arguments))
                     result, error = idle.pipe.recv()
                 finally:
@@ -152,9 +151,7 @@ class Processes:
             except (EOFError, OSError):  # The process has ended, or will.
                 if idle is not None:
                     idle.stop()
-                if self._closed:
-                    break
-                if time.monotonic() >= limit:
+                if self._closed or time.monotonic() >= limit:
                     raise TimeoutError("the deadline of a call was exceeded") from None
             else:
                 if error is not None:
@@ -165,7 +162,7 @@ class Processes:
         raise ChildProcessError(f"{attempts} worker processes died at the same item, possibly because memory ran out")
 
     def close(self) -> None:
-        """End the processes, also those with running calls, and cancel the calls that have not begun."""
+        """End the processes without waiting for running calls, and cancel the calls that have not begun."""
         self._closed = True
         for busy in list(self._busy):
             busy.process.kill()

@@ -154,12 +154,7 @@ class FrameOptions:
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics; see --help")
 
     def sources(
-        self,
-        segment: str | None = None,
-        model: "Segmenter | None" = None,
-        *,
-        masks: bool = True,
-        segments: bool = True,
+        self, segment: str | None = None, model: "Segmenter | None" = None, *, masks: bool = True
     ) -> list["FrameSource"]:
         """Return the frames, without reading them yet.
 
@@ -167,7 +162,6 @@ class FrameOptions:
             segment: segmenter that replaces the labels of the frames; None reads the labels, and segments recordings.
             model: the segmenter "model", if the command has one.
             masks: whether the frames need labels; if not, recordings are not segmented.
-            segments: whether the command has the option --segment.
 
         Raises:
             InputError: the options contradict each other, or a folder or a recording cannot be read.
@@ -189,7 +183,7 @@ class FrameOptions:
             needed = ["color", "depth", *["labels"] * (masks and segment is None), "intrinsics"]
             missing = ", ".join(f"--{name}" for name in needed if getattr(self, name) is None)
             if missing:
-                instead = ", or --segment in place of labels" if segments and "labels" in needed else ""
+                instead = ", or --segment in place of labels" if "labels" in needed else ""
                 raise InputError(f"{missing} is missing; one frame needs {', '.join(needed)}{instead}")
             assert self.color and self.depth and self.intrinsics
             files = FrameFiles(self.color, self.depth, self.labels, self.intrinsics)
