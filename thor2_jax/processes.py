@@ -7,7 +7,6 @@ import contextlib
 import math
 import multiprocessing
 import os
-import queue
 import signal
 import threading
 import time
@@ -113,10 +112,7 @@ class Processes:
     def __init__(self, count: int, context: Any, initialize: Callable[[], object], *blocked: signal.Signals) -> None:
         self._start = lambda: _Process(context, initialize, blocked)
         self._threads = ThreadPoolExecutor(count)
-        self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
-        self._busy, self._closed = set[_Process](), False
-        for _ in range(count):
-            self._idle.put(None)
+        self._processes, self._closed = dict[int, _Process](), False  # by the thread that waits for it
 
     def submit(
         self, function: Callable[..., Any], *arguments: Any, attempts: int = 1, deadline: float = math.inf
@@ -130,43 +126,39 @@ class Processes:
         return self._threads.submit(self._call, function, arguments, attempts, deadline)
 
     def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...], attempts: int, deadline: float) -> Any:
+        thread = threading.get_ident()
         for _ in range(attempts):
-            idle, limit = self._idle.get(), math.inf
+            process, limit = self._processes.get(thread), math.inf
             try:
-                if idle is None or not idle.process.is_alive():
-                    idle = self._start()
-                self._busy.add(idle)
+                if process is None or not process.process.is_alive():
+                    process = self._processes[thread] = self._start()
                 limit = 0.0 if self._closed else max(deadline, time.monotonic() + MIN_SECONDS)
                 # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
-                timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), idle.process.kill)
+                timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), process.process.kill)
                 timer.start()
                 try:
-                    idle.pipe.send((function, arguments))
-                    result, error = idle.pipe.recv()
+                    process.pipe.send((function, arguments))
+                    result, error = process.pipe.recv()
                 finally:
-                    self._busy.discard(idle)
                     timer.cancel()
                 if time.monotonic() >= limit:  # The timer may have ended the process after its answer.
                     raise TimeoutError
             except (EOFError, OSError):  # The process has ended, or will.
-                if idle is not None:
-                    idle.stop()
+                if process is not None:
+                    process.stop()
                 if self._closed or time.monotonic() >= limit:
                     raise TimeoutError("the deadline of a call was exceeded") from None
             else:
                 if error is not None:
                     raise error
                 return result
-            finally:
-                self._idle.put(idle)
         raise ChildProcessError(f"{attempts} worker processes died at the same item, possibly because memory ran out")
 
     def close(self) -> None:
         """End the processes without waiting for running calls, and cancel the calls that have not begun."""
         self._closed = True
-        for busy in list(self._busy):
-            busy.process.kill()
+        for process in list(self._processes.values()):
+            process.process.kill()
         self._threads.shutdown(cancel_futures=True)
-        while not self._idle.empty():
-            if (idle := self._idle.get()) is not None:
-                idle.stop()
+        for process in self._processes.values():
+            process.stop()

@@ -33,10 +33,8 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
     with pytest.raises(TimeoutError):  # It does not receive an argument that fills the pipe.
         pool.submit(len, bytes(10**7), deadline=time.monotonic()).result(HANG)
     pool.submit(os.getpid).result(HANG)
-    idle = pool._idle.get()
-    assert idle is not None
-    idle.stop()
-    pool._idle.put(idle)  # The pool does not notice the death of an idle process.
+    (idle,) = pool._processes.values()
+    idle.stop()  # The pool does not notice the death of an idle process.
     assert pool.submit(math.sqrt, 9.0).result(HANG) == 3.0
     with pytest.raises(ValueError, match="math domain error") as error:
         pool.submit(math.sqrt, -1.0).result(HANG)
@@ -52,7 +50,7 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
 def test_closing_ends_running_calls(begun: bool) -> None:
     pool = Processes(1, multiprocessing.get_context("spawn"), os.getpid)
     running = pool.submit(time.sleep, 10 * HANG, attempts=3)
-    wait_until(lambda: pool._busy or not begun)
+    wait_until(lambda: pool._processes or not begun)
     pool.close()
     with pytest.raises(TimeoutError):
         running.result(0)
