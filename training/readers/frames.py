@@ -4,6 +4,7 @@ The folder of a labelled frame contains color.png, depth.png, mask.png, intrinsi
 the intrinsics may also have the other names in `FILE_NAMES`.
 """
 
+import collections
 import dataclasses
 import functools
 import itertools
@@ -149,14 +150,14 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
             raise InputError(f"frames: {path} has no {', '.join(FILE_NAMES['color'])}; expected frames or a BOP split")
         located += of_path
     sources = [source for _, source in located]
+    counts = collections.Counter(folder.resolve() for folder, _ in located)
+    if repeated := [folder for folder, count in counts.items() if count > 1]:
+        raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
     if len({source.name for source in sources}) == len(sources):
         return sources
     # Frames in different folders may have the same name: their names are then relative to the common parent folder.
     common = Path(os.path.commonpath([folder.parent for folder, _ in located]))
     names = [folder.relative_to(common).as_posix() for folder, _ in located]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
     return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
