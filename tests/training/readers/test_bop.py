@@ -44,8 +44,9 @@ def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
     (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
     (tmp_path / "models").mkdir()
+    (tmp_path / "latest").symlink_to("000050")
     dataset = BOP(tmp_path)
-    items = [pickle.loads(pickle.dumps(dataset.only(k)))[0] for k in range(3)]  # as worker processes get frames
+    items = [pickle.loads(pickle.dumps(dataset.only(k)))[0] for k in range(len(dataset))]  # as in workers
     assert [item.identifier for item in items] == ["000048/1000000", "000050/000002", "000050/000010"]
     for item, seed in zip(items[1:], (2, 10), strict=True):
         np.testing.assert_array_equal(item.frame.color, images(seed)[0])
