@@ -307,7 +307,10 @@ class Recognizer:
         return map(model.corrected, prepared)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
-        """Prepare and describe the instances of a frame; their number may exceed the largest batch bucket."""
+        """Prepare and describe the instances of a frame; their number may exceed the largest batch bucket.
+
+        Raises InputError as `prepare`.
+        """
         describe = functools.partial(describe_looks, network=self.run.network, config=self.run.config)
         return DescribedFrame(*compute_by_chunks(self.prepare(frame), self.chunk, describe))
 
@@ -322,8 +325,8 @@ class Recognizer:
             answer_by: source of the answers, see `Model.answers_by`.
 
         Raises:
-            InputError: the run lacks a classifier of `classifiers`. An instance that cannot be described is not an
-                error: the `reason` of its answer explains why.
+            InputError: the frame has no labels, the run lacks a classifier of `classifiers`, or `answer_by` is unknown.
+                An instance that cannot be described is not an error: the `reason` of its answer explains why.
         """
         return answers(self.model, *self.infer(self.prepare(frame), classifiers, answer_by))
 
@@ -336,6 +339,9 @@ class Recognizer:
 
         Returns:
             Labels [H, W]; 0 is background.
+
+        Raises:
+            InputError: OpenCV is not installed.
         """
         labels = segment(frame)
         from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV

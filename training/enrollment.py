@@ -14,7 +14,7 @@ from typing import Any
 from thor2_jax import InputError, Recognizer
 from thor2_jax.files import atomic_directory
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
+from thor2_jax.gallery.enrollment import ObjectGallery, embedded_object
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, check_open_to_changes
 from thor2_jax.model.run_directory import TrainedRun, save_run
@@ -106,7 +106,7 @@ def enroll_objects(
             if len(new) < len(given):
                 skipped = [*skipped, f"views of {each} that are repeated or enrolled already: {len(given) - len(new)}"]
             if new or not given:
-                added[each] = enrolled_views(objects.embedding, new, kind, surface)
+                added[each] = embedded_object(objects.embedding, new, kind, surface)
         progress("enroll", len(names), len(names), "")
         if added:
             objects.add(added, extend=extend, replace=replace)

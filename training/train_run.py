@@ -32,7 +32,7 @@ from thor2_jax.errors import InputError, decoding
 from thor2_jax.files import check_output_directory, errors_name, locked, remove_written, write_text
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.compact_clouds import CompactClouds
-from thor2_jax.gallery.enrollment import ObjectGallery, enrolled_views
+from thor2_jax.gallery.enrollment import ObjectGallery, embedded_object
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.model.run_record import RUN_FILE, run_directories
@@ -361,7 +361,9 @@ def _publish(
         objects = ObjectGallery(run.classes, run.embedding)
         objects.open(complete / GALLERY_DIRECTORY)
         clouds = {name: CompactClouds.of(views) for name, views in enrolled.items()}
-        objects.add({name: enrolled_views(run.embedding, each, "frames") for name, each in clouds.items()}, extend=True)
+        objects.add(
+            {name: embedded_object(run.embedding, each, "frames") for name, each in clouds.items()}, extend=True
+        )
     files = [path for path in complete.rglob("*") if path.is_file()]
     for path in sorted(files, key=lambda path: path.name == RUN_FILE):
         place = directory / path.relative_to(complete)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import UNOPTIMIZED
 from rendered_objects import write_meshes, write_scene
 
 from benchmarks import levers
@@ -37,7 +36,6 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
 
 @pytest.mark.slow
 def test_a_small_table_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", (*NAMES, "mug_white"), seed)

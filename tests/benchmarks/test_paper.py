@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import UNOPTIMIZED
 from rendered_objects import write_meshes, write_scene
 
 from benchmarks import paper
@@ -113,7 +112,6 @@ def test_documented_figures_are_those_of_the_results() -> None:
 @pytest.mark.slow
 def test_a_small_comparison_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
-    monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", NAMES, seed)

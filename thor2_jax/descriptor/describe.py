@@ -160,6 +160,9 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         aligned: clouds in scaled units, as `align` returns them.
         network: the colour network; only its regions are used.
         config: settings of the descriptor. Static.
+
+    Raises:
+        InputError: `aligned` is not a batch of clouds, or another argument is of another type.
     """
     check_batch(aligned)
     check_types(network=network, config=config)
@@ -170,13 +173,27 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
 def describe_strips(
     strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """Return the descriptors of `strips` (fields [B, S, J], scaled units); otherwise equal to `describe`."""
+    """Return the descriptors of `strips` (fields [B, S, J], scaled units).
+
+    The other arguments, the result and the errors are those of `describe`.
+    """
     check_types(strips=strips, network=network, config=config, parameters=parameters)
     return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
-    """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours do not matter."""
+    """Return the persistence diagrams of aligned clouds (paper, section "TOPS").
+
+    Args:
+        aligned: clouds in scaled units, as `align` returns them; their colours do not matter.
+        config: settings of the descriptor. Static.
+
+    Returns:
+        Diagrams with fields [B, S, J], scaled units.
+
+    Raises:
+        InputError: `aligned` is not a batch of clouds, or `config` is of another type.
+    """
     return _diagrams(strips(aligned, colornet.load_default(), config), config)
 
 

@@ -89,8 +89,8 @@ class Intrinsics:
     Attributes:
         fx: focal length along a row, pixels.
         fy: focal length along a column, pixels.
-        cx: column of the principal point.
-        cy: row of the principal point.
+        cx: column of the principal point, pixels.
+        cy: row of the principal point, pixels.
         depth_scale: depth units per metre; 1000 if depth is in millimetres.
         width: columns of the images, if known; `RGBDFrame` checks it.
         height: rows of the images, if known.

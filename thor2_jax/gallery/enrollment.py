@@ -33,8 +33,8 @@ __all__ = [
     "ObjectGallery",
     "augmented_view",
     "embed_looks",
-    "enrolled_object",
-    "enrolled_views",
+    "embedded_object",
+    "gallery_object",
     "views_to_embed",
 ]
 
@@ -61,7 +61,7 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
     return np.concatenate(batches)[: len(views)]
 
 
-def enrolled_object(
+def gallery_object(
     embeddings: NDArray[Any], clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
     """Return an object that is enrolled at this time; `embeddings` [..., D] are those of `views_to_embed`."""
@@ -70,7 +70,7 @@ def enrolled_object(
     return GalleryObject(flat, clouds, source, date, surface)
 
 
-def enrolled_views(
+def embedded_object(
     embedding: Embedding, clouds: CompactClouds, source: str, surface: Mapping[str, NDArray[Any]] | None = None
 ) -> GalleryObject:
     """Return the views of an object as a gallery stores them; for `source` and `surface` see `ObjectGallery.enroll`.
@@ -82,7 +82,7 @@ def enrolled_views(
         raise InputError("views is empty; expected at least one view of the object")
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    return enrolled_object(embed_looks(embedding, views), clouds, source, surface)
+    return gallery_object(embed_looks(embedding, views), clouds, source, surface)
 
 
 def _contents(clouds: CompactClouds) -> list[bytes]:
@@ -236,9 +236,9 @@ class ObjectGallery:
     def weak_rejection(self) -> str:
         """Message that explains why few unknown objects are rejected, and what helps; empty if there is no cause."""
         objects, references = self.gallery.objects.values(), self.gallery.references
-        if few := sum(len(views.clouds) < FEW for views in objects):
+        if few := sum(len(enrolled.clouds) < FEW for enrolled in objects):
             return f"enrolled objects with fewer than {FEW} views: {few} of {len(objects)}; add views from other sides"
-        has_surfaces = all(views.surface is not None for views in objects)
+        has_surfaces = all(enrolled.surface is not None for enrolled in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
             return f"objects enrolled in a run without reference views: {len(objects)}; enroll more of them"
         return ""
@@ -258,11 +258,13 @@ class ObjectGallery:
     def _reembedded(self, report: Report, embedded: dict[str | None, GalleryObject], gallery: Gallery) -> Gallery:
         """Return the gallery with embedded objects; `embedded` has those of some files, and gets the others."""
         objects, total = dict[str, GalleryObject](), len(gallery.objects)
-        for name, views in gallery.objects.items():
-            if views.file not in embedded:
+        for name, enrolled in gallery.objects.items():
+            if enrolled.file not in embedded:
                 report(len(objects), total)
-                embedded[views.file] = enrolled_views(self.embedding, views.clouds, views.source, views.surface)
-            objects[name] = dataclasses.replace(embedded[views.file], date=views.date)
+                embedded[enrolled.file] = embedded_object(
+                    self.embedding, enrolled.clouds, enrolled.source, enrolled.surface
+                )
+            objects[name] = dataclasses.replace(embedded[enrolled.file], date=enrolled.date)
         report(total, total)
         return dataclasses.replace(gallery, embedding=self.embedding.fingerprint, objects=objects)
 
@@ -285,7 +287,7 @@ class ObjectGallery:
             trained=self.gallery.trained,
             search=self.gallery.search,
             references=self.embedding.references if gallery.objects else None,
-            version=self.embedding.sizes.version,
+            embedding_version=self.embedding.sizes.version,
         )
 
     def enroll(
@@ -316,7 +318,7 @@ class ObjectGallery:
         name = self.gallery.name_to_enroll(name, extend=extend, replace=replace)
         clouds = self.new_views(name, views, surface, extend=extend)
         if clouds or not views:
-            self.add({name: enrolled_views(self.embedding, clouds, source, surface)}, extend=extend, replace=replace)
+            self.add({name: embedded_object(self.embedding, clouds, source, surface)}, extend=extend, replace=replace)
 
     def new_views(
         self, name: str, views: Sequence[PreparedInstance], surface: Mapping[str, NDArray[Any]] | None, *, extend: bool
@@ -335,15 +337,15 @@ class ObjectGallery:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
 
         def change(gallery: Gallery) -> Gallery:
-            for name, views in objects.items():
+            for name, enrolled in objects.items():
                 # Another change may have added the same views, or some of them, since `new_views`.
-                new = _new_views(views.clouds, views.surface, gallery.objects.get(name) if extend else None)
-                if 0 < len(new) < len(views.clouds):
-                    given = [*views.clouds.views()]
+                new = _new_views(enrolled.clouds, enrolled.surface, gallery.objects.get(name) if extend else None)
+                if 0 < len(new) < len(enrolled.clouds):
+                    given = [*enrolled.clouds.views()]
                     clouds = CompactClouds.of([given[number] for number in new.values()])
-                    views = enrolled_views(self.embedding, clouds, views.source, views.surface)
+                    enrolled = embedded_object(self.embedding, clouds, enrolled.source, enrolled.surface)
                 if new:
-                    gallery = gallery.with_object(name, views, extend=extend, replace=replace)
+                    gallery = gallery.with_object(name, enrolled, extend=extend, replace=replace)
             return gallery
 
         self._change(change)

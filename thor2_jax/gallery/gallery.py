@@ -123,7 +123,7 @@ class Gallery:
         trained: class names of the run, in the order of the classifiers' outputs.
         hidden: trained classes that were forgotten or replaced; the classifiers' outputs for them are ignored.
         references: reference views of the embedding; None if it has none.
-        version: version of the embedding, see `EmbeddingSizes`.
+        embedding_version: version of the embedding, see `EmbeddingSizes`.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
         generation: number of changes on disk so far.
@@ -136,7 +136,7 @@ class Gallery:
     trained: tuple[str, ...] = ()
     search: str = "exact"
     references: "References | None" = None
-    version: int = 0
+    embedding_version: int = 0
     generation: int = 0
     stamp: tuple[int, int, int] | None = None
 
@@ -163,12 +163,14 @@ class Gallery:
             raise InputError(f"name: {known!r} is {state}; add views to it (extend) or replace it (replace)")
         return known
 
-    def with_object(self, name: str, views: GalleryObject, *, extend: bool = False, replace: bool = False) -> "Gallery":
+    def with_object(
+        self, name: str, enrolled: GalleryObject, *, extend: bool = False, replace: bool = False
+    ) -> "Gallery":
         """Return the gallery with a further object.
 
         Args:
             name: name of the object.
-            views: its views.
+            enrolled: its views.
             extend: add the views to an existing object or to a trained class.
             replace: discard the views of an existing object, and hide a trained class with this name.
 
@@ -177,9 +179,9 @@ class Gallery:
         """
         name = self.name_to_enroll(name, extend=extend, replace=replace)
         if name in self.objects and extend:
-            views = self.objects[name] + views
+            enrolled = self.objects[name] + enrolled
         hidden = (*self.hidden, name) if replace and self._is_answered_class(name) else self.hidden
-        objects = {**self.objects, name: dataclasses.replace(views, file=None)}
+        objects = {**self.objects, name: dataclasses.replace(enrolled, file=None)}
         return dataclasses.replace(self, objects=objects, hidden=hidden)
 
     def without(self, name: str) -> "Gallery":
@@ -192,7 +194,7 @@ class Gallery:
         is_class = self._is_answered_class(name)
         if name not in self.objects and not is_class:
             raise InputError(f"name: {name!r} is unknown; expected a name that this model recognizes: {self.summary}")
-        objects = {other: views for other, views in self.objects.items() if other != name}
+        objects = {other: enrolled for other, enrolled in self.objects.items() if other != name}
         return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
 
     def _is_answered_class(self, name: str) -> bool:
@@ -206,7 +208,7 @@ class Gallery:
         from outweighing those with few. Views of a trained class belong to the enrolled object with its name, if there
         is one, and views of a forgotten class to the background.
         """
-        embeddings = [views.embeddings for views in self.objects.values()]
+        embeddings = [enrolled.embeddings for enrolled in self.objects.values()]
         counts = np.array([len(each) for each in embeddings], np.float64)
         owner = np.repeat(np.arange(len(counts)), counts.astype(int))
         if self.references is not None:
@@ -233,8 +235,8 @@ class Gallery:
         They follow from `KEPT_WITH_SURFACE`. For objects without a surface, they follow from scores that are
         interpolated in `KEPT`, linearly in the logarithm of the number of views.
         """
-        views = [len(views.clouds) for views in self.objects.values()]
-        entries = KEPT[self.version]
+        views = [len(enrolled.clouds) for enrolled in self.objects.values()]
+        entries = KEPT[self.embedding_version]
         kept = entries[0] if self.references is None else entries[1 if self.references.classes else -1]
         scores = np.interp(np.log(views), np.log(list(kept)), list(kept.values()))
         scores[[each.surface is not None for each in self.objects.values()]] = KEPT_WITH_SURFACE
@@ -279,7 +281,7 @@ class Gallery:
         """The surfaces of those objects that were enrolled with a mesh, by the number of the object."""
         from thor2_jax.surfaces.surfaces import Surfaces  # imports JAX, which a list of the objects does not need
 
-        arrays = {number: views.surface for number, views in enumerate(self.objects.values())}
+        arrays = {number: enrolled.surface for number, enrolled in enumerate(self.objects.values())}
         return {number: Surfaces.of_arrays(each) for number, each in arrays.items() if each is not None}
 
     def with_evidence(self, scores: NDArray[np.float32], samples: "Sample") -> NDArray[np.float32]:

@@ -118,18 +118,18 @@ def _unusable(directory: Path, problem: str, repair: str = KEEP_OTHERS) -> Galle
 
 
 def load_gallery(
-    directory: Path, embedding: str | None = None, known: Gallery | None = None, *, rebuild: bool = False
+    directory: Path, fingerprint: str | None = None, earlier: Gallery | None = None, *, rebuild: bool = False
 ) -> Gallery:
     """Read a gallery; a gallery that does not exist is empty.
 
     Args:
         directory: directory of the gallery.
-        embedding: fingerprint that the gallery must have; None accepts any.
-        known: an earlier state of the gallery, whose objects are not read again.
+        fingerprint: fingerprint of the embedding that the gallery must have; None accepts any.
+        earlier: an earlier state of the gallery, whose objects are not read again.
         rebuild: if the index is missing, return a gallery of all object files.
 
     Raises:
-        GalleryError: a file is missing or damaged, the gallery has another embedding, or that of `known` was removed.
+        GalleryError: a file is missing or damaged, the gallery has another embedding, or that of `earlier` was removed.
             The message names the file.
     """
     for _ in range(3):
@@ -139,17 +139,17 @@ def load_gallery(
             return _rebuilt(directory)
         if index is None:
             check_index(directory)
-            if known is not None and (known.objects or known.hidden):
+            if earlier is not None and (earlier.objects or earlier.hidden):
                 raise GalleryError(f"gallery: {directory} was removed; restore it from a copy, or restart without it")
-            return Gallery(embedding or "")
-        if embedding is not None and index["embedding"] != embedding:
+            return Gallery(fingerprint or "")
+        if fingerprint is not None and index["embedding"] != fingerprint:
             raise GalleryError(
                 f"gallery: {directory} was enrolled with the embedding {index['embedding'][:8]}, and the run has "
-                f"{embedding[:8]}; embed its views again with `thor2 objects --reembed`"
+                f"{fingerprint[:8]}; embed its views again with `thor2 objects --reembed`"
             )
         # A file of the index is missing if a writer replaced it after the index was read, or if it was deleted.
         with contextlib.suppress(FileNotFoundError):
-            return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
+            return dataclasses.replace(_load_objects(directory, index, earlier), stamp=stamp)
     raise _unusable(directory, f"{directory} lacks files that {INDEX_FILE} names")
 
 
@@ -178,13 +178,13 @@ def _read_index(path: Path) -> dict[str, Any] | None:
     return dict(index)
 
 
-def _load_objects(directory: Path, index: dict[str, Any], known: Gallery | None) -> Gallery:
-    loaded = {} if known is None else {views.file: views for views in known.objects.values()}
+def _load_objects(directory: Path, index: dict[str, Any], earlier: Gallery | None) -> Gallery:
+    loaded = {} if earlier is None else {enrolled.file: enrolled for enrolled in earlier.objects.values()}
     objects: dict[str, GalleryObject] = {}
     for entry in index["objects"]:
-        views = loaded.get(entry["file"]) or _read_object(_object_file(directory, entry["file"]))[1]
-        objects[entry["name"]] = _with_origin(views, entry)
-    sizes = {views.embeddings.shape[1] for views in objects.values()}
+        enrolled = loaded.get(entry["file"]) or _read_object(_object_file(directory, entry["file"]))[1]
+        objects[entry["name"]] = _with_origin(enrolled, entry)
+    sizes = {enrolled.embeddings.shape[1] for enrolled in objects.values()}
     if len(sizes) > 1:
         raise GalleryError(f"gallery: {directory} has embeddings of {sorted(sizes)} numbers; expected one size")
     return Gallery(index["embedding"], objects, tuple(map(str, index["hidden"])), generation=index["generation"])
@@ -194,19 +194,19 @@ def _object_file(directory: Path, digest: str) -> Path:
     return directory / "objects" / f"{digest}.safetensors"
 
 
-def _origin(views: GalleryObject) -> dict[str, str]:
-    return {"source": views.source, "date": views.date}
+def _origin(enrolled: GalleryObject) -> dict[str, str]:
+    return {"source": enrolled.source, "date": enrolled.date}
 
 
-def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObject:
-    return dataclasses.replace(views, source=str(entry.get("source", "")), date=str(entry.get("date", "")))
+def _with_origin(enrolled: GalleryObject, entry: Mapping[str, Any]) -> GalleryObject:
+    return dataclasses.replace(enrolled, source=str(entry.get("source", "")), date=str(entry.get("date", "")))
 
 
-def _object_content(name: str, views: GalleryObject) -> bytes:
-    arrays = {"embeddings": views.embeddings, **vars(views.clouds)}
-    if views.surface is not None:
-        arrays |= {SURFACE + field: array for field, array in views.surface.items()}
-    return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(views)})})
+def _object_content(name: str, enrolled: GalleryObject) -> bytes:
+    arrays = {"embeddings": enrolled.embeddings, **vars(enrolled.clouds)}
+    if enrolled.surface is not None:
+        arrays |= {SURFACE + field: array for field, array in enrolled.surface.items()}
+    return pack_arrays(arrays, {"object": json.dumps({"name": name, **_origin(enrolled)})})
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
@@ -223,8 +223,10 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         arrays, metadata = unpack_arrays(content)
         about = json.loads(metadata.get("object", "{}"))
         of_surface = {name.removeprefix(SURFACE): arrays.pop(name) for name in list(arrays) if name.startswith(SURFACE)}
-        views = GalleryObject(arrays.pop("embeddings"), CompactClouds(**arrays), "", "", of_surface or None, path.stem)
-        return about.get("name"), _with_origin(views, about)
+        enrolled = GalleryObject(
+            arrays.pop("embeddings"), CompactClouds(**arrays), "", "", of_surface or None, path.stem
+        )
+        return about.get("name"), _with_origin(enrolled, about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
@@ -232,8 +234,8 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
 def update_gallery(
     directory: Path,
     change: Callable[[Gallery], Gallery],
-    embedding: str | None = None,
-    known: Gallery | None = None,
+    fingerprint: str | None = None,
+    earlier: Gallery | None = None,
     lock_seconds: float = LOCK_SECONDS,
 ) -> Gallery:
     """Change a gallery on disk without losing the change of another writer.
@@ -241,9 +243,9 @@ def update_gallery(
     Args:
         directory: directory of the gallery; created if it is missing.
         change: function of the gallery on disk that returns the new one. If it raises, nothing changes on disk.
-        embedding: fingerprint that the gallery must have. None accepts any, for a `change` that embeds the views again;
-            if the index is missing, the change then starts from the existing object files.
-        known: an earlier state of the gallery, whose objects are not read again.
+        fingerprint: fingerprint of the embedding that the gallery must have. None accepts any, for a `change` that
+            embeds the views again; if the index is missing, the change then starts from the existing object files.
+        earlier: an earlier state of the gallery, whose objects are not read again.
         lock_seconds: time to wait for another writer.
 
     Returns:
@@ -257,9 +259,9 @@ def update_gallery(
     busy = f"another process or thread has been writing to {directory} for {lock_seconds:.2g} s; try again when it ends"
     lock = locked(directory, GalleryBusyError(f"gallery: {busy}"), lock_seconds)
     with lock, new_directory(directory / "objects"):
-        before = load_gallery(directory, embedding, known, rebuild=embedding is None)
+        before = load_gallery(directory, fingerprint, earlier, rebuild=fingerprint is None)
         changed = dataclasses.replace(change(before), generation=before.generation + 1)
-        _remove_orphans(directory, {views.file for each in (before, changed) for views in each.objects.values()})
+        _remove_orphans(directory, {enrolled.file for each in (before, changed) for enrolled in each.objects.values()})
         objects = dict(changed.objects)
         written: list[Path] = []
         try:
@@ -267,11 +269,11 @@ def update_gallery(
                 # The index is written first, so that a killed writer leaves an empty gallery, not objects without it.
                 written.append(directory / INDEX_FILE)
                 write_text(written[0], _index_content(Gallery(changed.embedding)))
-            for name, views in changed.objects.items():
-                if views.file is None:
-                    content = _object_content(name, views)
+            for name, enrolled in changed.objects.items():
+                if enrolled.file is None:
+                    content = _object_content(name, enrolled)
                     file = content_digest([content])
-                    objects[name] = dataclasses.replace(views, file=file)
+                    objects[name] = dataclasses.replace(enrolled, file=file)
                     path = _object_file(directory, file)
                     if not path.exists():
                         written.append(path)
@@ -324,14 +326,14 @@ def _write_durably(path: Path, content: bytes) -> None:
 
 
 def _index_content(gallery: Gallery) -> str:
-    has_surface = any(views.surface is not None for views in gallery.objects.values())
+    has_surface = any(enrolled.surface is not None for enrolled in gallery.objects.values())
     index = {
         "format": FORMAT_WITH_SURFACES if has_surface else GALLERY_FORMAT,
         "generation": gallery.generation,
         "embedding": gallery.embedding,
         "objects": [
-            {"name": name, "file": views.file, "views": len(views.clouds), **_origin(views)}
-            for name, views in gallery.objects.items()
+            {"name": name, "file": enrolled.file, "views": len(enrolled.clouds), **_origin(enrolled)}
+            for name, enrolled in gallery.objects.items()
         ],
         "hidden": list(gallery.hidden),
     }
@@ -365,12 +367,12 @@ def _rebuilt(directory: Path) -> Gallery:
         previous = _read_index(directory / PREVIOUS_FILE) or previous
     listed = {entry["file"]: entry for entry in previous["objects"]}
     objects = []
-    for path, (name, views) in _own_objects(directory):
+    for path, (name, enrolled) in _own_objects(directory):
         entry = listed.get(path.stem)
         if name is None and entry is not None:
-            name, views = entry["name"], _with_origin(views, entry)
+            name, enrolled = entry["name"], _with_origin(enrolled, entry)
         # If two files have the same name, the one that the previous index lacks is newer.
-        objects.append((entry is None, views.date, name or f"object-{path.stem[:8]}", views))
+        objects.append((entry is None, enrolled.date, name or f"object-{path.stem[:8]}", enrolled))
     objects.sort(key=lambda each: each[:3])
-    of_name = {name: views for *_, name, views in objects}
+    of_name = {name: enrolled for *_, name, enrolled in objects}
     return Gallery("", of_name, tuple(map(str, previous["hidden"])), generation=previous["generation"] + 1)

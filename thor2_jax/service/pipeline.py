@@ -19,7 +19,7 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import compile_explanations, explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.gallery.enrollment import LOOKS, ObjectGallery, enrolled_object, views_to_embed
+from thor2_jax.gallery.enrollment import LOOKS, ObjectGallery, gallery_object, views_to_embed
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -310,7 +310,7 @@ class Service:
         results = await self._infer(views, request)
         embeddings = np.array([result.inference.embeddings[:LOOKS] for result in results])
         # Also without a new view, this is a change that can be undone.
-        added = {name: enrolled_object(embeddings, clouds, "frames")} if clouds else {}
+        added = {name: gallery_object(embeddings, clouds, "frames")} if clouds else {}
         return await self.change(lambda objects: objects.add(added, **flags), 409, "name", request)
 
     async def change(

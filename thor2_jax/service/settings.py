@@ -33,7 +33,8 @@ class Settings:
         max_batch: largest batch size, one of `capacity.BATCH_BUCKETS`.
         processes: number of processes that decode images and compute clouds.
         unknown_below: confidence below which an object is unknown, as in `Recognizer`; None is the run's own.
-        cache: directory of compiled programs, which a later start reuses; None disables the cache.
+        cache: directory of compiled programs, which a later start reuses; None keeps the setting of JAX, which commands
+            set to the user's cache directory.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: whether callers may enroll and forget objects.
         adapt: whether the camera's colour transform is estimated from the latest frames and applied.

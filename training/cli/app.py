@@ -117,7 +117,7 @@ def _lines() -> Progress:
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
-    help="Recognize objects on cluttered tables in RGB-D frames, trained on synthetic views only (THOR2 in JAX).",
+    help="Recognize objects on cluttered tables in RGB-D frames; synthetic views suffice for training (THOR2 in JAX).",
 )
 # A closed stream is None, and its file descriptor would go to the next file that is opened.
 sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))

@@ -60,8 +60,8 @@ ModelOption = Annotated[Path, typer.Option(help="Run directory of a trained mode
 SegmentOption = Annotated[
     str | None,
     typer.Option(
-        help="Segmenter to use instead of labels: table, model (for piles; only in recognize and explain), or another "
-        "one.",
+        help="Segmenter to use instead of labels: table, model (for piles; only in recognize and explain), or that of "
+        "another package.",
     ),
 ]
 GalleryOption = Annotated[
@@ -119,13 +119,13 @@ class FrameOptions:
 
     frames: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="FRAME", help="Frames: folders with color, depth, mask, intrinsics; or their parents."),
+        typer.Argument(metavar="FRAME", help="Folders with color, depth, mask, intrinsics; their parents; BOP scenes."),
     ] = None
     color: Annotated[Path | None, typer.Option(help="Colour image, PNG, JPEG or TIFF, in place of FRAME.")] = None
     depth: Annotated[Path | None, typer.Option(help="Depth image: PNG, TIFF, NPY or EXR.")] = None
     labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG or TIFF; 0 is background.")] = None
     intrinsics: Annotated[
-        Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
+        Path | None, typer.Option(help="Camera: fx, fy, cx, cy in JSON, ROS, BOP, RealSense, Open3D or a matrix.")
     ] = None
     depth_scale: Annotated[
         float | None, typer.Option(help="Depth units per metre. Default: as in the intrinsics, or 1000.")
@@ -134,9 +134,9 @@ class FrameOptions:
         Path | None, recording_option(help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags).")
     ] = None
     color_topic: Annotated[str | None, recording_option(help="Topic of colour images. Default: the only one.")] = None
-    depth_topic: Annotated[str | None, recording_option(help="Topic of aligned depth. Default: the only one.")] = None
-    camera_topic: Annotated[str | None, recording_option(help="Topic of camera_info. Default: the only one.")] = None
-    max_gap: Annotated[float, recording_option(help="Largest gap from colour to depth, seconds.")] = DEFAULT_MAX_GAP
+    depth_topic: Annotated[str | None, recording_option(help="Topic of depth. Default: the only (aligned) one.")] = None
+    camera_topic: Annotated[str | None, recording_option(help="camera_info topic. Default: beside the images.")] = None
+    max_gap: Annotated[float, recording_option(help="Largest time from colour to depth, seconds.")] = DEFAULT_MAX_GAP
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     @property
@@ -271,7 +271,7 @@ class WorkerOptions:
     workers: WorkersOption = 1
     engine: Annotated[
         Literal["local", "ray"],
-        typer.Option(help="Compute on this machine or on a Ray cluster (extra `cluster`) with the same paths."),
+        typer.Option(help="Compute on this machine, or on a Ray cluster (extra `cluster`) that has the same paths."),
     ] = "local"
     address: Annotated[
         str | None, typer.Option(help="Address of the Ray cluster. Default: the cluster on this machine.")

@@ -25,7 +25,7 @@ class ServiceOptions:
     max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32
     unknown_below: options.UnknownOption = None
     cache: Annotated[
-        Path | None, typer.Option(help="Directory for compiled programs, which makes the next start faster.")
+        Path | None, typer.Option(help="Directory for compiled programs. Default: the user's cache directory.")
     ] = None
     gallery: options.GalleryOption = None
     teach: Annotated[bool, typer.Option("--teach", help="Let clients enroll and forget objects.")] = False

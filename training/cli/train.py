@@ -72,9 +72,9 @@ class ProtocolOptions:
     epochs: Annotated[
         int | None,
         typer.Option(
-            help="Passes over the samples: of the embedding ({default.distractors.epochs}) and of the classifiers, "
-            "half at a learning rate of {default.fit.learning_rates[0]:g}, half at {default.fit.learning_rates[1]:g} "
-            "({default.fit.epochs}; paper: {paper.fit.epochs})."
+            help="Epochs of the embedding ({default.distractors.epochs}) and of the classifiers ({default.fit.epochs}; "
+            "paper: {paper.fit.epochs}), whose learning rate is {default.fit.learning_rates[0]:g} in the first half "
+            "and {default.fit.learning_rates[1]:g} in the second."
         ),
     ] = None
     batch_size: Annotated[int | None, typer.Option(help="Samples per step of the classifiers. {own}")] = None
@@ -104,8 +104,8 @@ def train(
     classifiers: Annotated[
         str | None,
         typer.Option(
-            help="The paper's classifiers to train, too, comma-separated: tops, tops2, ce. (none; "
-            "without an embedding, as with --paper: all)"
+            help="The paper's classifiers to train in addition, comma-separated: tops, tops2, ce. (none; all "
+            "without an embedding, as with --paper)"
         ),
     ] = None,
     baselines: Annotated[
@@ -135,7 +135,7 @@ def train(
     process: Annotated[int, typer.Option(min=0, help="Index of this process.")] = 0,
     quiet: options.QuietOption = False,
 ) -> None:
-    """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
+    """Train a recognizer on views of meshes, labelled frames or both. An interrupted training resumes.
 
     A run recognizes objects by an embedding: several small networks, fitted on the views and on distractors. Since
     distractors are objects of none of the classes, unknown objects get a low confidence. The embedding is also used to

@@ -82,7 +82,7 @@ def test_thresholds_grow_with_the_views_of_each_object() -> None:
         (2, references(("mug", 3)), {1: 0.145, 3: 0.235, 5: 0.25, 10: 0.305, 120: 0.39}),
         (2, references(), {1: 0.185, 3: 0.27, 5: 0.305, 10: 0.36, 120: 0.45}),
     ):
-        of_version = dataclasses.replace(gallery, references=reference_views, version=version)
+        of_version = dataclasses.replace(gallery, references=reference_views, embedding_version=version)
         thresholds = dict(zip(gallery.names, of_version.unknown_below, strict=True))
         for views, score in scores.items():
             odds = (score / 0.2) ** 3
