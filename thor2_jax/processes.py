@@ -7,7 +7,6 @@ import contextlib
 import math
 import multiprocessing
 import os
-import queue
 import signal
 import threading
 import time
@@ -113,9 +112,7 @@ class Processes:
     def __init__(self, count: int, context: Any, initialize: Callable[[], object], *blocked: signal.Signals) -> None:
         self._start = lambda: _Process(context, initialize, blocked)
         self._threads = ThreadPoolExecutor(count)
-        self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
-        for _ in range(count):
-            self._idle.put(None)
+        self._processes, self._closed = dict[int, _Process](), False  # by the thread that waits for it
 
     def submit(
         self, function: Callable[..., Any], *arguments: Any, attempts: int = 1, deadline: float = math.inf
@@ -123,46 +120,45 @@ class Processes:
         """Call `function`, which must be picklable like its arguments, in a process.
 
         The future raises the error of the function, TimeoutError if the call has not returned at `deadline` (a time of
-        `time.monotonic`), or ChildProcessError if `attempts` processes died one after the other.
+        `time.monotonic`) or when the processes are closed, or ChildProcessError if `attempts` processes died one after
+        the other.
         """
         return self._threads.submit(self._call, function, arguments, attempts, deadline)
 
     def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...], attempts: int, deadline: float) -> Any:
+        thread = threading.get_ident()
         for _ in range(attempts):
-            idle, limit = self._idle.get(), math.inf
+            process, limit = self._processes.get(thread), math.inf
             try:
-                if idle is None or not idle.process.is_alive():
-                    idle = self._start()
-                limit = max(deadline, time.monotonic() + MIN_SECONDS)
+                if process is None or not process.process.is_alive():
+                    process = self._processes[thread] = self._start()
+                limit = 0.0 if self._closed else max(deadline, time.monotonic() + MIN_SECONDS)
                 # A process that was stopped by a signal does not receive, so that sending to it takes as long, too.
-                timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), idle.process.kill)
+                timer = threading.Timer(min(limit - time.monotonic(), threading.TIMEOUT_MAX), process.process.kill)
                 timer.start()
                 try:
-                    idle.pipe.send((function, arguments))
-                    result, error = idle.pipe.recv()
+                    process.pipe.send((function, arguments))
+                    result, error = process.pipe.recv()
                 finally:
                     timer.cancel()
                 if time.monotonic() >= limit:  # The timer may have ended the process after its answer.
                     raise TimeoutError
             except (EOFError, OSError):  # The process has ended, or will.
-                if idle is not None:
-                    idle.stop()
-                if time.monotonic() >= limit:
+                if process is not None:
+                    process.stop()
+                if self._closed or time.monotonic() >= limit:
                     raise TimeoutError("the deadline of a call was exceeded") from None
             else:
                 if error is not None:
                     raise error
                 return result
-            finally:
-                self._idle.put(idle)
         raise ChildProcessError(f"{attempts} worker processes died at the same item, possibly because memory ran out")
 
     def close(self) -> None:
-        """Wait for running calls, cancel the others, and end the processes; Ctrl-C ends this process meanwhile."""
-        # With an exception here, Python would wait at its end, possibly forever. Only the main thread handles signals.
-        is_main = threading.current_thread() is threading.main_thread()
-        with ended_by_signals() if is_main else contextlib.nullcontext():
-            self._threads.shutdown(cancel_futures=True)
-            while not self._idle.empty():
-                if (idle := self._idle.get()) is not None:
-                    idle.stop()
+        """End the processes without waiting for running calls, and cancel the calls that have not begun."""
+        self._closed = True
+        for process in list(self._processes.values()):
+            process.process.kill()
+        self._threads.shutdown(cancel_futures=True)
+        for process in self._processes.values():
+            process.stop()

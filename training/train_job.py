@@ -200,7 +200,7 @@ def _read_frames(job: TrainJob) -> LabelledInstances | None:
         )
     if "thor" in job.baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
-    frames = FrameFolder([source for path in job.frames for source in find_frames([path])])
+    frames = FrameFolder(find_frames(job.frames))
     read = read_instances(frames, job.protocol.config.sigma_s, crop_size=job.crop_size)
     return dataclasses.replace(read, left_out=job.leave_out)
 

@@ -205,6 +205,7 @@ def train_run(
                 locks.enter_context(locked(out / CHECKPOINTS))
             begin_job(out, job, JOB)
         wait_for_all("begun")
+        check_begun(out, job, JOB)  # all processes need the options of the first one
         runs = []
         for fold in range(settings.folds):
             held_out = None if parts == 1 else fold_of == fold

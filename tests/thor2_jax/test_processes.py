@@ -5,11 +5,10 @@ import multiprocessing
 import os
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from processes import HANG
+from processes import HANG, wait_until
 
 from thor2_jax import processes
 from thor2_jax.processes import Processes
@@ -34,10 +33,8 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
     with pytest.raises(TimeoutError):  # It does not receive an argument that fills the pipe.
         pool.submit(len, bytes(10**7), deadline=time.monotonic()).result(HANG)
     pool.submit(os.getpid).result(HANG)
-    idle = pool._idle.get()
-    assert idle is not None
-    idle.stop()
-    pool._idle.put(idle)  # The pool does not notice the death of an idle process.
+    (idle,) = pool._processes.values()
+    idle.stop()  # The pool does not notice the death of an idle process.
     assert pool.submit(math.sqrt, 9.0).result(HANG) == 3.0
     with pytest.raises(ValueError, match="math domain error") as error:
         pool.submit(math.sqrt, -1.0).result(HANG)
@@ -49,11 +46,11 @@ def test_slow_and_dead_processes_are_replaced(monkeypatch: pytest.MonkeyPatch, r
         pool.submit(time.sleep, 0.2, deadline=0).result(HANG)
 
 
-def test_ctrl_c_again_while_running_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends the process at once, and does not leave one that waits forever."""
-    handlers, before = [], signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(
-        ThreadPoolExecutor, "shutdown", lambda *_, **__: handlers.append(signal.getsignal(signal.SIGINT))
-    )
-    Processes(2, multiprocessing.get_context("spawn"), os.getpid).close()
-    assert handlers == [signal.SIG_DFL] and signal.getsignal(signal.SIGINT) is before
+@pytest.mark.parametrize("begun", [True, False], ids=["", "starting"])
+def test_closing_ends_running_calls(begun: bool) -> None:
+    pool = Processes(1, multiprocessing.get_context("spawn"), os.getpid)
+    running = pool.submit(time.sleep, 10 * HANG, attempts=3)
+    wait_until(lambda: pool._processes or not begun)
+    pool.close()
+    with pytest.raises(TimeoutError):
+        running.result(0)

@@ -1,6 +1,7 @@
 """Trainings: uninterrupted, interrupted and resumed, with several folds, and two in the same run directory."""
 
 import dataclasses
+import functools
 import os
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from training.fitting.fit import FitContext
 from training.fitting.loop import Checkpoints, FitOptions
 from training.fitting.samples import sample_views
 from training.protocol import Protocol
+from training.storage.jobs import begin_job
 from training.train_run import train_run
 from training.views.normalized_views import MemoryViews, fold_of_views
 
@@ -172,6 +174,14 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
     assert_refused(r"begun\.json cannot be read", train, out)
+
+
+def test_a_process_with_other_options_than_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = Protocol(["tops"], dataclasses.replace(OPTIONS, epochs=4), CONFIG).record(source().digest)
+    begin = functools.partial(begin_job, tmp_path, job, module.JOB)
+    monkeypatch.setattr(module, "wait_for_all", lambda point: point == "begun" and begin())
+    monkeypatch.setattr("jax.process_index", lambda: 1)
+    assert_refused("epochs 4, not 3", train, tmp_path)
 
 
 def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:

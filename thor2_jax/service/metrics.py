@@ -2,10 +2,13 @@
 
 import functools
 import os
+from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from thor2_jax.files import write_bytes
 
 __all__ = ["Metrics", "count_requests"]
 
@@ -17,6 +20,11 @@ class Metrics:
     """Metrics of one process, or of all workers if `PROMETHEUS_MULTIPROC_DIR` names their shared directory."""
 
     def __init__(self) -> None:
+        """Create the metrics; raise OSError if the files that the workers share cannot be written."""
+        if directory := os.environ.get("PROMETHEUS_MULTIPROC_DIR"):
+            # The files are mapped: without their blocks, a disk that becomes full would end this process by SIGBUS.
+            for kind in ("counter", "gauge_livesum", "histogram"):
+                write_bytes(Path(directory) / f"{kind}_{os.getpid()}.db", bytes(2**16))
         registry = self._registry = CollectorRegistry()
         gauge = functools.partial(Gauge, registry=registry, multiprocess_mode="livesum")
         counter = functools.partial(Counter, registry=registry)

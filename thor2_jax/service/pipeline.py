@@ -91,10 +91,10 @@ class Service:
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Load the run; raise InputError if it cannot be read."""
+        """Load the run; raise InputError if it cannot be read, and OSError as `Metrics`."""
         self.settings = settings
-        self.metrics = Metrics()
         self.engine = InferenceEngine(settings)
+        self.metrics = Metrics()
         self.state = "starting"
         self.progress = ""
         self._in_progress = self._accepted = 0

@@ -21,6 +21,8 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import file_digest
+from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.processes import end_with_parent, ended_by_signals, signals_blocked
 from thor2_jax.service.app import create_app
 from thor2_jax.service.engine import InferenceEngine
@@ -59,11 +61,16 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         InputError: the run cannot be read, or the address is in use.
     """
     with listening(host, port) as (listener, url):
+        digest = None
+        if workers > 1:
+            with ended_by_signals():
+                InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
+            digest = file_digest(settings.model / RUN_FILE)
         settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
         loggers = {"thor2_jax.service": {"handlers": ["default"], "level": "INFO", "propagate": False}}
         loggers["python_multipart"] = {"level": "CRITICAL"}  # It warns of invalid forms, which are refused.
         config = uvicorn.Config(
-            functools.partial(_create_worker, settings, workers),
+            functools.partial(_create_worker, settings, workers, digest),
             factory=True,
             workers=workers,
             loop="asyncio",  # uvloop raises an error for each answer to a connection that was reset.
@@ -88,8 +95,6 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
             finally:
                 signal.signal(signal.SIGTERM, previous)
         else:
-            with ended_by_signals():
-                InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
             log.info("listening at %s; requests wait until a worker is ready", url)
             listener.set_inheritable(True)
             with tempfile.TemporaryDirectory() as directory:
@@ -127,16 +132,19 @@ class _Supervisor(Multiprocess):
             process.child_conn.close()
 
 
-def _create_worker(settings: Settings, workers: int) -> FastAPI:
+def _create_worker(settings: Settings, workers: int, digest: str | None = None) -> FastAPI:
     """Create the application of one process; a worker finishes the accepted requests when its parent has ended.
 
     Raises:
         InputError, OSError: as `create_app`, in a single process.
-        SystemExit: the same in a worker, which replaces another one after the run has changed.
+        SystemExit: the same in a worker, which replaces another one after the run has changed; or `digest` is not the
+            digest of the run's record, since the other workers answer by the former model.
     """
     end_with_parent(signal.SIGTERM)
     with ended_by_signals():  # uvicorn's handler would wait for the compilation.
         try:
+            if digest is not None and file_digest(settings.model / RUN_FILE) != digest:
+                raise InputError(f"model: {settings.model} has changed since the start; restart the service to use it")
             return create_app(settings, workers)
         except (InputError, OSError) as error:
             raise error if workers == 1 else SystemExit(f"error: a worker cannot start: {error}") from None

@@ -9,7 +9,6 @@ import contextlib
 import functools
 import gc
 import itertools
-import multiprocessing
 import os
 import re
 import shlex
@@ -219,8 +218,6 @@ def _repeat_interrupt(report: Callable[[Any], Any], lost: Any, seconds: float = 
 def _interrupt(number: int, _: object) -> NoReturn:
     """Raise KeyboardInterrupt, so that files are finished or removed; a second signal ends the process at once."""
     signal.signal(number, signal.SIG_DFL)
-    if multiprocessing.active_children():  # their running calls would be awaited
-        signal.raise_signal(number)
     raise KeyboardInterrupt
 
 

@@ -56,7 +56,8 @@ def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     paths = given.frames or ()
     runs = [path for path in paths if run_directories(path)]
     given = dataclasses.replace(given, frames=[path for path in paths if path not in runs])
-    folder = FrameFolder(given.sources())
+    options.check_belongs("--labels", given.labels, color=given.depth and given.color)
+    folder = FrameFolder(given.sources(masks=False))
     files = filter(None, [given.color, given.depth, given.labels, given.intrinsics])
     dataset = ", ".join(str(path.resolve()) for path in given.frames or files)
     if folder.note:

@@ -234,7 +234,7 @@ def _report(directory: Path, runs: Sequence[Any], has_baselines: bool) -> None:
     if runs and (enrolled := load_gallery(model / GALLERY_DIRECTORY).objects):
         views = ", ".join(f"{name} (views: {len(each.clouds)})" for name, each in enrolled.items())
         console.print(f"enrolled, too, since they have no mesh: {views}")
-    finished = "finished, with its baselines" if has_baselines else "finished already: nothing was trained"
+    finished = f"finished already: {'only missing baselines were' if has_baselines else 'nothing was'} trained"
     objects = f" (objects: {len(runs[0].classes)})" if runs else ""
     written = "run written to" if runs else f"{finished}; the run is in"
     frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()

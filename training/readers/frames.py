@@ -4,6 +4,7 @@ The folder of a labelled frame contains color.png, depth.png, mask.png, intrinsi
 the intrinsics may also have the other names in `FILE_NAMES`.
 """
 
+import collections
 import dataclasses
 import functools
 import itertools
@@ -113,8 +114,8 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """Find the frames in folders and return them sorted by name; the names are unique.
 
     Args:
-        paths: frame folders, folders that contain frame folders (at any depth) or links to them or to their parents,
-            and BOP splits or scenes. A frame with several names in a folder counts once.
+        paths: frame folders, folders that contain frame folders or links to them, at any depth, and BOP splits or
+            scenes. A frame with several names in a folder counts once.
         depth_scale: see `read_frame`.
 
     Raises:
@@ -134,27 +135,29 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
-            # "**" does not follow links to folders, "*" does. A frame without colour is found, too, to report it.
-            names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
-            images = [file for name in names for start in ("", "*/**/") for file in path.glob(start + name)]
-            of_path = []
-            # A link such as "latest" would add a frame a second time.
-            folders = sorted({file.parent for file in images}, reverse=True)
-            for folder in sorted({each.resolve(): each for each in folders}.values()):
-                name = folder.name if folder == path else folder.relative_to(path).as_posix()
-                of_path.append((folder, frame_files(folder).source(name, depth_scale)))
+            # A frame without colour is found, too, to report it. A link such as "latest" adds no frame a second time.
+            images, of_path, visited = {*FILE_NAMES["color"], *FILE_NAMES["depth"]}, [], set[str]()
+            for root, folders, files in os.walk(path, followlinks=True):
+                folders.sort()
+                if (real := os.path.realpath(root)) in visited:
+                    folders.clear()
+                elif not images.isdisjoint(files):
+                    folder = Path(root)
+                    name = folder.name if folder == path else folder.relative_to(path).as_posix()
+                    of_path.append((folder, frame_files(folder).source(name, depth_scale)))
+                visited.add(real)
         if not of_path:
             raise InputError(f"frames: {path} has no {', '.join(FILE_NAMES['color'])}; expected frames or a BOP split")
         located += of_path
     sources = [source for _, source in located]
+    counts = collections.Counter(folder.resolve() for folder, _ in located)
+    if repeated := [folder for folder, count in counts.items() if count > 1]:
+        raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
     if len({source.name for source in sources}) == len(sources):
         return sources
     # Frames in different folders may have the same name: their names are then relative to the common parent folder.
     common = Path(os.path.commonpath([folder.parent for folder, _ in located]))
     names = [folder.relative_to(common).as_posix() for folder, _ in located]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
     return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
@@ -182,10 +185,9 @@ class FrameFolder(LabelledFrames):
         labelled = [each for each in sources if each.files and each.files.names.is_file()]
         self.named = bool(labelled)
         if named and not self.named:
-            raise InputError(
-                f"frames: {first_names([each.name for each in sources])} has no labels.json; expected the names of the "
-                "objects in the frames"
-            )
+            names = first_names([each.name for each in sources])
+            advice = "" if sources[0].files else "; `thor2 evaluate bop` reads the names of a BOP dataset"
+            raise InputError(f"frames: {names}: no labels.json; expected the names of the objects{advice}")
         self.sources = labelled or sources
         self.identifiers = [source.name for source in self.sources]
         used = set(self.identifiers)

@@ -13,7 +13,6 @@ import contextlib
 import ctypes
 import functools
 import importlib
-import inspect
 import multiprocessing
 import os
 import signal
@@ -129,7 +128,6 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
                 raise InputError(f"engine is ray; expected HOST:PORT of its cluster as the address ({error})") from None
         with cluster:
             # Ray accepts functions only, not other callables such as partial functions.
-            task = function if inspect.isfunction(function) else lambda item: function(item)
-            yield from _map_ordered(ray.remote(task).remote, fetch, items, workers)
+            yield from _map_ordered(ray.remote(lambda item: function(item)).remote, fetch, items, workers)
 
     return run

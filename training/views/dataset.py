@@ -331,7 +331,7 @@ def render_dataset(
             write_text(out / MANIFEST, dataset.manifest)
         progress("render", len(dataset) + dataset.left_out, total, "")
         missing = [file for file in job.shards if file not in done]
-        with contextlib.closing(pool(render_task, job.tasks(missing))) as results:
+        with contextlib.closing(pool(render_task, job.tasks(missing, record["objects"]))) as results:
             for file, rendered in zip(missing, results, strict=True):
                 name, views = job.shards[file]
                 with with_context(f"object {name!r}"):
@@ -372,7 +372,7 @@ def render_crops(
         missing = [index for index, shard in enumerate(dataset.shards) if shard.crops not in done]
         n_done = len(dataset) - sum(dataset.shards[index].views for index in missing)
         progress(n_done, len(dataset))
-        tasks = job.tasks(dataset.shards[index].file for index in missing)
+        tasks = job.tasks((dataset.shards[index].file for index in missing), dataset.job["objects"])
         with contextlib.closing(pool(functools.partial(crops_of, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
                 views, name = dataset.read(index), dataset.shards[index].crops

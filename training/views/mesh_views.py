@@ -239,11 +239,17 @@ class RenderJob:
             yield load_mesh(source)
         progress("surfaces", len(self.meshes), len(self.meshes), "")
 
-    def tasks(self, files: Iterable[str]) -> Iterator[ViewTask]:
-        """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh."""
-        angles = self.angles
+    def tasks(self, files: Iterable[str], objects: Iterable[Mapping[str, str]]) -> Iterator[ViewTask]:
+        """Yield the task of each of these shards; consecutive shards of an object share one reading of its mesh.
+
+        Raises:
+            InputError: a mesh is unreadable, or is not the mesh in `objects`, those of the job's `record`.
+        """
+        angles, digests = self.angles, {each["name"]: each["mesh"] for each in objects}
         for name, group in itertools.groupby(map(self.shards.__getitem__, files), key=operator.itemgetter(0)):
             mesh = load_mesh(self.meshes[name])
+            if mesh.digest != digests[name]:
+                raise InputError(f"the mesh of {name!r} has changed during the rendering; restore it, or start anew")
             for _, views in group:
                 of_views = angles[views.start : views.stop]
                 yield ViewTask(name, mesh, of_views, views.start, self.augmentations, self.seed)

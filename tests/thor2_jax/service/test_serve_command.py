@@ -41,6 +41,11 @@ def test_missing_run_directory(workers: int, tmp_path: Path, serve: Command, cap
         server._create_worker(Settings(tmp_path), workers)
 
 
+def test_a_worker_refuses_a_run_that_was_trained_again(run_dir: Path) -> None:
+    with pytest.raises(SystemExit, match="has changed since the start; restart"):
+        server._create_worker(Settings(run_dir), 2, "the digest of the record that the other workers have read")
+
+
 def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
@@ -117,6 +122,14 @@ def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
         "print(*sorted(blocked)); print(signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
     )
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
+
+
+def test_metrics_of_workers_need_no_space_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write to a mapped file ends the process if its disk is full and the file has a hole there."""
+    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
+    finish_programs(start_program("from thor2_jax.service.metrics import Metrics; Metrics()"))
+    files = [path.stat() for path in tmp_path.iterdir()]
+    assert len(files) == 3 and all(file.st_blocks * 512 >= file.st_size for file in files)
 
 
 def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

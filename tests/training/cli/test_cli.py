@@ -223,7 +223,7 @@ def test_train_by_folds(
         assert "views are rendered" in refused(*arguments, "--baselines", "forest")
         (tmp_path / "run" / fold / "baselines").mkdir()
         (tmp_path / "run" / fold / "baselines" / "forest.safetensors").touch()
-    assert "with its baselines" in printed(*arguments, "--baselines", "forest")
+    assert "only missing baselines were trained" in printed(*arguments, "--baselines", "forest")
 
 
 @pytest.mark.usefixtures("unfitted")

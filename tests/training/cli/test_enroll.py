@@ -85,7 +85,10 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path, refused: C
     assert cell["instances"] == 2 and cell["accuracy"]["gallery"]["mean"] == 1.0
     assert report["instances"]["no_class"] == {"leaf": 1}
     page = (tmp_path / "report" / "report.html").read_text()
-    assert run_thor2("evaluate", "frames", *frame_options(frames / "a"), "--model", model) == 0
+    options = frame_options(frames / "a")
+    assert run_thor2("evaluate", "frames", *options, "--model", model) == 0
+    for given in (options[:2], [*options[:4], *options[6:]]):
+        assert "--segment" not in refused("evaluate", "frames", *given, "--model", model)
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 

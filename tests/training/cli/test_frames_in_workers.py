@@ -35,9 +35,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
-    for name, target in (("000", "000"), ("002", "002"), ("all", ".")):
+    (tmp_path / "a").mkdir()
+    for name, target in (("000", "000"), ("002", "002"), ("a/b", "001"), ("a/c", tmp_path), ("all", ".")):
         (tmp_path / name).symlink_to(folder / target, target_is_directory=True)
-    assert [one.name for one in find_frames([tmp_path])] == ["000", "002", *(f"all/00{k}" for k in "1345678")]
+    assert [one.name for one in find_frames([tmp_path])] == ["000", "002", "a/b", *(f"all/00{k}" for k in "345678")]
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, r
     recognizer = Recognizer.load(run)
     assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "classifiers"
     assert "finished already" in printed(*command)
-    message = refused("train", "--frames", frames / "0", frames / "0", "--out", run, *TINY)
+    message = refused("train", "--frames", frames / "1", frames / "0", "--out", run, *TINY)
     assert "out: " in message and "dataset" in message
 
 
@@ -115,7 +115,8 @@ def test_invalid_inputs(
         ("--frames frames --coordinator localhost:1 --processes 2", "coordinator: "),
         ("--dataset views --frames frames --sequences table.yaml", "sequences is table.yaml; expected none"),
         ("--meshes meshes --out meshes", "--out: meshes already contains"),
-        ("--frames frames frames/0 --embedding 9 --distractors meshes", "also a class"),
+        ("--frames frames frames/0", "0 is given twice"),
+        ("--frames frames one --embedding 9 --distractors meshes", "also a class"),
     ):
         command = ("train", "--out", tmp_path / "run", *TINY, *STEPS[4:], *arguments.split())
         assert expected in refused(*command), arguments

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from commands import Command
 from dataset_files import TWO, K, band, images, update, write_bop
+from refusals import assert_refused
 from toy_recognizers import NamesInOrder
 
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers.bop import BOP
-from training.readers.frames import find_frames
+from training.readers.frames import FrameFolder, find_frames
 
 
 def test_a_frame(tmp_path: Path) -> None:
@@ -23,6 +24,7 @@ def test_a_frame(tmp_path: Path) -> None:
     (item,) = BOP(tmp_path)
     assert item.identifier == "000048/000001" and item.attributes == {"scene": "000048"}
     assert item.truth == {1: "obj_000008", 2: "obj_000014"}
+    assert_refused("`thor2 evaluate bop` reads", FrameFolder, tmp_path)
     color = cv2.cvtColor(cv2.imread(str(scene / "rgb" / "000001.png")), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(item.frame.color, color)
     depth = cv2.imread(str(scene / "depth" / "000001.png"), cv2.IMREAD_UNCHANGED)
@@ -42,8 +44,9 @@ def test_the_order_of_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
     (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
     (tmp_path / "models").mkdir()
+    (tmp_path / "latest").symlink_to("000050")
     dataset = BOP(tmp_path)
-    items = [pickle.loads(pickle.dumps(dataset.only(k)))[0] for k in range(3)]  # as worker processes get frames
+    items = [pickle.loads(pickle.dumps(dataset.only(k)))[0] for k in range(len(dataset))]  # as in workers
     assert [item.identifier for item in items] == ["000048/1000000", "000050/000002", "000050/000010"]
     for item, seed in zip(items[1:], (2, 10), strict=True):
         np.testing.assert_array_equal(item.frame.color, images(seed)[0])

@@ -96,7 +96,8 @@ def test_frames_of_one_name_in_two_folders(tmp_path: Path) -> None:
         (("a", "b/deep"), ["a/000", "b/deep/000"]),
     ):
         assert [source.name for source in find_frames([tmp_path / path for path in paths])] == names
-    assert_refused("000 is given twice", find_frames, [tmp_path / "a", tmp_path / "a"])
+    for again in ("b", "b/deep"):
+        assert_refused("000 is given twice", find_frames, [tmp_path / "b", tmp_path / again])
 
 
 RECORDED = [table_frame(k) for k in range(3)]

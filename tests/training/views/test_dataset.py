@@ -172,6 +172,16 @@ def test_another_job_is_refused(copied: Path) -> None:
         assert files_of(copied) == before
 
 
+def test_a_mesh_that_changes_during_the_rendering(tmp_path: Path) -> None:
+    objects = dict(OBJECTS)
+
+    def change(stage: str, *_: object) -> None:
+        if stage == "render":
+            objects["tennis_ball"] = resized(1.1)
+
+    assert_refused("'tennis_ball' has changed", render_dataset, RenderJob(objects, 180, 90), tmp_path, progress=change)
+
+
 def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("training.views.mesh_views.CLOUDS_PER_SHARD", 8)
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
