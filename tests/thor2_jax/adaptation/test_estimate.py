@@ -16,10 +16,8 @@ from small_runs import class_probabilities, untrained_embedding_run, untrained_r
 
 import thor2_jax as thor2
 from thor2_jax.adaptation.estimate import (
-    EVIDENCE,
     GRID,
     MIN_INSTANCES,
-    PRIOR,
     adaptation_criterion,
     entropy,
     estimate_transform,
@@ -110,7 +108,7 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     certain = np.where(np.arange(len(GRID)) == 17, 0, 1e6)
     np.testing.assert_allclose(posterior_mean(certain), GRID[17])
     totals = np.random.default_rng(0).uniform(0, 3, len(GRID))
-    weights = np.exp(-EVIDENCE * totals) * np.exp(-0.5 * (GRID[:, 3] / PRIOR) ** 2)
+    weights = np.exp(-0.5 * totals) * np.exp(-0.5 * (GRID[:, 3] / 0.085) ** 2)
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
 
 

@@ -132,12 +132,13 @@ def test_the_service_adapts_after_enough_instances_if_told(
         assert all(a is b for a, b in zip(corrected, frame, strict=True))
     assert engine.adaptation is None and adaptation_answer(None) is None
     engine.correct(second, observe=True)
-    engine._online._thread.join()
+    (thread := engine._online._thread).join()
     adaptation = engine.adaptation
     assert adaptation.instances == EVERY + 2
     if not (trained or is_estimated):  # Estimates use objects that were enrolled after the start, too.
         assert estimate.estimate_transform.call_args.args[1](pack_instances(second, 4)).shape == (4, 2)
-    (corrected,) = engine.correct(second[:1], observe=False)
+    (corrected,) = engine.correct(second[:1], observe=True)
+    assert engine._online._thread is thread  # that starts no estimate
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()
     assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}

@@ -113,5 +113,7 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
     assert [name for name, _ in box[1]] == ["box"] and box[1] != others[0][1]
+    # With another order, other distractors would be held out when a training resumes.
+    assert Distractors(procedural=9, meshes={"box": tmp_path}).sources == [3, 5, 1, 6, 2, 4, 8, tmp_path, 7, 0]
     record = samples_record([0], NETWORK, SMALL_CONFIG, 1)
     assert record["color_network"] == NETWORK.fingerprint and "augmentations" in record

@@ -151,7 +151,9 @@ def test_further_networks_keep_the_first(views: Samples, fitted: tuple[Embedding
     with mock.patch.multiple(fit, _step=mock.Mock(wraps=fit._step), network_step=with_margin):
         two = fit_two(CLASSES, networks=2)
         assert fit._step._cache_size() == programs + 1  # all steps share one
-        assert len({call.args[5].length.tobytes() for call in fit._step.call_args_list}) == 36
+        calls = [call.args for call in fit._step.call_args_list]
+        assert len({args[5].length.tobytes() for args in calls}) == 36
+        assert len({str(key) for args in calls for key in jax.random.key_data(args[7]).tolist()}) == 72
     assert [numbers[:2] for numbers in progress] == [(3 * epoch, 36) for epoch in range(1, 13)]
     assert max(metrics.loss for *_, metrics in progress) < 1e-5
     assert dataclasses.replace(two, further=()).fingerprint == fitted[0].fingerprint
