@@ -119,7 +119,7 @@ def test_preparation_processes_receive_no_signal_of_a_terminal() -> None:
     assert finish_programs(start_program(code)) == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}\nset()\n"]
 
 
-def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
     """It ends a worker at once, which then does not compile for a minute; uvicorn handles it in a ready worker."""
     app, actions = create_app(Settings(run_dir), workers=2), []
 
@@ -133,10 +133,8 @@ def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyP
     for name in ("start", "wait_until_ready", "close"):
         monkeypatch.setattr(app.state.service, name, record)
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        asyncio.run(start())
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    request.addfinalizer(lambda: signal.signal(signal.SIGTERM, before))
+    asyncio.run(start())
     assert actions == [signal.SIG_DFL] * 2 + [signal.default_int_handler] * 2
 
 

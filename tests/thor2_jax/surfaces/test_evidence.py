@@ -201,16 +201,14 @@ def test_one_colour_has_no_correlation() -> None:
 
 
 def test_accelerators_compare_all_rows_at_once(
-    surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch
+    surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     clouds = PointClouds.pack(views)
     expected = np.asarray(evidence(surfaces, clouds, OWN))
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, default: default(*arguments))
     search_poses.clear_cache()
-    try:
-        np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
-    finally:
-        search_poses.clear_cache()
+    request.addfinalizer(search_poses.clear_cache)
+    np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("n_classes", [6, 1])

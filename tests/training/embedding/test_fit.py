@@ -131,6 +131,10 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
         similarity = learned @ learned.T
         gaps.append(similarity[same].mean() - similarity[~same].mean())
     assert gaps[1] > 1.5 * gaps[0] and len(embedding.references.label) == len(views)  # each view once
+    drop_out = nnx.jit(lambda key, model, *inputs: model.learned(*inputs, train=True, rngs=nnx.Rngs(dropout=key)))
+    inputs = descriptors, batch.statistics
+    drawn = [drop_out(jax.random.key(seed), nnx.clone(embedding.model), *inputs) for seed in (0, 0, 1)]
+    assert np.array_equal(*drawn[:2]) and np.abs(drawn[2] - drawn[1]).max() > 0.01
     basis = np.asarray(embedding.model.color_basis[...])
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
