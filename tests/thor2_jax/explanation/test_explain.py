@@ -13,9 +13,9 @@ from PIL import Image
 from refusals import assert_refused
 from scipy.special import logit
 from slow_tier import slow
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks, side_lengths
@@ -36,7 +36,6 @@ from training.objects.surfaces import surfaces_of
 from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
 
-NETWORK = colornet.load_default()
 CLASSES = ("a", "b", "c")
 FOUR = dataclasses.replace(SMALL_CONFIG, looks=4)
 

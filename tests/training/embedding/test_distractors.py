@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from rendered_objects import write_box
 from scipy.sparse import csr_array
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from training.embedding import distractors as module
 from training.embedding.distractors import Distractors, samples_record
 from training.fitting.samples import Samples
-
-NETWORK = colornet.load_default()
 
 STRIPS = csr_array(np.array([[0, 0.1, 0, 0], [0.2, 0, 0, 3]], np.float32))
 SAMPLES = Samples(STRIPS, np.ones((2, 14), np.float32), np.array([0, 1], np.int32), np.zeros(2, np.int32))

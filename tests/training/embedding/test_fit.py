@@ -14,9 +14,9 @@ import pytest
 from failures import Interrupted
 from flax import nnx
 from refusals import assert_refused
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import N_SCALARS, describe_aligned_looks, is_color
@@ -33,7 +33,6 @@ from training.fitting.samples import Samples, describe_batch
 from training.storage.jobs import save_arrays
 from training.views import normalized_views
 
-NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
 OBJECTS = range(2, 26, 3)  # all of their views have enough points
 CLASSES = ("a", "b")

@@ -11,9 +11,8 @@ import numpy as np
 import optax
 import pytest
 from refusals import assert_refused
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.networks.networks import MLP, model_arrays
 from training import train_run
@@ -24,7 +23,6 @@ from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
-NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, to compile quickly
 TOPS2 = FitContext("tops2", NETWORK, CONFIG)
 QUICK = FitOptions(epochs=8, batch_size=16, seed=3)

@@ -18,7 +18,7 @@ from commands import Command
 from failures import Interrupted
 from refusals import assert_refused
 from rendered_objects import write_box
-from small_clouds import random_clouds
+from small_clouds import CLOSED, random_clouds
 from written_files import files_of
 
 import thor2_jax
@@ -40,7 +40,6 @@ NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
 JOB = RenderJob(OBJECTS, 180, 90)
 """6 views an object: of 4 and 2 with the shards of these tests."""
-CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -228,7 +227,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Comma
 
 
 def views_of(clouds: list[Cloud]) -> NormalizedViews:
-    return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CONFIG)
+    return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CLOSED)
 
 
 def test_only_what_was_rendered_is_removed(copied: Path) -> None:
@@ -254,12 +253,12 @@ def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert views.view.tolist() == list(range(30)) and not views.copy.any()
         assert views.counts.tolist() == [len(xyz) for xyz, _ in clouds]
         for (xyz, rgb), cloud in list(zip(views.clouds(), clouds, strict=True))[::10]:
-            normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CONFIG)
+            normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CLOSED)
             assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= COORDINATE_STEP / 2 * 1.02
             assert np.array_equal(rgb, cloud[1])
         for (xyz, _), camera, cloud in zip(views.clouds(), views.camera, clouds, strict=True):
             distance = np.linalg.norm(xyz.astype(np.float64) - camera, axis=1)
-            np.testing.assert_allclose(distance, CONFIG.sigma_s * np.linalg.norm(cloud[0], axis=1), atol=1e-4)
+            np.testing.assert_allclose(distance, CLOSED.sigma_s * np.linalg.norm(cloud[0], axis=1), atol=1e-4)
         assert np.array_equal(views.xyz, views_of(clouds).xyz)
     record = json.loads(json.dumps(dataset.record))
     assert record["digest"] == dataset.digest == hashlib.sha256((tmp_path / MANIFEST).read_bytes()).hexdigest()
