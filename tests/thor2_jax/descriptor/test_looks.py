@@ -14,15 +14,7 @@ import thor2_jax as thor2
 from colornet.colors import GRID_WHITE, to_lab
 from thor2_jax.descriptor import describe, looks
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import (
-    N_BALANCED,
-    N_SCALARS,
-    aligned_looks,
-    balanced_histogram,
-    cloud_statistics,
-    describe_looks,
-    side_lengths,
-)
+from thor2_jax.descriptor.looks import aligned_looks, cloud_statistics, describe_looks, side_lengths
 
 WARMER = np.array([1.06, 1, 1 / 1.06], np.float32)
 
@@ -153,7 +145,7 @@ def test_statistics_of_a_cloud() -> None:
     scalars = [1, 0.5, 0.25, 0.75, np.sqrt(404) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
     region_points = np.asarray(described.color).sum(axis=(0, 1, 2))
     expected = [*scalars, *np.sqrt(region_points / region_points.sum())]
-    assert len(scalars) == N_SCALARS
+    assert len(scalars) == looks.N_SCALARS
     np.testing.assert_allclose(values, expected, atol=1e-4)
 
 
@@ -169,8 +161,8 @@ def test_balanced_histograms_are_those_of_colour_science() -> None:
         low = np.minimum(point.astype(int), (4, 5, 5))
         for corner in np.ndindex(2, 2, 2):
             expected[tuple(low + corner)] += share * np.abs(1 - np.array(corner) - (point - low)).prod()
-    actual = balanced_histogram(jnp.asarray(colors, jnp.float32)[None], jnp.asarray(mask)[None])
-    assert actual.shape == (1, N_BALANCED)
+    actual = looks.balanced_histogram(jnp.asarray(colors, jnp.float32)[None], jnp.asarray(mask)[None])
+    assert actual.shape == (1, looks.N_BALANCED)
     np.testing.assert_allclose(np.square(actual[0]), expected.ravel(), atol=1e-3)
 
 
