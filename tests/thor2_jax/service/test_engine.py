@@ -13,7 +13,6 @@ from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run, with_surfaces
 
 import thor2_jax as thor2
-from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
@@ -33,7 +32,7 @@ BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     monkeypatch.setattr(estimate, "CAPACITY", 512)
 
 

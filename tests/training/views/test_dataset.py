@@ -24,7 +24,6 @@ from written_files import files_of
 import thor2_jax
 from thor2_jax.errors import InputError
 from thor2_jax.files import locked
-from thor2_jax.surfaces.surfaces import SURFACES_FILE
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination
@@ -118,12 +117,12 @@ def changed(folder: Path) -> dict[str, int]:
 
 def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
     missing = copied / "0001-0000.safetensors"
-    for bad in (copied / "0000-0001.safetensors", copied / SURFACES_FILE):
+    for bad in (copied / "0000-0001.safetensors", copied / "surfaces.safetensors"):
         content = bytearray(bad.read_bytes())
         content[1000] ^= 1
         bad.write_bytes(content)
     missing.unlink()
-    with pytest.raises(InputError, match=f"{SURFACES_FILE} is missing or damaged; repeat `thor2 render`"):
+    with pytest.raises(InputError, match="surfaces.safetensors is missing or damaged; repeat `thor2 render`"):
         _ = ViewDataset.open(copied).surfaces
     before = changed(copied)
     render_dataset(JOB, copied)
@@ -139,7 +138,7 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
 
 def test_a_dataset_of_an_earlier_version_stays_as_it_is(copied: Path) -> None:
     """It has neither surfaces nor cameras."""
-    (copied / SURFACES_FILE).unlink()
+    (copied / "surfaces.safetensors").unlink()
     dataset, shards = ViewDataset.open(copied), list[Shard]()
     for shard in dataset.shards:
         arrays = safetensors.numpy.load((copied / shard.file).read_bytes())
