@@ -252,3 +252,14 @@ def test_points_stay_on_the_nearest_of_two_near_surfaces() -> None:
     fitted = fit_masks(frame, TRUTH, lambda frame: {1: distances, 2: distances})
     assert (fitted == TRUTH)[TRUTH > 0].mean() > 0.97
     np.testing.assert_array_equal(fitted > 0, grow(TRUTH > 0, 3))
+
+
+@pytest.mark.parametrize(("piece", "whole", "merged"), [(0.85, 0.9, 0), (0.85, 0.95, 1), (0.98, 1, 0), (0.96, 1, 1)])
+def test_pieces_are_merged_where_the_odds_grow_by_one(piece: float, whole: float, merged: int) -> None:
+    """Confidences above 0.99 count as 0.99."""
+    size = ONE_PIECE.sum()
+    recognize: Recognize = lambda frames: [  # noqa: E731
+        ("a", whole if (frame.label_image == 1).sum() == size else piece) for frame in frames
+    ]
+    labels = segment_known(FRAME, TRUTH, recognize, nowhere)
+    np.testing.assert_array_equal(labels, ONE_PIECE if merged else TRUTH)
