@@ -87,7 +87,8 @@ def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.f
     Returns:
         [..., 3] float64: L* in 0..100, a*, b*.
     """
-    import colour  # imported here, so that plots without a colour network need no colour-science
+    with np.printoptions():  # colour-science changes how NumPy prints arrays when it is imported
+        import colour  # imported here, so that plots without a colour network need no colour-science
 
     xyz = colour.sRGB_to_XYZ(np.asarray(rgb, np.float64) / 255.0)
     return np.asarray(colour.XYZ_to_Lab(xyz, np.array(white)), np.float64)

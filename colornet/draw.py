@@ -17,7 +17,6 @@ from colornet.network import ColorNetwork
 
 __all__ = ["draw_network", "draw_similarity", "plot_network"]
 
-_DPI = 150
 _TEXT_COLOR = "#222222"
 _EDGE_COLOR = "#8a8a8a"
 _PALE_EDGE_COLOR = "#dcdcdc"
@@ -123,4 +122,4 @@ def _contrasting(rgb: NDArray[np.float64]) -> str:
 
 def _save(figure: Figure, path: str | Path) -> None:
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI)
+        figure.savefig(temporary, format="png", dpi=150)

@@ -1,10 +1,15 @@
-"""Small clouds of points."""
+"""Small clouds of points, and the colour network and the constants by which they are described."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+import colornet
+import thor2_jax as thor2
 from thor2_jax.types import Cloud
+
+NETWORK = colornet.load_default()
+CLOSED = thor2.DescriptorConfig(homology="closed_form")
 
 
 def aligned_cloud(seed: int, n: int) -> Cloud:

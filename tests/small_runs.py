@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flax import nnx
 from numpy.typing import NDArray
+from small_clouds import NETWORK
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.model.inference import infer
@@ -34,12 +34,11 @@ def untrained_run(
     seed: int = 0,
 ) -> TrainedRun:
     """Return a run whose classifiers have random weights, other ones for each feature."""
-    network = colornet.load_default()
     classifiers = {
-        name: random_classifier(input_size(name, config, network.n_regions), len(classes), seed + k)
+        name: random_classifier(input_size(name, config, NETWORK.n_regions), len(classes), seed + k)
         for k, name in enumerate(features)
     }
-    return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+    return TrainedRun(config, NETWORK, tuple(classes), classifiers, record or {})
 
 
 def save_untrained_run(folder: Path, *arguments: Any, **options: Any) -> Path:

@@ -12,10 +12,9 @@ from image_files import small_frame, write_frame_files
 from processes import finish_programs, start_program
 from refusals import assert_refused
 from rendered_objects import write_box
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 from small_runs import save_untrained_run
 
-import colornet
 import thor2_jax as thor2
 from training.cli.app import TRAINING_PACKAGES
 
@@ -80,7 +79,7 @@ def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch
     clouds = thor2.PointClouds.pack(random_clouds(0, [9]))
     monkeypatch.setitem(sys.modules, "gudhi", None)
     config = thor2.DescriptorConfig(homology="gudhi", n_slices=2)
-    assert_refused("homology is .*closed_form", thor2.describe, clouds, colornet.load_default(), config)
+    assert_refused("homology is .*closed_form", thor2.describe, clouds, NETWORK, config)
 
 
 def names(requirements: list[str]) -> dict[str, str]:

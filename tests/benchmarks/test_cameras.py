@@ -14,8 +14,6 @@ from benchmarks import cameras
 from training.augmentation.simulated_cameras import CHOOSE
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 
-CLASSES = ("bowl", "can", "mug")
-
 
 def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
     for k in range(2):
@@ -82,7 +80,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     for k in range(2):
         write_frame_files(tmp_path / "video" / f"{k}", small_frame(k), {1: "mug", 4: "dragon"})
     for seed in range(2):
-        save_untrained_run(tmp_path / f"run{seed}", CLASSES, ("tops",), seed=seed)
+        save_untrained_run(tmp_path / f"run{seed}", ("bowl", "can", "mug"), ("tops",), seed=seed)
     out, picture = tmp_path / "out.json", tmp_path / "cameras.jpg"
     arguments = f"--model {tmp_path}/run0 {tmp_path}/run1 --frames {tmp_path}/video --out {out} --picture {picture}"
     monkeypatch.setattr("sys.argv", ["cameras", *arguments.split()])

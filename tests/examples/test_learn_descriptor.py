@@ -8,11 +8,9 @@ from refusals import assert_refused
 
 from training.objects.builtin_objects import builtin_objects
 
-ROOT = Path(__file__).parents[2]
-
 
 def test_one_object_is_refused(tmp_path: Path) -> None:
-    example = runpy.run_path(str(ROOT / "examples" / "learn_descriptor.py"))
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "learn_descriptor.py"))
     name, mesh = next(iter(builtin_objects().items()))
     compare = example["compare"]
     compare.__globals__["load_sets"] = lambda options: ({name: mesh}, {})

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from small_clouds import NETWORK
 from small_runs import untrained_run
 
-import colornet
 import thor2_jax as thor2
 from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
@@ -83,7 +83,6 @@ def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
     return Disk(tmp_path, monkeypatch)
 
 
-NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)
 FRAME = thor2.RGBDFrame(PHOTO, np.zeros((40, 50), np.uint16), PHOTO[..., 0] + 1, thor2.Intrinsics(1, 1, 0, 0))
 

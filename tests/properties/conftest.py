@@ -8,12 +8,11 @@ from typing import Any
 import jax
 import pytest
 from hypothesis import strategies as st
+from small_clouds import NETWORK
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import testing as laws
 
-NETWORK = colornet.load_default()
 GUDHI = thor2.DescriptorConfig(n_slices=3, n_strips=8, image_size=12)
 CLOSED = dataclasses.replace(GUDHI, homology="closed_form")
 SMALL_CONFIGS = {

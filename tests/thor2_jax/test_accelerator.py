@@ -12,9 +12,9 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_clouds import NETWORK
 from small_runs import untrained_embedding_run, with_surfaces
 
-import colornet
 import thor2_jax as thor2
 from benchmarks import run_gpu
 from benchmarks.timing import time_calls
@@ -24,7 +24,6 @@ from thor2_jax.model.model import Model
 from thor2_jax.networks.embedding import References
 from thor2_jax.networks.networks import FEATURES
 
-NETWORK = colornet.load_default()
 N_CLOUDS = 64
 
 

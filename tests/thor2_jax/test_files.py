@@ -16,30 +16,18 @@ from processes import HANG
 from refusals import assert_refused
 from written_files import killed
 
-from thor2_jax.files import (
-    atomic_directory,
-    atomic_write,
-    check_output_directory,
-    has_json,
-    json_digest,
-    parse_yaml,
-    read_table,
-    remove_leftovers,
-    remove_written,
-    temporary_directory,
-    write_text,
-)
+from thor2_jax import files
 
 
 def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text("old")
-    write_text(str(path), "π\n")
+    files.write_text(str(path), "π\n")
     assert path.read_bytes() == b"\xcf\x80\n" and stat.S_IMODE(path.stat().st_mode) == 0o644
-    write_text(path, os.fsdecode(b"frame \xff"))
+    files.write_text(path, os.fsdecode(b"frame \xff"))
     assert path.read_bytes() == b"frame \\udcff"
     with pytest.raises(FileNotFoundError):
-        write_text(tmp_path / "missing" / "a.txt", "")
+        files.write_text(tmp_path / "missing" / "a.txt", "")
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -47,7 +35,7 @@ def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
 def test_a_failure_leaves_the_old_file_and_nothing_else(error: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(error), atomic_write(path) as temporary:
+    with pytest.raises(error), files.atomic_write(path) as temporary:
         assert temporary.parent.parent == tmp_path and temporary.suffix == ".txt"
         temporary.write_text("half")
         assert path.read_text() == "old"
@@ -59,21 +47,23 @@ def test_a_new_or_empty_directory_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "empty")
     (tmp_path / "empty").mkdir()
     for directory in ("empty", "link", "new", "a/b/c"):
-        check_output_directory(tmp_path / directory)
-        check_output_directory(tmp_path / directory, "marker", ("partial",))
+        files.check_output_directory(tmp_path / directory)
+        files.check_output_directory(tmp_path / directory, "marker", ("partial",))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "link"]
 
 
 def test_a_used_directory_needs_a_marker(tmp_path: Path) -> None:
     for name in ("partial", ".lock", "marker"):
         (tmp_path / name).touch()
-        assert_refused(f"out: {tmp_path} already contains", check_output_directory, tmp_path)
+        assert_refused(f"out: {tmp_path} already contains", files.check_output_directory, tmp_path)
         if name != "marker":
-            check_output_directory(tmp_path, "marker", ("partial",))
-    assert_refused(f"out: {tmp_path} already contains marker", check_output_directory, tmp_path, "other", ("partial",))
-    check_output_directory(tmp_path, "marker")
+            files.check_output_directory(tmp_path, "marker", ("partial",))
+    assert_refused(
+        f"out: {tmp_path} already contains marker", files.check_output_directory, tmp_path, "other", ("partial",)
+    )
+    files.check_output_directory(tmp_path, "marker")
     (tmp_path / "a").touch()
-    assert_refused("contains .lock, a, marker; expected", check_output_directory, tmp_path)
+    assert_refused("contains .lock, a, marker; expected", files.check_output_directory, tmp_path)
 
 
 def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path) -> None:
@@ -81,37 +71,37 @@ def test_files_links_and_unwritable_directories_are_refused(tmp_path: Path) -> N
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to(tmp_path / "absent")
     for name in ("file", "file/below", "link", "link/below"):
-        assert_refused(f"out: {tmp_path / name} ", check_output_directory, tmp_path / name, "marker")
-    assert_refused("File name too long", check_output_directory, tmp_path / ("x" * 300), "marker")
+        assert_refused(f"out: {tmp_path / name} ", files.check_output_directory, tmp_path / name, "marker")
+    assert_refused("File name too long", files.check_output_directory, tmp_path / ("x" * 300), "marker")
     with small_disk(500):
-        assert_refused(f"out: {tmp_path / 'new' / 'deep'} .*large", check_output_directory, tmp_path / "new" / "deep")
+        assert_refused(f"out: {tmp_path}/new/deep .*large", files.check_output_directory, tmp_path / "new/deep")
 
 
 def test_digests_are_those_of_earlier_versions() -> None:
-    assert json_digest({"b": 1, "a": 2}) == hashlib.sha256(b'{"a": 2, "b": 1}').hexdigest()
+    assert files.json_digest({"b": 1, "a": 2}) == hashlib.sha256(b'{"a": 2, "b": 1}').hexdigest()
 
 
 def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
     target = tmp_path / "new" / "deeper" / "out"
-    with pytest.raises(KeyError), atomic_directory(target) as unfinished:
+    with pytest.raises(KeyError), files.atomic_directory(target) as unfinished:
         (unfinished / "half").write_text("x")
         raise KeyError
     for given, named in (((errno.ENOSPC, "full"), target), ((errno.EIO, "failed", "input"), "input")):
-        with pytest.raises(OSError, match=f"'{re.escape(str(named))}'"), atomic_directory(target):
+        with pytest.raises(OSError, match=f"'{re.escape(str(named))}'"), files.atomic_directory(target):
             raise OSError(*given)
     assert list(tmp_path.iterdir()) == []
     for content in ("first", "second"):
-        with atomic_directory(target) as unfinished:
+        with files.atomic_directory(target) as unfinished:
             assert content == "first" or (target / "file").read_text() == "first"
             (unfinished / "file").write_text(content)
         (target / "scan.ply").write_text("a user's")
     assert (target / "file").read_text() == "second"
-    with pytest.raises(KeyError), atomic_directory(target):
+    with pytest.raises(KeyError), files.atomic_directory(target):
         raise KeyError
     assert [path.name for path in target.parent.iterdir()] == ["out"] and (target / "file").read_text() == "second"
     assert (target / "scan.ply").read_text() == "a user's"
     (target / "folder").mkdir()
-    with pytest.raises(IsADirectoryError), atomic_directory(target) as unfinished:
+    with pytest.raises(IsADirectoryError), files.atomic_directory(target) as unfinished:
         for name in ("file", "folder"):
             (unfinished / name).write_text("third")
     assert (target / "file").read_text() == "second"
@@ -124,8 +114,8 @@ def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:
     link.symlink_to(killed(tmp_path.parent))
     for path in users:
         path.write_text("a user's")
-    remove_leftovers(tmp_path)
-    remove_leftovers(tmp_path / "missing")
+    files.remove_leftovers(tmp_path)
+    files.remove_leftovers(tmp_path / "missing")
     assert all(path.read_text() == "a user's" for path in users) and (link / "half").exists() and not own.exists()
 
 
@@ -137,8 +127,8 @@ def test_the_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> No
     done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.txt"], timeout=HANG)
     (left,) = tmp_path.iterdir()
     assert done.returncode == -signal.SIGKILL and left.name.startswith(".thor2-")
-    with temporary_directory(tmp_path) as running:
-        write_text(tmp_path / "b.txt", "")
+    with files.temporary_directory(tmp_path) as running:
+        files.write_text(tmp_path / "b.txt", "")
         assert {path.name for path in tmp_path.iterdir()} == {running.name, "b.txt"} and list(running.iterdir())
 
 
@@ -150,16 +140,16 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
         path.touch()
     (directory / "link").symlink_to(elsewhere)
     killed(directory / "crops")
-    remove_written(directory, r"manifest\.json", r"(.*/)?0\.npz")
+    files.remove_written(directory, r"manifest\.json", r"(.*/)?0\.npz")
     left = {path.relative_to(directory).as_posix() for path in directory.rglob("*")}
     assert left == {"crops", "crops/mine.npz", "link"} and (elsewhere / "0.npz").exists()
     for path in (directory / "crops" / "mine.npz", directory / "link"):
         path.unlink()
-    remove_written(directory)
-    remove_written(tmp_path / "missing")
+    files.remove_written(directory)
+    files.remove_written(tmp_path / "missing")
     assert not directory.exists()
     directory.symlink_to(elsewhere)
-    remove_written(directory, r"0\.npz")
+    files.remove_written(directory, r"0\.npz")
     assert directory.is_symlink() and elsewhere.is_dir() and not list(elsewhere.iterdir())
 
 
@@ -169,13 +159,13 @@ def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
 )
 def test_json_is_known_by_its_keys(content: str, is_own: bool, tmp_path: Path) -> None:
     (tmp_path / "file").write_text(content)
-    assert has_json(tmp_path / "file", ("a", "b")) == is_own and not has_json(tmp_path, ("a", "b"))
+    assert files.has_json(tmp_path / "file", ("a", "b")) == is_own and not files.has_json(tmp_path, ("a", "b"))
 
 
 def test_shared_and_nested_yaml_values_are_read() -> None:
-    assert parse_yaml(b"a: &row [1, 2]\nb: *row\n") == {"a": [1, 2], "b": [1, 2]}
-    assert parse_yaml(b"[" * 50 + b"]" * 50) is not None
-    assert parse_yaml(b"") is None
+    assert files.parse_yaml(b"a: &row [1, 2]\nb: *row\n") == {"a": [1, 2], "b": [1, 2]}
+    assert files.parse_yaml(b"[" * 50 + b"]" * 50) is not None
+    assert files.parse_yaml(b"") is None
 
 
 @pytest.mark.parametrize(
@@ -188,20 +178,20 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
 )
 def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
     with pytest.raises(ValueError):
-        parse_yaml(content)
+        files.parse_yaml(content)
 
 
 def test_yaml_has_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("thor2_jax.files.MAX_YAML_BYTES", 20)
     monkeypatch.setattr("thor2_jax.files.MAX_YAML_VALUES", 5)
-    assert parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
+    assert files.parse_yaml(b"[1,2,3,4]") == [1, 2, 3, 4]
     many = "more than 5 values"
     for content, message in ((b"[1]" + b" " * 18, "21 bytes"), (b"[{1},1,1]", many), (b"[&a [1,2],*a,*a]", many)):
         with pytest.raises(ValueError, match=message):
-            parse_yaml(content)
+            files.parse_yaml(content)
 
 
 def test_damaged_json_is_refused(tmp_path: Path) -> None:
     for content in ("[" * 10**6, "1" * 10**5, '{"fx": ' * 10**5, "[", "{} {}"):
         (tmp_path / "a.json").write_text(content)
-        assert_refused(r"a\.json is damaged", read_table, tmp_path / "a.json")
+        assert_refused(r"a\.json is damaged", files.read_table, tmp_path / "a.json")

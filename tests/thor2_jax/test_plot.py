@@ -8,13 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from refusals import assert_refused
+from small_clouds import CLOSED, NETWORK
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import plot
 
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
-NETWORK = colornet.load_default()
 RNG = np.random.default_rng(0)
 POINTS = (RNG.random((300, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1)).astype(np.float32)
 COLORS = RNG.integers(0, 256, (300, 3), np.uint8)
@@ -57,35 +55,35 @@ def test_values_replace_the_colors(ax) -> None:
 
 
 def test_slices_have_borders_and_leave_out_points_without_a_place(ax) -> None:
-    aligned = thor2.align(thor2.PointClouds.pack([(POINTS, COLORS)]), CONFIG)
-    plot.slices(ax, *aligned.unpack()[0], CONFIG, strips=True)
+    aligned = thor2.align(thor2.PointClouds.pack([(POINTS, COLORS)]), CLOSED)
+    plot.slices(ax, *aligned.unpack()[0], CLOSED, strips=True)
     levels = sorted({float(line.get_ydata()[0]) for line in ax.lines if len(set(line.get_ydata())) == 1})
     top = float(aligned.points[..., 2].max())
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
-    plot.slices(ax, np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS), COLORS, CONFIG)
-    assert len(ax.texts) == len(levels) - 1 + CONFIG.n_slices
+    plot.slices(ax, np.where(np.arange(len(POINTS))[:, None] < 2, np.nan, POINTS), COLORS, CLOSED)
+    assert len(ax.texts) == len(levels) - 1 + CLOSED.n_slices
 
 
 def test_diagram_has_every_pair(ax) -> None:
     clouds = thor2.PointClouds.pack([(POINTS, COLORS)])
-    diagrams = thor2.diagrams(thor2.align(clouds, CONFIG), CONFIG)
+    diagrams = thor2.diagrams(thor2.align(clouds, CLOSED), CLOSED)
     one = thor2.Diagrams(diagrams.births[0], diagrams.deaths[0], diagrams.mask[0])
-    plot.persistence_diagram(ax, one, CONFIG)
+    plot.persistence_diagram(ax, one, CLOSED)
     drawn = np.concatenate([line.get_xydata() for line in ax.lines if line.get_marker() == "o"])
     mask = np.asarray(one.mask)
     expected = np.column_stack([np.asarray(one.births)[mask], np.asarray(one.deaths)[mask]])
     np.testing.assert_array_equal(drawn, expected)
-    assert_refused("diagrams", plot.persistence_diagram, ax, diagrams, CONFIG)
+    assert_refused("diagrams", plot.persistence_diagram, ax, diagrams, CLOSED)
 
 
 def test_image_has_birth_to_the_right(ax) -> None:
     image = np.zeros((32, 32))
     image[20, 5] = 1  # birth 20, persistence 5
-    drawn = plot.persistence_image(ax, image, CONFIG)
+    drawn = plot.persistence_image(ax, image, CLOSED)
     assert drawn.get_array()[5, 20] == 1
     np.testing.assert_allclose(drawn.get_extent(), (-0.025, 0.775, -0.025, 0.775))
-    assert_refused("image", plot.persistence_image, ax, image[:31], CONFIG)
+    assert_refused("image", plot.persistence_image, ax, image[:31], CLOSED)
 
 
 def test_color_matrix_has_mean_colors(ax) -> None:
@@ -149,7 +147,7 @@ def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
     assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
     assert_refused("values is .*numbers", plot.attribution_colors, ["red"])
     assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)
-    assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CONFIG)
+    assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CLOSED)
     assert_refused("config is a ColorNetwork", plot.persistence_image, ax, np.zeros((32, 32)), NETWORK)
     assert_refused("network is a ndarray", plot.color_matrix, ax, NETWORK, np.zeros((31, 22)))
     assert_refused("matrix is 'red'", plot.color_vectors, ax, "red", NETWORK)

@@ -166,7 +166,7 @@ def test_instances_are_compared_with_surfaces() -> None:
 
 
 @pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])
-def test_nothing_compiles_after_warm_up(max_points: int, sizes: int) -> None:
+def test_nothing_compiles_after_warm_up(max_points: int, sizes: int, request: pytest.FixtureRequest) -> None:
     """JAX's monitoring counts the compilations of a recognizer that no other test uses."""
     run = with_surfaces(untrained_embedding_run(CLASSES, THOR2))
     compiled: list[str] = []
@@ -183,15 +183,13 @@ def test_nothing_compiles_after_warm_up(max_points: int, sizes: int) -> None:
         surface = surfaces_of([builtin_objects()["banana"]]).arrays
         fresh.objects.enroll("mesh", list(fresh.prepare(one)), "mesh", surface)
     jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
-        assert compiled
-        compiled.clear()
-        for count, frame in enumerate((one, two), 1):
-            assert [answer.classifier is not None for answer in fresh.recognize(frame)] == [True] * count
-        assert compiled == []
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
+    request.addfinalizer(lambda: jax.monitoring.unregister_event_duration_listener(listen))
+    assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
+    assert compiled
+    compiled.clear()
+    for count, frame in enumerate((one, two), 1):
+        assert [answer.classifier is not None for answer in fresh.recognize(frame)] == [True] * count
+    assert compiled == []
 
 
 def test_known_instances_are_located(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,14 +12,12 @@ from refusals import assert_refused
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks
-from small_clouds import random_clouds
+from small_clouds import CLOSED, NETWORK, random_clouds
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax import transformers
 
-NETWORK = colornet.load_default()
 TRANSFORMERS = (thor2.TopsTransformer, thor2.Tops2Transformer)
 SIZES = (256, 191, 153, 81, 92)
 
@@ -43,7 +41,7 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
 def test_values_are_those_of_describe(config: thor2.DescriptorConfig | None) -> None:
     """The default is the configuration of the paper."""
     clouds = random_clouds(0, SIZES)
-    chosen = config or thor2.DescriptorConfig(homology="closed_form")
+    chosen = config or CLOSED
     expected = thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, chosen)
     for transformer, values in zip(TRANSFORMERS, (expected.tops, expected.tops2), strict=True):
         rows = transformer(config=config).fit_transform(clouds)

@@ -15,19 +15,8 @@ from small_clouds import random_clouds
 from small_runs import class_probabilities, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.adaptation.estimate import (
-    EVIDENCE,
-    GRID,
-    MIN_INSTANCES,
-    PRIOR,
-    adaptation_criterion,
-    entropy,
-    estimate_transform,
-    evenly_spread,
-    objective,
-    posterior_mean,
-    transform_colors,
-)
+from thor2_jax.adaptation import estimate
+from thor2_jax.adaptation.estimate import GRID, adaptation_criterion, estimate_transform, posterior_mean
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FusionRule
@@ -54,7 +43,7 @@ def test_a_transform_follows_its_formula() -> None:
     expected = (grey[:, None] + np.exp(0.3) * (values - grey[:, None])).clip(0, 1)
     np.testing.assert_allclose(WARM(colors), 255 * expected, atol=0.51)
     parameters = jnp.array(dataclasses.astuple(WARM))
-    np.testing.assert_allclose(transform_colors(parameters, jnp.asarray(colors / 255)), expected, atol=1e-5)
+    np.testing.assert_allclose(estimate.transform_colors(parameters, jnp.asarray(colors / 255)), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
@@ -65,7 +54,7 @@ def test_a_damaged_transform_is_refused(stored: object) -> None:
 def test_entropy_counts_what_the_classes_lack() -> None:
     p = np.array([[0.2, 0.3, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 0.5, 0]])
     expected = [scipy_entropy([*row, 1 - sum(row)]) for row in p]
-    np.testing.assert_allclose(entropy(jnp.asarray(p)), expected, atol=1e-5)
+    np.testing.assert_allclose(estimate.entropy(jnp.asarray(p)), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("rule", ["max", "log-mean", *slow("mean")])
@@ -73,7 +62,7 @@ def test_the_objective_is_the_entropy_of_the_answers(rule: FusionRule) -> None:
     made = instances(11)  # two chunks, one with padding
     recognizer = Recognizer(run(), rule=rule)
     criterion = adaptation_criterion(recognizer.model)
-    total = objective(made, lambda clouds: criterion(clouds) / 2)  # the other half: unknown, before and after
+    total = estimate.objective(made, lambda clouds: criterion(clouds) / 2)  # the other half: unknown, before and after
     for transform in (ColorTransform(), WARM):
         corrected = [dataclasses.replace(each, colors=transform(each.colors)) for each in made]
         oriented = describe_looks(pack_instances(corrected, 16), run().network, run().config, 2)
@@ -109,14 +98,15 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     certain = np.where(np.arange(len(GRID)) == 17, 0, 1e6)
     np.testing.assert_allclose(posterior_mean(certain), GRID[17])
     totals = np.random.default_rng(0).uniform(0, 3, len(GRID))
-    weights = np.exp(-EVIDENCE * totals) * np.exp(-0.5 * (GRID[:, 3] / PRIOR) ** 2)
+    weights = np.exp(-0.5 * totals) * np.exp(-0.5 * (GRID[:, 3] / 0.085) ** 2)
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
 
 
 def test_instances_are_spread_evenly_and_too_few_are_refused() -> None:
-    few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(instances(1)[0], reason="too few points")]
-    assert evenly_spread(7, 3).tolist() == [0, 3, 6] and evenly_spread(7, 40).tolist() == [0, 1, 2, 3, 4, 5, 6]
-    message = f"9 usable instances; expected at least {MIN_INSTANCES}: .* unusable ones .1.; .* too few points"
+    few = [*instances(9), dataclasses.replace(instances(1)[0], reason="too few points")]
+    assert estimate.evenly_spread(7, 3).tolist() == [0, 3, 6]
+    assert estimate.evenly_spread(7, 40).tolist() == list(range(7))
+    message = "9 usable instances; expected at least 10: .* unusable ones .1.; .* too few points"
     assert_refused(message, estimate_transform, few, none_is_known)
 
 

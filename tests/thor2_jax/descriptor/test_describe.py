@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 from slow_tier import slow
-from small_clouds import aligned_cloud, random_clouds
+from small_clouds import CLOSED, NETWORK, aligned_cloud, random_clouds
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor import describe
 from thor2_jax.types import Cloud
-
-NETWORK = colornet.load_default()
-CLOSED = thor2.DescriptorConfig(homology="closed_form")
 
 
 def test_describe_equals_its_steps_and_its_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

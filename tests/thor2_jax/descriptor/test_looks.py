@@ -8,24 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import assert_refused
+from small_clouds import CLOSED, NETWORK
 
-import colornet
 import thor2_jax as thor2
 from colornet.colors import GRID_WHITE, to_lab
 from thor2_jax.descriptor import describe, looks
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import (
-    N_BALANCED,
-    N_SCALARS,
-    aligned_looks,
-    balanced_histogram,
-    cloud_statistics,
-    describe_looks,
-    side_lengths,
-)
+from thor2_jax.descriptor.looks import aligned_looks, cloud_statistics, describe_looks, side_lengths
 
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
-NETWORK = colornet.load_default()
 WARMER = np.array([1.06, 1, 1 / 1.06], np.float32)
 
 Cloud = tuple[np.ndarray, np.ndarray]
@@ -48,26 +38,26 @@ PACKED = thor2.PointClouds.pack([LONG, SQUARE], rim=RIMS)
 
 def half_turned(cloud: Cloud) -> np.ndarray:
     """Return the points [n, 3] of a cloud that is packed alone and aligned after a half turn about z."""
-    normal = thor2.mirror(thor2.view_normalize(thor2.PointClouds.pack([cloud]), CONFIG), "xy")
-    return thor2.turn(normal, CONFIG).unpack()[0][0]
+    normal = thor2.mirror(thor2.view_normalize(thor2.PointClouds.pack([cloud]), CLOSED), "xy")
+    return thor2.turn(normal, CLOSED).unpack()[0][0]
 
 
 def test_the_second_of_two_looks_or_without_a_rim_is_a_half_turn() -> None:
     unknown, none = (thor2.PointClouds.pack([LONG, SQUARE], rim=rim) for rim in (None, [None, None]))
     assert unknown.rim is None and none.rim is not None
     for clouds, count in ((PACKED, 2), (unknown, 4), (none, 4)):
-        seconds = aligned_looks(clouds, CONFIG, count).unpack()[1::count]
+        seconds = aligned_looks(clouds, CLOSED, count).unpack()[1::count]
         for (points, colors), cloud in zip(seconds, (LONG, SQUARE), strict=True):
             np.testing.assert_allclose(points, half_turned(cloud), atol=2e-6)
             np.testing.assert_array_equal(colors, np.float32(cloud[1]) / np.float32(255))
 
 
 def test_four_looks_are_those_of_changed_clouds() -> None:
-    aligned = aligned_looks(PACKED, CONFIG, 4)
-    np.testing.assert_allclose(aligned.camera[::4], thor2.align(PACKED, CONFIG).camera, atol=1e-6)
+    aligned = aligned_looks(PACKED, CLOSED, 4)
+    np.testing.assert_allclose(aligned.camera[::4], thor2.align(PACKED, CLOSED).camera, atol=1e-6)
     for number, ((points, colors), rim) in enumerate(zip((LONG, SQUARE), RIMS, strict=True)):
         assert 0 < rim.sum() < len(rim) / 2
-        given, shades = thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).unpack()[0][0], colors / 255
+        given, shades = thor2.align(thor2.PointClouds.pack([(points, colors)]), CLOSED).unpack()[0][0], colors / 255
         expected = [
             (given, shades),
             (half_turned((points[~rim], colors[~rim])), shades[~rim]),
@@ -84,7 +74,7 @@ def test_tiny_clouds_have_finite_looks() -> None:
     sizes = (0, 1, 3, 0, 1, 3)
     rims = [np.full(n, k > 2) for k, n in enumerate(sizes)]
     tiny = thor2.PointClouds.pack([(LONG[0][:n], LONG[1][:n]) for n in sizes], rim=rims)
-    described, aligned = describe_looks(tiny, NETWORK, CONFIG, 4), aligned_looks(tiny, CONFIG, 4)
+    described, aligned = describe_looks(tiny, NETWORK, CLOSED, 4), aligned_looks(tiny, CLOSED, 4)
     expected = [[n, 0 if rim.all() else n, n, n] for n, rim in zip(sizes, rims, strict=True)]
     assert np.asarray(aligned.mask).sum(axis=1).reshape(-1, 4).tolist() == expected
     assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
@@ -92,47 +82,47 @@ def test_tiny_clouds_have_finite_looks() -> None:
 
 def test_other_counts_are_refused() -> None:
     for count in (0, 3, 5):
-        assert_refused(f"count is {count}", aligned_looks, PACKED, CONFIG, count)
-        assert_refused(f"count is {count}", describe_looks, PACKED, NETWORK, CONFIG, count)
+        assert_refused(f"count is {count}", aligned_looks, PACKED, CLOSED, count)
+        assert_refused(f"count is {count}", describe_looks, PACKED, NETWORK, CLOSED, count)
 
 
 @pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])
 def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, recorded = describe_looks(PACKED, NETWORK, CONFIG, 4), Mock(wraps=aligned_looks)
+    whole, recorded = describe_looks(PACKED, NETWORK, CLOSED, 4), Mock(wraps=aligned_looks)
     monkeypatch.setattr(describe, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
     monkeypatch.setattr(looks, "aligned_looks", recorded)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    chunked = describe_looks(PACKED, NETWORK, CONFIG, 4)
+    chunked = describe_looks(PACKED, NETWORK, CLOSED, 4)
     assert recorded.call_count == calls
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked, whole)
 
 
 def test_an_occluded_end_decides_the_half_turn() -> None:
-    x = np.asarray(thor2.view_normalize(PACKED, CONFIG).points)[0, :, 0]
+    x = np.asarray(thor2.view_normalize(PACKED, CLOSED).points)[0, :, 0]
     boundary = np.zeros(PACKED.mask.shape, bool)
     boundary[0] = np.asarray(PACKED.mask)[0] & (x > x.max() - 0.01)
-    aligned = aligned_looks(dataclasses.replace(PACKED, boundary=jnp.asarray(boundary)), CONFIG, 2)
+    aligned = aligned_looks(dataclasses.replace(PACKED, boundary=jnp.asarray(boundary)), CLOSED, 2)
     np.testing.assert_array_equal(aligned.points[1], aligned.points[0])
     assert np.abs(aligned.points[3] - aligned.points[2]).max() > 0.01
 
 
 def test_descriptors_and_statistics_are_those_of_each_look() -> None:
-    described = describe_looks(PACKED, NETWORK, CONFIG, 4)
-    aligned = aligned_looks(PACKED, CONFIG, 4)
+    described = describe_looks(PACKED, NETWORK, CLOSED, 4)
+    aligned = aligned_looks(PACKED, CLOSED, 4)
     assert described.statistics.shape[:2] == described.shape == (2, 4)
-    np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CONFIG).tops2, atol=1e-4)
+    np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CLOSED).tops2, atol=1e-4)
     for row, cloud in enumerate(aligned.unpack()):
         alone = thor2.PointClouds.pack([cloud])  # points of the rim are not there, instead of masked
         descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
-        expected = thor2.describe_aligned(alone, NETWORK, CONFIG)
+        expected = thor2.describe_aligned(alone, NETWORK, CLOSED)
         np.testing.assert_allclose(descriptors.tops2, expected.tops2[0], atol=1e-4)
-        statistics = cloud_statistics(side_lengths(alone, CONFIG.alpha), alone, strips(alone, NETWORK, CONFIG))[0]
+        statistics = cloud_statistics(side_lengths(alone, CLOSED.alpha), alone, strips(alone, NETWORK, CLOSED))[0]
         np.testing.assert_allclose(described.statistics[row // 4, row % 4], statistics, atol=1e-4)
     assert np.abs(described.statistics[:, 2] - described.statistics[:, 3]).max() > 1e-3
 
 
 def test_overflow_is_that_of_the_first_look() -> None:
-    short = dataclasses.replace(CONFIG, n_slices=2)
+    short = dataclasses.replace(CLOSED, n_slices=2)
     described = describe_looks(PACKED, NETWORK, short, 4)
     np.testing.assert_array_equal(described.overflow, thor2.describe(PACKED, NETWORK, short).overflow)
     assert np.asarray(described.overflow).min() > 0
@@ -143,19 +133,19 @@ def test_fused_probabilities_are_geometric_means() -> None:
     logits = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
     odds = np.exp(logits.astype(np.float64))
     means = np.prod((odds / odds.sum(axis=1, keepdims=True)).reshape(2, 4, 3), axis=1) ** 0.25
-    fused = describe_looks(PACKED, NETWORK, CONFIG, 4).fuse(jnp.asarray(logits))
+    fused = describe_looks(PACKED, NETWORK, CLOSED, 4).fuse(jnp.asarray(logits))
     np.testing.assert_allclose(fused, means / means.sum(axis=1, keepdims=True), rtol=1e-5)
 
 
 def test_statistics_of_a_cloud() -> None:
     colors = LONG[1]
-    aligned = thor2.align(thor2.PointClouds.pack([LONG]), CONFIG)
-    described = strips(aligned, NETWORK, CONFIG)
+    aligned = thor2.align(thor2.PointClouds.pack([LONG]), CLOSED)
+    described = strips(aligned, NETWORK, CLOSED)
     values = np.asarray(cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), aligned, described))[0]
     scalars = [1, 0.5, 0.25, 0.75, np.sqrt(404) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
     region_points = np.asarray(described.color).sum(axis=(0, 1, 2))
     expected = [*scalars, *np.sqrt(region_points / region_points.sum())]
-    assert len(scalars) == N_SCALARS
+    assert len(scalars) == looks.N_SCALARS
     np.testing.assert_allclose(values, expected, atol=1e-4)
 
 
@@ -171,20 +161,20 @@ def test_balanced_histograms_are_those_of_colour_science() -> None:
         low = np.minimum(point.astype(int), (4, 5, 5))
         for corner in np.ndindex(2, 2, 2):
             expected[tuple(low + corner)] += share * np.abs(1 - np.array(corner) - (point - low)).prod()
-    actual = balanced_histogram(jnp.asarray(colors, jnp.float32)[None], jnp.asarray(mask)[None])
-    assert actual.shape == (1, N_BALANCED)
+    actual = looks.balanced_histogram(jnp.asarray(colors, jnp.float32)[None], jnp.asarray(mask)[None])
+    assert actual.shape == (1, looks.N_BALANCED)
     np.testing.assert_allclose(np.square(actual[0]), expected.ravel(), atol=1e-3)
 
 
 def test_side_lengths_are_those_before_the_turn() -> None:
-    extents = np.ptp(thor2.view_normalize(PACKED, CONFIG).points, axis=1)  # padding lies in a corner of the box
-    sides = side_lengths(thor2.align(PACKED, CONFIG), CONFIG.alpha)
+    extents = np.ptp(thor2.view_normalize(PACKED, CLOSED).points, axis=1)  # padding lies in a corner of the box
+    sides = side_lengths(thor2.align(PACKED, CLOSED), CLOSED.alpha)
     np.testing.assert_allclose(sides, np.sort(extents)[:, ::-1], atol=1e-4)
 
 
 def test_statistics_of_one_color_have_gradients() -> None:
     clouds = thor2.PointClouds.pack([(np.random.default_rng(0).random((50, 3)), np.full((50, 3), 90, np.uint8))])
-    described = strips(thor2.align(clouds, CONFIG), NETWORK, CONFIG)
+    described = strips(thor2.align(clouds, CLOSED), NETWORK, CLOSED)
 
     def total(colors: jax.Array, vectors: jax.Array) -> jax.Array:
         changed = dataclasses.replace(clouds, colors=colors), dataclasses.replace(described, color=vectors)

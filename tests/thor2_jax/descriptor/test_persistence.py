@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_clouds import aligned_cloud
+from small_clouds import NETWORK, aligned_cloud
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.persistence import diagrams_of_strips, persistence_images
 from thor2_jax.testing.values import pixel_masses
@@ -20,7 +19,7 @@ GUDHI = thor2.DescriptorConfig()
 def test_one_callback_per_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     trees, make = [], gudhi.SimplexTree
     clouds = thor2.PointClouds.pack([aligned_cloud(k, 50) for k in range(5)])
-    strips = thor2.strips(clouds, colornet.load_default(), GUDHI)
+    strips = thor2.strips(clouds, NETWORK, GUDHI)
     monkeypatch.setattr(gudhi, "SimplexTree", lambda: trees.append(1) or make())
     jax.block_until_ready(jax.vmap(lambda each: diagrams_of_strips(each, GUDHI))(strips))
     assert len(trees) == 1

@@ -9,10 +9,9 @@ import pytest
 from jax.sharding import Mesh
 from processes import finish_programs, free_port, start_program
 from refusals import assert_refused
-from small_clouds import aligned_cloud, random_clouds
+from small_clouds import NETWORK, aligned_cloud, random_clouds
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor import describe
 from thor2_jax.descriptor.describe import batch_mesh, describe_sharded, shard_clouds
@@ -42,11 +41,11 @@ def test_each_device_describes_its_clouds(monkeypatch: pytest.MonkeyPatch) -> No
     """With a function that compiles at once in place of `describe`, and one device."""
     monkeypatch.setattr(describe, "describe", lambda clouds, network, config: (clouds.points * config.alpha, clouds))
     config = dataclasses.replace(SMALL_CONFIG, alpha=0.3)  # of no other test
-    network, packed = colornet.load_default(), thor2.PointClouds.pack([aligned_cloud(k, 100) for k in range(3)])
-    turned, clouds = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)
+    packed = thor2.PointClouds.pack([aligned_cloud(k, 100) for k in range(3)])
+    turned, clouds = describe_sharded(shard_clouds(packed, batch_mesh()), NETWORK, config)
     np.testing.assert_allclose(turned, packed.points * config.alpha)
     jax.tree.map(np.testing.assert_array_equal, clouds, packed)
-    assert_refused("shard_clouds", describe_sharded, packed, network, config)
+    assert_refused("shard_clouds", describe_sharded, packed, NETWORK, config)
     assert_refused("multiple of 2", shard_clouds, packed, Mesh(np.array(jax.devices() * 2), ("batch",)))
 
 
@@ -56,7 +55,7 @@ def test_two_processes_with_four_devices_equal_one_device(homology: str, tmp_pat
     port = free_port()
     finish_programs(*(start_program(PROGRAM, port, rank, homology, tmp_path, devices=4) for rank in range(2)))
     clouds = thor2.PointClouds.pack([cloud for rank in range(2) for cloud in random_clouds(rank, range(100, 260, 20))])
-    expected = thor2.describe(clouds, colornet.load_default(), thor2.DescriptorConfig(homology=homology))
+    expected = thor2.describe(clouds, NETWORK, thor2.DescriptorConfig(homology=homology))
     for name in ("tops2", "overflow"):
         sharded = np.concatenate([np.load(tmp_path / f"{name}{rank}.npy") for rank in range(2)])
         np.testing.assert_allclose(sharded, getattr(expected, name), atol=1e-6)

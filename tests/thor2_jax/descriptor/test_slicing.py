@@ -2,13 +2,12 @@
 
 import jax
 import numpy as np
+from small_clouds import NETWORK
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.slicing import color_sets, region_sets, slices_and_strips
 from thor2_jax.testing.values import cells
 
-NETWORK = colornet.load_default()
 RELEASED = thor2.DescriptorConfig.released()
 
 

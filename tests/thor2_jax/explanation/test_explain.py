@@ -13,18 +13,16 @@ from PIL import Image
 from refusals import assert_refused
 from scipy.special import logit
 from slow_tier import slow
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
 
-import colornet
 import thor2_jax as thor2
-from thor2_jax import capacity
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks, side_lengths
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
 from thor2_jax.explanation import attributions, pictures
 from thor2_jax.explanation.changes import CHANGES, Change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions, surface_fits
-from thor2_jax.explanation.pictures import change_text
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.fusion import Calibration
@@ -36,7 +34,6 @@ from training.objects.surfaces import surfaces_of
 from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
 
-NETWORK = colornet.load_default()
 CLASSES = ("a", "b", "c")
 FOUR = dataclasses.replace(SMALL_CONFIG, looks=4)
 
@@ -73,7 +70,7 @@ def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig 
 
 @pytest.fixture(autouse=True)
 def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
 
 
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])
@@ -258,7 +255,7 @@ def test_changed_extents_keep_the_other_sides() -> None:
     shifted = changed_instance(INSTANCE, "color", np.array([0.1, 0, -1]), axes)
     np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(INSTANCE.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
-    assert " -0 " not in change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", INSTANCE))
+    assert " -0 " not in pictures.change_text(Change("extent", (0.9, 0.999, 1.25), 0.25, "bowl", INSTANCE))
 
 
 @pytest.mark.slow

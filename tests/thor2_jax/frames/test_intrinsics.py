@@ -1,6 +1,5 @@
 """Intrinsics: each format as other software writes it, sizes, lens distortion, and invalid files."""
 
-import io
 import json
 import re
 from pathlib import Path
@@ -48,11 +47,8 @@ roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
 ROS2_ECHO = ROS1_ECHO.replace("D:", "d:").replace("K:", "k:").replace("R:", "r:").replace("P:", "p:") + ROS1_ECHO
 
 
-def as_text(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.savetxt(stream, array)
-    return stream.getvalue()
-
+TEXT = b"6.155e+02 0.0e+00 3.1825e+02\n0.0e+00 6.1675e+02 2.415e+02\n0.0e+00 0.0e+00 1.0e+00\n"
+"""The matrix in the notation of `np.savetxt`."""
 
 IMAGES = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
 BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
@@ -77,7 +73,7 @@ FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
     "K": (as_json({"K": MATRIX.tolist(), "depth_scale": 4000}), Intrinsics(**PINHOLE, depth_scale=4000)),
     "camera_matrix": (as_json({"camera_matrix": MATRIX.tolist()}), Intrinsics(**PINHOLE)),
     "nine numbers in JSON": (as_json(MATRIX.ravel().tolist()), Intrinsics(**PINHOLE)),
-    "matrix in text with a comment": (b"\xef\xbb\xbf# K\r\n" + as_text(MATRIX), Intrinsics(**PINHOLE)),
+    "matrix in text with a comment": (b"\xef\xbb\xbf# K\r\n" + TEXT, Intrinsics(**PINHOLE)),
     "matrix in CSV": (b"615.5, 0, 318.25\n0, 616.75, 241.5\n0, 0, 1\n", Intrinsics(**PINHOLE)),
     "matrix in NPY": (encode_npy(np.asfortranarray(MATRIX.astype(np.float32))), Intrinsics(**PINHOLE)),
     "BOP entry": (as_json(BOP_ENTRY), Intrinsics(**PINHOLE, depth_scale=10_000)),

@@ -8,7 +8,6 @@ from scipy.spatial.distance import cdist
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, find_occlusion, instance_clouds
 
-HEIGHT, WIDTH = 120, 160
 CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)
 BACK, FRONT = 1, 2
 
@@ -21,7 +20,7 @@ def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[bool, n
 
 def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndarray, np.ndarray]:
     """Return depth in millimetres and labels of two adjacent blocks, at columns 30 to 79 and 80 to 129."""
-    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    labels = np.zeros((120, 160), np.uint8)
     labels[30:90, 30:80] = BACK
     labels[40:100, 80:130] = FRONT
     return np.choose(labels, [table, back, front]).astype(np.uint16), labels

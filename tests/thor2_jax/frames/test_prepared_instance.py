@@ -12,13 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.frames.prepared_instance import (
-    MIN_POINTS,
-    PreparedInstance,
-    instance_clouds,
-    pack_instances,
-    prepare_instance,
-)
+from thor2_jax.frames.prepared_instance import PreparedInstance, instance_clouds, pack_instances, prepare_instance
 from training.readers.frames import FrameFolder
 
 HEIGHT, WIDTH = 240, 320
@@ -117,7 +111,7 @@ def test_valid_depth(millimetres: int, used: bool) -> None:
 
 @pytest.mark.parametrize(
     ("distance", "size", "points"),
-    [(2250, (1, MIN_POINTS - 1), MIN_POINTS - 1), (2250, (1, MIN_POINTS), None), (300, (8, 10), 6)],
+    [(2250, (1, 29), 29), (2250, (1, 30), None), (300, (8, 10), 6)],
     ids=["too few", "enough", "several pixels in each voxel"],
 )
 def test_minimum_number_of_points(distance: int, size: tuple[int, int], points: int | None) -> None:
@@ -125,7 +119,7 @@ def test_minimum_number_of_points(distance: int, size: tuple[int, int], points: 
     cloud = only(frame_of(flat(distance), patch((1, 5, 5 + size[0], 10, 10 + size[1]))))
     assert (cloud.reason is None) == (points is None)
     if points is not None:
-        assert f"{points} points" in str(cloud.reason) and f"at least {MIN_POINTS}" in str(cloud.reason)
+        assert f"{points} points" in str(cloud.reason) and "at least 30" in str(cloud.reason)
 
 
 # Which points are dropped

@@ -250,7 +250,8 @@ def test_views_get_augmented_copies() -> None:
         assert len(recognizer.gallery.objects[source].embeddings) == count
 
 
-def test_a_run_directory_keeps_its_gallery(tmp_path: Path) -> None:
+def test_a_run_directory_keeps_its_gallery(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also if another writer forgets an object as soon as it is enrolled."""
     path = tmp_path / "run"
     save_run(dataclasses.replace(untrained_run((), ()), embedding=embedding()), path)
     assert load_run(path).classes == ()
@@ -264,6 +265,16 @@ def test_a_run_directory_keeps_its_gallery(tmp_path: Path) -> None:
     elsewhere = thor2.Recognizer.load(path, gallery=tmp_path / "elsewhere")
     elsewhere.enroll("pen", [(CLUTTER, 3)])
     assert first.objects.refresh() is False and (tmp_path / "elsewhere" / "index.json").is_file()
+    update = store.update_gallery
+
+    def overtaken(directory: Path, *given: Any) -> Gallery:
+        changed = update(directory, *given)
+        update(directory, lambda gallery: gallery.without("pen"))
+        return changed
+
+    monkeypatch.setattr(store, "update_gallery", overtaken)
+    first.enroll("pen", [(CLUTTER, 3)])
+    assert first.classes == ("brick", "book")
 
 
 def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
@@ -272,6 +283,8 @@ def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
     embedding().save(path / EMBEDDING_FILE)
     before = thor2.Recognizer.load(path)
     before.enroll("brick", [(CLUTTER, 1)])
+    index = path / "gallery" / "index.json"
+    index.write_text(index.read_text().replace(before.gallery.objects["brick"].date, "2026-01-02"))
     other.save(path / EMBEDDING_FILE)
     assert_refused("gallery.*reembed", thor2.Recognizer.load, path)
     meanwhile = functools.partial(before.enroll, "book", [(CLUTTER, 2)], extend=True)  # needs the lock when it is new
@@ -281,7 +294,8 @@ def test_another_embedding_embeds_the_views_again(tmp_path: Path) -> None:
         expected.enroll(name, [(CLUTTER, label)])
         embeddings = thor2.Recognizer.load(path).gallery.objects[name].embeddings
         np.testing.assert_array_equal(embeddings, expected.gallery.objects[name].embeddings)
-    assert json.loads((path / "gallery" / "index.json").read_text())["embedding"] == other.fingerprint
+    assert json.loads(index.read_text())["embedding"] == other.fingerprint
+    assert thor2.Recognizer.load(path).gallery.objects["brick"].date == "2026-01-02"
 
 
 def test_combined_values_of_classes_and_objects() -> None:

@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
-from thor2_jax.segmentation import known_objects
 from thor2_jax.segmentation.known_objects import Answer, Distances, Recognize, fit_masks, segment_known
 from thor2_jax.segmentation.pixels import grow, shrink
 
@@ -101,7 +100,7 @@ def located(*masks: NDArray[np.bool_]) -> Callable[[RGBDFrame], dict[int, Distan
 
 def test_pixels_of_other_surfaces_are_left_for_the_next_object(monkeypatch: pytest.MonkeyPatch) -> None:
     """All of a piece resembles an object at first; without surfaces, the piece remains."""
-    monkeypatch.setattr(known_objects, "ROUNDS", 0)
+    monkeypatch.setattr("thor2_jax.segmentation.known_objects.ROUNDS", 0)
     masks = TRUTH == 1, TRUTH == 2
     alike = knows(*masks)
 
@@ -117,7 +116,7 @@ def test_pixels_of_other_surfaces_are_left_for_the_next_object(monkeypatch: pyte
 
 def test_an_object_gets_all_pixels_on_its_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the upper half of one object is known."""
-    monkeypatch.setattr(known_objects, "ROUNDS", 0)
+    monkeypatch.setattr("thor2_jax.segmentation.known_objects.ROUNDS", 0)
     middle = np.median(np.nonzero(TRUTH == 1)[0])
     upper = (TRUTH == 1) & (np.arange(480)[:, None] < middle)
     recognize = knows(upper, TRUTH == 2)
@@ -151,7 +150,7 @@ def test_what_is_left_is_unknown_unless_it_is_small_or_large(
     frame = render(boxes, tilt=30, size=(480, 640))
     truth = frame.label_image
     if is_small:
-        monkeypatch.setattr(known_objects, "LEAST_PIXELS", (truth == 3).sum() * 1.2)
+        monkeypatch.setattr("thor2_jax.segmentation.known_objects.LEAST_PIXELS", (truth == 3).sum() * 1.2)
     recognize = knows(truth == 1, truth == 2, frame=frame)
     labels = segment_known(frame, (truth > 0).astype(np.int32), recognize, nowhere)
     assert labels.max() == found
@@ -253,3 +252,14 @@ def test_points_stay_on_the_nearest_of_two_near_surfaces() -> None:
     fitted = fit_masks(frame, TRUTH, lambda frame: {1: distances, 2: distances})
     assert (fitted == TRUTH)[TRUTH > 0].mean() > 0.97
     np.testing.assert_array_equal(fitted > 0, grow(TRUTH > 0, 3))
+
+
+@pytest.mark.parametrize(("piece", "whole", "merged"), [(0.85, 0.9, 0), (0.85, 0.95, 1), (0.98, 1, 0), (0.96, 1, 1)])
+def test_pieces_are_merged_where_the_odds_grow_by_one(piece: float, whole: float, merged: int) -> None:
+    """Confidences above 0.99 count as 0.99."""
+    size = ONE_PIECE.sum()
+    recognize: Recognize = lambda frames: [  # noqa: E731
+        ("a", whole if (frame.label_image == 1).sum() == size else piece) for frame in frames
+    ]
+    labels = segment_known(FRAME, TRUTH, recognize, nowhere)
+    np.testing.assert_array_equal(labels, ONE_PIECE if merged else TRUTH)

@@ -10,6 +10,7 @@ from segmentation_scenes import APART, CAMERA, TABLE_TOP, Box, best_overlaps, ca
 from slow_tier import slow
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.segmentation.foreground import _depth_edges, _plane_color
 from thor2_jax.segmentation.planes import DepthImage, dominant_planes
 from thor2_jax.segmentation.table import _refined, _trimmed, _without_holes, segment_table
 
@@ -103,6 +104,32 @@ def test_the_nearest_large_plane_is_the_support() -> None:
     assert support.distance == pytest.approx(np.median(depth[on_table]), rel=0.02) and floor.distance > 1.2
     assert support.share == pytest.approx(on_table.sum() / depth[20:].size, abs=0.02)
     np.testing.assert_allclose(support.heights(image)[20:], (0.75 * (1 - depth / table))[20:], atol=0.002)
+
+
+def test_points_of_a_plane_are_near_it_in_inverse_depth() -> None:
+    """Three of five points are on it, the others are less or more than 3 mm and 4 mm times the squared depth away."""
+    sides = np.random.default_rng(0).choice([-1, 0, 0, 0, 1], (240, 320))
+    for inverse, tolerance in ((0.5, 0.00475), (2.5, 0.02275)):
+        for distance, share in ((0.95, 1.0), (1.3, 0.6)):
+            image = DepthImage((1 / (inverse + distance * tolerance * sides)).astype(np.float32), CAMERA)
+            assert dominant_planes(image)[0].share == pytest.approx(share, abs=0.02)
+
+
+def test_pixels_of_another_colour_than_the_plane_around_are_left_out() -> None:
+    for difference, left_out in ((9, 0), (11, 1)):  # of three channels: 27 and 33
+        color = np.full((80, 80, 3), 100, np.uint8)
+        color[40:42, 40:42] += np.uint8(difference)
+        assert (_plane_color(color, np.ones((80, 80), bool))[3] == 0).sum() == left_out
+
+
+def test_steps_are_where_neighbours_differ() -> None:
+    """The slope between the neighbours of a pixel is 0.3 or 0.5 of the least step."""
+    columns = np.arange(64)
+    for inverse, least in ((2.0, 0.039), (0.5, 0.0165)):
+        for step, slope, expected in ((0.96, 0, []), (1.04, 0.3, [31, 32]), (1.04, 0.5, [30, 31, 32, 33])):
+            rows = np.tile(inverse + least * (step * (columns > 31) + slope / 2 * (columns - 31.5)), (48, 1))
+            (steps, _), _ = _depth_edges(DepthImage((1 / rows).astype(np.float32), CAMERA))
+            assert np.flatnonzero(steps[24]).tolist() == expected
 
 
 def test_frames_without_things() -> None:

@@ -28,7 +28,6 @@ from small_runs import save_untrained_run, small_embedding
 
 import thor2_jax as thor2
 from thor2_jax.frames.frames import encode_image
-from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
 from thor2_jax.service.pipeline import Service
@@ -60,7 +59,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_run(folder: Path, trained: tuple[str, ...] = ("a", "b"), record: dict[str, object] | None = None) -> Path:
     """Write a run with trained classes and a small embedding, which compiles quickly."""
     save_untrained_run(folder, trained, ("tops", "tops2") if trained else (), record=record)
-    small_embedding().save(folder / EMBEDDING_FILE)
+    small_embedding().save(folder / "embedding.safetensors")
     return folder
 
 

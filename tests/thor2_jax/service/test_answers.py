@@ -12,10 +12,9 @@ import pytest
 from processes import HANG
 from refusals import assert_refused
 from service_requests import check_refused
-from small_clouds import random_clouds
+from small_clouds import CLOSED, NETWORK, random_clouds
 from small_runs import assert_same_answers
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError, _recognitions
 from thor2_jax.frames.frames import encode_image
@@ -76,8 +75,7 @@ def test_a_frame_without_labels_is_segmented(
 
 def check_described(server: Any, inputs: list[tuple[np.ndarray, np.ndarray]]) -> thor2.Descriptors:
     """Compare the service's descriptors with those of the library, and return the latter."""
-    config = thor2.DescriptorConfig(homology="closed_form")
-    expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
+    expected = thor2.describe(thor2.PointClouds.pack(inputs), NETWORK, CLOSED)
     answer = Client(server.url, timeout=HANG).describe(inputs)
     np.testing.assert_allclose(answer.tops2, expected.tops2, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(answer.overflow, expected.overflow)
@@ -105,16 +103,15 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
 
 
 def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
-    network = colornet.load_default()
     model = Client(server.url, timeout=HANG).model()
     assert model.classes == CLASSES and set(model.classifiers) == {"ce", "tops", "tops2"}
-    assert model.config.n_slices == 7 and model.color_network == network.fingerprint
+    assert model.config.n_slices == 7 and model.color_network == NETWORK.fingerprint
     assert model.knows == f"{len(CLASSES)} objects: {', '.join(CLASSES[:6])}, ..."
     assert "local/path" not in str(model)
     answer = http.get("/v1/colornet").json()
-    np.testing.assert_allclose(answer["mean_rgb"], network.mean_rgb)
-    np.testing.assert_allclose(answer["similarity"], network.similarity)
-    assert len(answer["edges"]) == len(answer["edge_weights"]) == len(network.edges)
+    np.testing.assert_allclose(answer["mean_rgb"], NETWORK.mean_rgb)
+    np.testing.assert_allclose(answer["similarity"], NETWORK.similarity)
+    assert len(answer["edges"]) == len(answer["edge_weights"]) == len(NETWORK.edges)
 
 
 def test_health_page_and_unknown_paths(http: httpx.Client) -> None:

@@ -13,7 +13,6 @@ from small_clouds import random_clouds
 from small_runs import SMALL_CONFIG, assert_same_answers, untrained_embedding_run, with_surfaces
 
 import thor2_jax as thor2
-from thor2_jax import capacity
 from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
@@ -33,7 +32,7 @@ BY_CLASSIFIERS: dict[str, object] = {"answer_by": "classifiers"}
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     monkeypatch.setattr(estimate, "CAPACITY", 512)
 
 
@@ -132,12 +131,13 @@ def test_the_service_adapts_after_enough_instances_if_told(
         assert all(a is b for a, b in zip(corrected, frame, strict=True))
     assert engine.adaptation is None and adaptation_answer(None) is None
     engine.correct(second, observe=True)
-    engine._online._thread.join()
+    (thread := engine._online._thread).join()
     adaptation = engine.adaptation
     assert adaptation.instances == EVERY + 2
     if not (trained or is_estimated):  # Estimates use objects that were enrolled after the start, too.
         assert estimate.estimate_transform.call_args.args[1](pack_instances(second, 4)).shape == (4, 2)
-    (corrected,) = engine.correct(second[:1], observe=False)
+    (corrected,) = engine.correct(second[:1], observe=True)
+    assert engine._online._thread is thread  # that starts no estimate
     np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
     answer = adaptation_answer(adaptation).model_dump()
     assert answer == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}

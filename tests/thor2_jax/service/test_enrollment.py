@@ -26,7 +26,6 @@ import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import encode_image
-from thor2_jax.gallery import store
 from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.service import pipeline
 from thor2_jax.service.app import create_app
@@ -206,7 +205,7 @@ def test_a_full_disk_leaves_the_gallery(
     generation = enroll(http, files, "tall").json()["generation"]
     before = files_of(gallery)
     with monkeypatch.context() as patch:
-        patch.setattr(store, "write_text", full_disk)
+        patch.setattr("thor2_jax.gallery.store.write_text", full_disk)
         for answer in (enroll(http, files, "wide", 7), http.delete("/v1/objects/tall"), undo(http, generation)):
             check_refused(answer, 507, None)
     assert files_of(gallery) == before and enroll(http, files, "wide", 7).status_code == 200

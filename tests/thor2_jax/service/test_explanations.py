@@ -17,11 +17,10 @@ from PIL import Image
 from playwright.sync_api import Route, expect
 from processes import HANG
 from service_requests import check_refused
+from small_clouds import CLOSED, NETWORK
 from small_runs import untrained_run
 
-import colornet
 import thor2_jax as thor2
-from thor2_jax import capacity
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.errors import InputError
@@ -54,9 +53,8 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
         assert all(one[name] == other[name] for name in ("label", "name", "unrecognized"))
 
     described = thor2.Recognizer.load(run_dir).describe(frame)
-    config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
-    aligned = thor2.align(described.packed, config)
-    colors = np.asarray(strips(aligned, network, config).color)
+    aligned = thor2.align(described.packed, CLOSED)
+    colors = np.asarray(strips(aligned, NETWORK, CLOSED).color)
     shown = [one["details"] for one in answer["instances"] if one["details"] is not None]
     assert len(shown) == 3
     for row, (details, instance) in enumerate(zip(shown, described.usable, strict=True)):
@@ -175,7 +173,7 @@ def test_why_returns_pictures(
     service: Service, teaching_url: str, files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Almost all programs of an explanation are compiled before the first one."""
-    monkeypatch.setattr(capacity, "MIN_BATCH_POINTS", 512)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     service._compile_explanations(*service.engine.explanation_programs()).result(HANG)
     before = service.metrics.compilations._value.get()
     answer = ask(teaching_url, files).json()

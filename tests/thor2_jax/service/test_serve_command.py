@@ -132,7 +132,7 @@ def test_metrics_of_workers_need_no_space_later(tmp_path: Path, monkeypatch: pyt
     assert len(files) == 3 and all(file.st_blocks * 512 >= file.st_size for file in files)
 
 
-def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
     """It ends a worker at once, which then does not compile for a minute; uvicorn handles it in a ready worker."""
     app, actions = create_app(Settings(run_dir), workers=2), []
 
@@ -146,10 +146,8 @@ def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyP
     for name in ("start", "wait_until_ready", "close"):
         monkeypatch.setattr(app.state.service, name, record)
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        asyncio.run(start())
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    request.addfinalizer(lambda: signal.signal(signal.SIGTERM, before))
+    asyncio.run(start())
     assert actions == [signal.SIG_DFL] * 2 + [signal.default_int_handler] * 2
 
 

@@ -119,6 +119,9 @@ def test_views_with_poses_are_described_as_one_cloud() -> None:
     assert both.points[:, 0].max() == pytest.approx(second.points[:, 0].max(), abs=0.004)
     assert answer.points_used == len(both.points) > len(first.points)
     assert not both.boundary.any() and answer.frames == 2
+    for moved[0, 3] in (0.04, 0.06, 0.08, 0.1, 0.12, 0.14):
+        tracker.update(frame_of_squares({1: (10, 60, UNSURE_B)}), moved)
+    assert np.ptp(recognizer.described[-1].points[:, 0]) == pytest.approx(np.ptp(first.points[:, 0]) + 0.1, abs=0.004)
 
 
 def test_a_track_ends_when_its_object_is_gone() -> None:

@@ -25,7 +25,6 @@ from .conftest import augmented_view, flat_view, wall
 OBJECTS = builtin_objects()
 AUGMENTATIONS: dict[str, Any] = {name: kind() for name, (kind, _) in KINDS.items()} | {"base": Base(missing=1)}
 NO_LIGHT = Illumination(gamma=(1, 1), gain=(1, 1), cast=0, shading=(0, 0), saturation=(1, 1), veil=(0, 0), noise=(0, 0))
-NO_BLUR: dict[str, Any] = {"blur": (0, 0), "chroma": (0, 0)}
 
 
 def view_of(name: str = "mug_blue", azimuth: float = 0.6, polar: float = 1.1) -> RenderedView:
@@ -272,7 +271,7 @@ def test_colors_are_shifted_and_the_background_shows_at_the_outline() -> None:
     view.color[4:-4, 34:-4] = (200, 50, 25)
     shifts, colors = set(), []
     for seed in range(60):
-        result = augmented_view(view, seed, registration=Registration(shifted=1, shift=4, **NO_BLUR))
+        result = augmented_view(view, seed, registration=Registration(shifted=1, shift=4, blur=(0, 0), chroma=(0, 0)))
         assert np.array_equal(result.depth, view.depth)
         shifts.add(np.flatnonzero((result.color[34, 14:54] == (200, 50, 25)).all(axis=1))[0] - 20)
         colors.append(np.unique(result.color[view.depth > 0], axis=0))

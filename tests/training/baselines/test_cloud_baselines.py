@@ -6,29 +6,25 @@ import numpy as np
 import pytest
 from flax import nnx
 from sklearn.ensemble import RandomForestClassifier
-from small_clouds import random_clouds
+from small_clouds import CLOSED, NETWORK, random_clouds
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.networks.networks import model_arrays
 from training.baselines import cloud_baselines as module
 from training.baselines.baseline import BaselineInputs, Predictor
 from training.baselines.cloud_baselines import POINTS, PointNet, forest_features, load_pointnet
 
-NETWORK = colornet.load_default()
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
-
 
 def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
     clouds = [(xyz - xyz.min(axis=0) if len(xyz) else xyz, rgb) for xyz, rgb in random_clouds(1, sizes)]
-    return thor2.view_normalize(thor2.PointClouds.pack(clouds, camera=[0, 0, -3]), CONFIG)
+    return thor2.view_normalize(thor2.PointClouds.pack(clouds, camera=[0, 0, -3]), CLOSED)
 
 
 def test_features_match_numpy() -> None:
     clouds = normal((400, 1, 0, 57))
-    features = forest_features(clouds, NETWORK, CONFIG)
+    features = forest_features(clouds, NETWORK, CLOSED)
     assert features.shape == (4, 22 + 3 + 14)
-    aligned = np.asarray(thor2.turn(clouds, CONFIG).points, np.float64)
+    aligned = np.asarray(thor2.turn(clouds, CLOSED).points, np.float64)
     points, mask = np.asarray(clouds.points, np.float64), np.asarray(clouds.mask)
     colors = np.rint(np.asarray(clouds.colors) * 255).astype(np.uint8)
     for row, (n, expected) in enumerate(zip((400, 1, 0, 57), features, strict=True)):
@@ -41,9 +37,9 @@ def test_features_match_numpy() -> None:
         np.testing.assert_allclose(expected[22:25], points[row, here].max(axis=0), rtol=1e-6)
         x, y, z = aligned[row, here].T
         for k in range(7):
-            inside = np.floor(z / CONFIG.sigma_1) == k
-            strips = np.floor(x[inside] / CONFIG.sigma_2)
-            wide = (np.ptp(strips) + 1) * CONFIG.sigma_2 if inside.any() else 0
+            inside = np.floor(z / CLOSED.sigma_1) == k
+            strips = np.floor(x[inside] / CLOSED.sigma_2)
+            wide = (np.ptp(strips) + 1) * CLOSED.sigma_2 if inside.any() else 0
             deep = np.ptp(y[inside]) if inside.any() else 0
             assert expected[25 + k] == pytest.approx(wide, abs=1e-6)
             assert expected[32 + k] == pytest.approx(deep, abs=1e-6)

@@ -19,14 +19,7 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import load_run
 from training.baselines import architectures
 from training.baselines import baseline as module
-from training.baselines.architectures import (
-    ARCHITECTURES,
-    Architecture,
-    crop_size,
-    network_inputs,
-    pretrained_files,
-    tensors,
-)
+from training.baselines.architectures import ARCHITECTURES, crop_size, pretrained_files, tensors
 from training.baselines.baseline import BaselineInputs, StoredBaseline, baseline_file
 from training.baselines.image_baselines import check_backbone, compare
 from training.baselines.job import load_baselines, train_baselines
@@ -71,7 +64,7 @@ def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
 def quick_network(module_patch: pytest.MonkeyPatch) -> None:
     """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
     vit = dataclasses.replace(VIT_TINY, width=96, depth=1)
-    architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
+    architecture = architectures.Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
     module_patch.setitem(ARCHITECTURES, SMALL, architecture)
     module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
@@ -201,7 +194,7 @@ def test_nearest_template_has_the_largest_cosine() -> None:
 
 def test_inputs_are_scaled_and_the_background_is_zero() -> None:
     crops = crops_of(0, 2, 12)
-    color, normals = (np.asarray(values) for values in network_inputs(crops.color, crops.normals))
+    color, normals = (np.asarray(values) for values in architectures.network_inputs(crops.color, crops.normals))
     mask = crops.normals.any(axis=-1)
     assert not color[~mask].any() and not normals[~mask].any()
     for values, pixel in ((color, np.array([200, 30, 30]) / 255), (normals, np.array([0.5, 0.5, 0]))):

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from commands import Command
 from refusals import assert_refused
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 from small_runs import random_classifier, save_trained_run
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.model.run_directory import load_run
@@ -71,7 +70,7 @@ def test_baselines_are_calibrated(trained: Path, names: tuple[str, ...], monkeyp
     assert run.predictors == ("tops", *names)
     assert set(run.temperatures) == {"tops", *names} and run.temperatures["tops"] == 1.5
     packed = thor2.PointClouds.pack([cloud for each in clouds(5, 4).values() for cloud in each])
-    described: Any = SimpleNamespace(packed=packed, descriptors=describe(packed, colornet.load_default(), CONFIG))
+    described: Any = SimpleNamespace(packed=packed, descriptors=describe(packed, NETWORK, CONFIG))
     inputs = BaselineInputs.of_frame(described, CONFIG, None)
     for name, baseline in run.baselines.items():
         probabilities = baseline.predict(inputs)

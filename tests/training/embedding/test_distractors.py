@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from rendered_objects import write_box
 from scipy.sparse import csr_array
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from training.embedding import distractors as module
 from training.embedding.distractors import Distractors, samples_record
 from training.fitting.samples import Samples
-
-NETWORK = colornet.load_default()
 
 STRIPS = csr_array(np.array([[0, 0.1, 0, 0], [0.2, 0, 0, 3]], np.float32))
 SAMPLES = Samples(STRIPS, np.ones((2, 14), np.float32), np.array([0, 1], np.int32), np.zeros(2, np.int32))
@@ -113,5 +111,7 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     others = [key(box=0.2), key(procedural=11), key(views=3), key(thor2.DescriptorConfig(homology="closed_form"))]
     assert same not in [box, *others] and box not in others
     assert [name for name, _ in box[1]] == ["box"] and box[1] != others[0][1]
+    # With another order, other distractors would be held out when a training resumes.
+    assert Distractors(procedural=9, meshes={"box": tmp_path}).sources == [3, 5, 1, 6, 2, 4, 8, tmp_path, 7, 0]
     record = samples_record([0], NETWORK, SMALL_CONFIG, 1)
     assert record["color_network"] == NETWORK.fingerprint and "augmentations" in record

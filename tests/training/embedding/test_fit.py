@@ -14,9 +14,9 @@ import pytest
 from failures import Interrupted
 from flax import nnx
 from refusals import assert_refused
+from small_clouds import NETWORK
 from small_runs import SMALL_CONFIG
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import N_SCALARS, describe_aligned_looks, is_color
@@ -33,7 +33,6 @@ from training.fitting.samples import Samples, describe_batch
 from training.storage.jobs import save_arrays
 from training.views import normalized_views
 
-NETWORK = colornet.load_default()
 SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
 OBJECTS = range(2, 26, 3)  # all of their views have enough points
 CLASSES = ("a", "b")
@@ -131,6 +130,10 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
         similarity = learned @ learned.T
         gaps.append(similarity[same].mean() - similarity[~same].mean())
     assert gaps[1] > 1.5 * gaps[0] and len(embedding.references.label) == len(views)  # each view once
+    drop_out = nnx.jit(lambda key, model, *inputs: model.learned(*inputs, train=True, rngs=nnx.Rngs(dropout=key)))
+    inputs = descriptors, batch.statistics
+    drawn = [drop_out(jax.random.key(seed), nnx.clone(embedding.model), *inputs) for seed in (0, 0, 1)]
+    assert np.array_equal(*drawn[:2]) and np.abs(drawn[2] - drawn[1]).max() > 0.01
     basis = np.asarray(embedding.model.color_basis[...])
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
@@ -151,7 +154,9 @@ def test_further_networks_keep_the_first(views: Samples, fitted: tuple[Embedding
     with mock.patch.multiple(fit, _step=mock.Mock(wraps=fit._step), network_step=with_margin):
         two = fit_two(CLASSES, networks=2)
         assert fit._step._cache_size() == programs + 1  # all steps share one
-        assert len({call.args[5].length.tobytes() for call in fit._step.call_args_list}) == 36
+        calls = [call.args for call in fit._step.call_args_list]
+        assert len({args[5].length.tobytes() for args in calls}) == 36
+        assert len({str(key) for args in calls for key in jax.random.key_data(args[7]).tolist()}) == 72
     assert [numbers[:2] for numbers in progress] == [(3 * epoch, 36) for epoch in range(1, 13)]
     assert max(metrics.loss for *_, metrics in progress) < 1e-5
     assert dataclasses.replace(two, further=()).fingerprint == fitted[0].fingerprint

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from image_files import patches, tilted
 from refusals import assert_refused
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 from small_runs import save_untrained_run, untrained_embedding_run, with_surfaces
 
-import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.fusion import Calibration
@@ -68,7 +67,7 @@ def test_each_sequence_is_answered_by_its_run(tmp_path: Path) -> None:
     assert [run.digest for run in load_sequence_runs(tmp_path / "runs", ["x/top/s2/f1"])] != [r.digest for r in runs]
 
     clouds = PointClouds.pack(random_clouds(0, [50] * 3))
-    described = SimpleNamespace(oriented=describe_looks(clouds, colornet.load_default(), CONFIG), packed=clouds)
+    described = SimpleNamespace(oriented=describe_looks(clouds, NETWORK, CONFIG), packed=clouds)
     for fold, run in enumerate(runs):
         for frame, own, columns in (("x/bottom/s1/f2", "bottom/s1", [1, 2]), ("x/top/s2/f1", "s2", [0, 1])):
             (alone,) = load_runs([tmp_path / "runs" / own / f"fold-{fold}"])

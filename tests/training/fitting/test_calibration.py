@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy.special import softmax
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 from small_runs import SMALL_CONFIG, untrained_embedding_run
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.model.fusion import Calibration
@@ -26,7 +25,6 @@ from training.views.normalized_views import MemoryViews, padded_batches
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, image_size=8)
-NETWORK = colornet.load_default()
 
 
 @pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])

@@ -8,22 +8,21 @@ from unittest import mock
 
 import jax
 import numpy as np
+import optax
 import pytest
 from refusals import assert_refused
-from small_clouds import random_clouds
+from small_clouds import NETWORK, random_clouds
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.networks.networks import MLP, model_arrays
 from training import train_run
-from training.fitting.fit import FitContext, fit, train_step
+from training.fitting.fit import FitContext, FitState, fit, train_step
 from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions
 from training.fitting.samples import Samples, describe_batch, sample_views
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
-NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, to compile quickly
 TOPS2 = FitContext("tops2", NETWORK, CONFIG)
 QUICK = FitOptions(epochs=8, batch_size=16, seed=3)
@@ -108,6 +107,10 @@ def test_each_epoch_has_its_order_dropout_and_learning_rate(fitted: Fit) -> None
         first, both = (fitted(dataclasses.replace(options, epochs=epochs))[0] for epochs in (1, 2))
     np.testing.assert_allclose(both.head.kernel[...], first.head.kernel[...], atol=1e-6)
     assert [call.args[6] for call in step.call_args_list] == [*range(3), *range(6)]
+    context, graph, _, batch, rate, seed, _ = step.call_args.args
+    state = jax.tree.map(np.asarray, FitState.initial(first, optax.adam(rate))[1])
+    losses = [train_step(context, graph, state, batch, rate, seed, number)[1][0].item() for number in (0, 0, 1)]
+    assert losses[0] == losses[1] != losses[2]
     batches = [np.asarray(call.args[3].length).tobytes() for call in step.call_args_list]
     assert batches[:3] == batches[3:6] and len(set(batches)) == 6
 

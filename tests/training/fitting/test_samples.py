@@ -9,22 +9,18 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 from slow_tier import slow
+from small_clouds import CLOSED, NETWORK
 from small_clouds import random_clouds as views
 
-import colornet
 import thor2_jax as thor2
 from training.fitting.samples import OF_EMBEDDING, Form, describe_batch, sample_views
 from training.protocol import PAPER
 from training.views.normalized_views import MemoryViews, SourceShard, fold_of_views
 
-NETWORK = colornet.load_default()
-CONFIG = thor2.DescriptorConfig(homology="closed_form")
-
-
 RELAXED = thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation())
 
 
-@pytest.mark.parametrize("config", [CONFIG, *slow(thor2.DescriptorConfig.released(homology="closed_form"), RELAXED)])
+@pytest.mark.parametrize("config", [CLOSED, *slow(thor2.DescriptorConfig.released(homology="closed_form"), RELAXED)])
 def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("training.views.normalized_views.CLOUDS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
@@ -34,7 +30,7 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
     assert progress == [(3, 4), (4, 4)]
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
     assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
-    if config is CONFIG:
+    if config is CLOSED:
         points = samples.take(np.arange(16), NETWORK, config).color.sum(axis=(1, 2, 3))
         assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
     batch = samples.take(np.arange(16), NETWORK, config)
@@ -58,33 +54,33 @@ def test_every_view_is_mirrored_in_four_ways(config: thor2.DescriptorConfig, mon
 def test_shards_of_a_class_and_copies_of_a_view() -> None:
     """Two shards of a mug, the first with two copies of view 7, and one of a box; a sample is small."""
     mugs, boxes = views(0, (300, 310, 320)), views(1, (330,))
-    whole = MemoryViews({"mug": mugs, "box": boxes}, CONFIG)
-    first, second = (MemoryViews({"mug": some}, CONFIG).read(0) for some in (mugs[:2], mugs[2:]))
+    whole = MemoryViews({"mug": mugs, "box": boxes}, CLOSED)
+    first, second = (MemoryViews({"mug": some}, CLOSED).read(0) for some in (mugs[:2], mugs[2:]))
     first = dataclasses.replace(first, view=np.array([7, 7], np.int32), copy=np.array([0, 1], np.int32))
     second = dataclasses.replace(second, view=np.array([9], np.int32))
     chunks = [first, second, dataclasses.replace(whole.read(1), view=second.view)]
     shards = [SourceShard(each.label, len(each)) for each in chunks]
     source: Any = SimpleNamespace(classes=whole.classes, shards=shards, read=chunks.__getitem__)
-    samples, _ = sample_views(source, NETWORK, CONFIG)
+    samples, _ = sample_views(source, NETWORK, CLOSED)
     keys = zip(samples.label.tolist(), samples.view.tolist(), strict=True)
     assert sorted(keys) == sorted([(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 9)] * 2)
-    expected, _ = sample_views(whole, NETWORK, CONFIG)
+    expected, _ = sample_views(whole, NETWORK, CLOSED)
     np.testing.assert_allclose(np.sort(samples.strips.data), np.sort(expected.strips.data), atol=1e-6)
     # A fifteenth of the TOPS2 descriptor.
     assert sum(array.nbytes for array in samples.arrays().values()) / len(samples) < 4 * 11942 / 15
 
     # Orientations differ between equal shards and between seeds: two shards of two clouds, two copies, two seeds.
     equal: Any = SimpleNamespace(shards=[shards[0]] * 2, read=lambda _: first)
-    turned = [sample_views(equal, NETWORK, CONFIG, OF_EMBEDDING, seed)[0].strips.toarray() for seed in (0, 1)]
+    turned = [sample_views(equal, NETWORK, CLOSED, OF_EMBEDDING, seed)[0].strips.toarray() for seed in (0, 1)]
     assert len(np.unique(np.concatenate(turned), axis=0)) == 2 * 2 * 2 * 2
 
     held_out = {0: np.array([9]), 1: np.array([7])}  # the box has a view 9 and no view 7
-    fitted, kept = sample_views(source, NETWORK, CONFIG, held_out=held_out)
+    fitted, kept = sample_views(source, NETWORK, CLOSED, held_out=held_out)
     rest = samples.select(np.flatnonzero((samples.label == 1) | (samples.view == 7)))
     np.testing.assert_equal(fitted.arrays(), rest.arrays())
     ((label, (xyz, rgb)),) = kept
     assert label == 0 and np.array_equal(rgb, second.rgb)
-    np.testing.assert_allclose(xyz * CONFIG.sigma_s, second.xyz - second.camera, atol=1e-6)
+    np.testing.assert_allclose(xyz * CLOSED.sigma_s, second.xyz - second.camera, atol=1e-6)
 
 
 def test_the_digest_is_that_of_names_and_clouds() -> None:
@@ -92,7 +88,7 @@ def test_the_digest_is_that_of_names_and_clouds() -> None:
     recolored = [(one[0], one[1] ^ 1), two]
     cases: list[dict[str, Any]] = [{"a": [one, two], "b": other}, {"b": [one, two], "a": other}]
     cases += [{"a": other, "b": [one, two]}, {"a": recolored, "b": other}]
-    assert len({MemoryViews(clouds, CONFIG).digest for clouds in (*cases, cases[0])}) == 4
+    assert len({MemoryViews(clouds, CLOSED).digest for clouds in (*cases, cases[0])}) == 4
 
 
 def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:

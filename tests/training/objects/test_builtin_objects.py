@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from small_clouds import NETWORK
 
-import colornet
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.mesh import TexturedMesh
 
@@ -39,10 +39,9 @@ def test_objects_have_plausible_sizes_and_closed_surfaces(name: str) -> None:
 def test_pairs_that_differ_only_in_colour(pair: tuple[str, str]) -> None:
     one, other = (OBJECTS[name] for name in pair)
     assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
-    network = colornet.load_default()
 
     def regions(mesh: TexturedMesh) -> np.ndarray:
-        return sum(share * network.membership(np.array(c, np.uint8)) for c, share in color_shares(mesh).items())
+        return sum(share * NETWORK.membership(np.array(c, np.uint8)) for c, share in color_shares(mesh).items())
 
     # The distance of two distributions over the colour regions is at most 2.
     assert np.abs(regions(one) - regions(other)).sum() > 0.8

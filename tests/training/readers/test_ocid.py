@@ -152,13 +152,12 @@ def test_runs_of_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prin
 
 
 POINTS = np.array([(0.5 * k, -0.25 * k, np.nan if k == 4 else 1.0 + k) for k in range(6)]).reshape(2, 3, 3)
-SIGNALLING_NAN = b"\x01\0\x80\x7f"
 
 
 def write_cloud(path: Path, data: str, old: bytes = b"", new: bytes = b"") -> Path:
     """Write six points, whose labels are 0 to 5, with bytes replaced that occur once."""
     content = pack_pcd(POINTS, np.zeros((2, 3, 3), int), np.arange(1, 7).reshape(2, 3), data)
-    content = content.replace(struct.pack("<f", np.nan), SIGNALLING_NAN)
+    content = content.replace(struct.pack("<f", np.nan), b"\x01\0\x80\x7f")  # a signalling one
     assert not old or content.count(old) == 1
     path.write_bytes(content.replace(old, new) if old else content)
     return path

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from commands import STEPS, run_thor2
 from refusals import assert_refused
+from rendered_objects import write_box
 from scipy.ndimage import generic_filter
 from written_files import files_of
 
@@ -18,9 +19,9 @@ from training.objects.meshes import find_meshes, load_mesh
 from training.protocol import DEFAULT
 from training.rendering.camera import RayCaster, camera_pose, view_angles
 from training.train_job import TrainJob, run_train_job
-from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, rgbd_crop, surface_normals
+from training.views.crops import CROP_SIZE, ViewCrops, crops_of, fill_depth, rgbd_crop, surface_normals
 from training.views.dataset import ViewDataset, render_crops, render_dataset
-from training.views.mesh_views import RenderJob
+from training.views.mesh_views import RenderJob, ViewTask
 from training.views.normalized_views import WithoutClasses
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)
@@ -146,6 +147,12 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
         np.testing.assert_array_equal(crops.normals[row], normals)
     alone = WithoutClasses(dataset, [dataset.classes[0]])
     assert index == 1 and np.array_equal(alone.read_crops(0, SIZE).color, crops.color)
+
+
+def test_views_without_pixels_have_no_crop(tmp_path: Path) -> None:
+    sheet = load_mesh(write_box(tmp_path / "sheet.ply", (0.1, 0.1, 1e-6)))
+    from_above_and_edge_on = np.array([[0, 0], [0, np.pi / 2]])
+    assert crops_of(ViewTask("sheet", sheet, from_above_and_edge_on), SIZE).keys() == {(0, 0)}
 
 
 def test_interrupted_crops_resume(meshes: Path, dataset: ViewDataset) -> None:

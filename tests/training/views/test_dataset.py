@@ -18,13 +18,12 @@ from commands import Command
 from failures import Interrupted
 from refusals import assert_refused
 from rendered_objects import write_box
-from small_clouds import random_clouds
+from small_clouds import CLOSED, random_clouds
 from written_files import files_of
 
 import thor2_jax
 from thor2_jax.errors import InputError
 from thor2_jax.files import locked
-from thor2_jax.surfaces.surfaces import SURFACES_FILE
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.sensing import Illumination
@@ -40,7 +39,6 @@ NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
 JOB = RenderJob(OBJECTS, 180, 90)
 """6 views an object: of 4 and 2 with the shards of these tests."""
-CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -119,12 +117,12 @@ def changed(folder: Path) -> dict[str, int]:
 
 def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
     missing = copied / "0001-0000.safetensors"
-    for bad in (copied / "0000-0001.safetensors", copied / SURFACES_FILE):
+    for bad in (copied / "0000-0001.safetensors", copied / "surfaces.safetensors"):
         content = bytearray(bad.read_bytes())
         content[1000] ^= 1
         bad.write_bytes(content)
     missing.unlink()
-    with pytest.raises(InputError, match=f"{SURFACES_FILE} is missing or damaged; repeat `thor2 render`"):
+    with pytest.raises(InputError, match="surfaces.safetensors is missing or damaged; repeat `thor2 render`"):
         _ = ViewDataset.open(copied).surfaces
     before = changed(copied)
     render_dataset(JOB, copied)
@@ -140,7 +138,7 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
 
 def test_a_dataset_of_an_earlier_version_stays_as_it_is(copied: Path) -> None:
     """It has neither surfaces nor cameras."""
-    (copied / SURFACES_FILE).unlink()
+    (copied / "surfaces.safetensors").unlink()
     dataset, shards = ViewDataset.open(copied), list[Shard]()
     for shard in dataset.shards:
         arrays = safetensors.numpy.load((copied / shard.file).read_bytes())
@@ -238,7 +236,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Comma
 
 
 def views_of(clouds: list[Cloud]) -> NormalizedViews:
-    return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CONFIG)
+    return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CLOSED)
 
 
 def test_only_what_was_rendered_is_removed(copied: Path) -> None:
@@ -264,12 +262,12 @@ def test_views_are_read_normalized(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert views.view.tolist() == list(range(30)) and not views.copy.any()
         assert views.counts.tolist() == [len(xyz) for xyz, _ in clouds]
         for (xyz, rgb), cloud in list(zip(views.clouds(), clouds, strict=True))[::10]:
-            normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CONFIG)
+            normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CLOSED)
             assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= COORDINATE_STEP / 2 * 1.02
             assert np.array_equal(rgb, cloud[1])
         for (xyz, _), camera, cloud in zip(views.clouds(), views.camera, clouds, strict=True):
             distance = np.linalg.norm(xyz.astype(np.float64) - camera, axis=1)
-            np.testing.assert_allclose(distance, CONFIG.sigma_s * np.linalg.norm(cloud[0], axis=1), atol=1e-4)
+            np.testing.assert_allclose(distance, CLOSED.sigma_s * np.linalg.norm(cloud[0], axis=1), atol=1e-4)
         assert np.array_equal(views.xyz, views_of(clouds).xyz)
     record = json.loads(json.dumps(dataset.record))
     assert record["digest"] == dataset.digest == hashlib.sha256((tmp_path / MANIFEST).read_bytes()).hexdigest()

@@ -6,18 +6,15 @@ import jax
 import numpy as np
 import pytest
 from refusals import assert_refused
+from small_clouds import CLOSED
 
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.enrollment import augmented_view
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
 from training.views.labelled_views import FIRST_VIEW, LabelledInstances, WithLabelledViews
-from training.views.mesh_views import COORDINATE_STEP
 from training.views.normalized_views import MemoryViews, WithoutClasses
-
-CONFIG = DescriptorConfig(homology="closed_form")
 
 
 def instance(seed: int, n: int = 50) -> PreparedInstance:
@@ -30,7 +27,7 @@ def instance(seed: int, n: int = 50) -> PreparedInstance:
 
 def rendered(bowls: int = 30) -> MemoryViews:
     clouds = [(view.points, view.colors) for view in map(instance, range(bowls + 3))]
-    return MemoryViews({"bowl": clouds[:bowls], "mug": clouds[bowls:]}, CONFIG)
+    return MemoryViews({"bowl": clouds[:bowls], "mug": clouds[bowls:]}, CLOSED)
 
 
 def test_labelled_instances_join_the_rendered_views() -> None:
@@ -38,7 +35,7 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     instances = {"mug": 4, "pen": 40, "box": 2}
     views = {name: [instance(100 + k) for k in range(n)] for name, n in instances.items()}
     crops = {"mug": [(np.full((4, 4, 3), k, np.uint8), np.full((4, 4, 3), -k, np.int8)) for k in range(4)]}
-    source = WithLabelledViews(LabelledInstances(views, ["too few points"], crops), CONFIG, rendered())
+    source = WithLabelledViews(LabelledInstances(views, ["too few points"], crops), CLOSED, rendered())
     assert source.classes == ("bowl", "mug", "pen", "box")
     shards = [(shard.label, shard.views) for shard in source.shards]
     assert shards == [(0, 30), (1, 3), (1, 4 * 7), (2, 40), (3, 2 * 9)]
@@ -64,9 +61,9 @@ def test_surfaces_need_a_mesh_of_every_class() -> None:
     both = bowl_and_mug.surfaces = surfaces_of(builtin_objects()[name] for name in ("white_bowl", "mug_blue"))
     for name, left_out, expected in (("mug", "", both), ("pen", "", None), ("pen", "pen", both)):
         labelled = LabelledInstances({name: [instance(100)]}, left_out=[left_out])
-        source = WithLabelledViews(labelled, CONFIG, bowl_and_mug)
+        source = WithLabelledViews(labelled, CLOSED, bowl_and_mug)
         jax.tree.map(np.testing.assert_array_equal, source.surfaces, expected)
-    assert WithLabelledViews(labelled, CONFIG).surfaces is None
+    assert WithLabelledViews(labelled, CLOSED).surfaces is None
     mug = WithoutClasses(source, ["bowl", "pen"]).surfaces
     jax.tree.map(np.testing.assert_array_equal, mug, jax.tree.map(lambda a: a[1:], both))
     assert WithoutClasses(rendered(), ["bowl"]).surfaces is None
@@ -76,23 +73,23 @@ def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.Monkey
     """Clouds with an occlusion boundary may take another half turn than the same points without one."""
     monkeypatch.setattr("training.views.labelled_views.CLOUDS", 18)
     views = [instance(seed, 40 + seed) for seed in range(6)]
-    source = WithLabelledViews(LabelledInstances({"mug": views}), CONFIG)
+    source = WithLabelledViews(LabelledInstances({"mug": views}), CLOSED)
     assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [18]
     flat = [each for view in views for each in (view, *(augmented_view(view, k) for k in (0, 1)))]
-    normal = view_normalize(pack_instances(flat, len(flat)), CONFIG)
+    normal = view_normalize(pack_instances(flat, len(flat)), CLOSED)
     expected = np.asarray(normal.points)[np.asarray(normal.mask)]
     read = source.read(0)
     assert read.counts.tolist() == [len(each.points) for each in flat]
-    np.testing.assert_allclose(read.xyz, expected, atol=COORDINATE_STEP / 2 + 1e-6)
+    np.testing.assert_allclose(read.xyz, expected, atol=2**-15 + 1e-6)
     np.testing.assert_array_equal(read.rgb, np.concatenate([each.colors for each in flat]))
     bare = [dataclasses.replace(view, boundary=np.zeros_like(view.boundary)) for view in views]
-    assert np.abs(WithLabelledViews(LabelledInstances({"mug": bare}), CONFIG).read(0).xyz - read.xyz).max() > 0.01
+    assert np.abs(WithLabelledViews(LabelledInstances({"mug": bare}), CLOSED).read(0).xyz - read.xyz).max() > 0.01
 
 
 def test_the_digest_depends_on_everything_that_is_read() -> None:
     def digest(*seeds: int, name: str = "mug", bowls: int = 30, **changes: np.ndarray) -> str:
         views = [dataclasses.replace(instance(seed), **changes) for seed in seeds]
-        return WithLabelledViews(LabelledInstances({name: views}), CONFIG, rendered(bowls) if bowls else None).digest
+        return WithLabelledViews(LabelledInstances({name: views}), CLOSED, rendered(bowls) if bowls else None).digest
 
     colors, boundary = np.zeros((50, 3), np.uint8), np.ones(50, bool)
     digests = [digest(1, 2), digest(2, 1), digest(1), digest(1, 2, name="cup")]
@@ -103,5 +100,5 @@ def test_the_digest_depends_on_everything_that_is_read() -> None:
 
 def test_an_instance_that_is_too_long_is_refused() -> None:
     long = dataclasses.replace(instance(0), points=instance(0).points * np.float32(20))
-    source = WithLabelledViews(LabelledInstances({"mug": [long]}), CONFIG)
+    source = WithLabelledViews(LabelledInstances({"mug": [long]}), CLOSED)
     assert_refused("frames: 'mug': .*depth scale", source.read, 0)
