@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import pytest
@@ -215,7 +216,7 @@ def test_ctrl_c_where_exceptions_are_ignored(interrupted: Any, busy: bool, monke
         time.sleep(HANG)
 
     def timer(seconds: float, *arguments: Any) -> threading.Timer:
-        return threading.Timer(0 if busy and seconds == 0.01 else seconds, *arguments)
+        return Timer(0 if busy and seconds == 0.01 else seconds, *arguments)
 
     monkeypatch.setattr("threading.Timer", timer)
     monkeypatch.setattr(sys.modules["training.cli.app"], "app", run)
