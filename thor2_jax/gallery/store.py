@@ -97,8 +97,9 @@ def check_open_to_changes(directory: Path) -> None:
     """Raise InputError unless the gallery in a directory can be written, and no other writer holds the lock."""
     with refusing_os_errors(f"gallery: {directory} cannot be written", "choose another directory (--gallery)"):
         check_writable(directory)
-        with _writing(directory, LOCK_SECONDS) if gallery_stamp(directory) else contextlib.nullcontext():
-            pass
+        if gallery_stamp(directory) is not None:
+            with _writing(directory, LOCK_SECONDS):
+                pass
 
 
 def _writing(directory: Path, seconds: float) -> contextlib.AbstractContextManager[None]:

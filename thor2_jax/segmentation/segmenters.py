@@ -75,7 +75,7 @@ def load_segmenter(name: str, others: Sequence[str] = ()) -> Segmenter:
 
 
 def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any]:
-    """Return the labels [H, W] of `segmented`, integers; 0 is background. Arguments and exceptions as `segmented`."""
+    """Return the labels [H, W] of `segmented`, integers; 0 is background. It has the same arguments and errors."""
     return segmented(frame, segmenter).label_image
 
 

@@ -49,8 +49,9 @@ class BOP(LabelledFrames):
             OSError: `names` cannot be opened.
         """
         path = self.dataset_folder(named_path(path))
-        found = sorted((f.parent for start in ("", "*/") for f in path.glob(f"{start}scene_camera.json")), reverse=True)
-        scenes = sorted({each.resolve(): each for each in found}.values())  # a link such as "latest" adds no scene
+        folders = [file.parent for file in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")]]
+        # A link such as "latest" adds no scene.
+        scenes = sorted({each.resolve(): each for each in sorted(folders, reverse=True)}.values())
         self.sources = [image for scene in scenes for image in _images(scene / "rgb")]
         self.identifiers = [f"{_scene(image).name}/{image.stem}" for image in self.sources]
         if lacking := [scene for scene in scenes or [path] if not _images(scene / "rgb")]:
