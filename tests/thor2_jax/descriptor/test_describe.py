@@ -41,7 +41,7 @@ def test_describe_equals_its_steps_and_its_chunks(monkeypatch: pytest.MonkeyPatc
 
 def test_describe_with_jax_enable_x64() -> None:
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        clouds = thor2.PointClouds.pack(random_clouds(1, [60]), capacity=64)
+        clouds = thor2.PointClouds.pack(random_clouds(1, [60] * 4))
         tops2 = thor2.describe(clouds, NETWORK, CLOSED).tops2
     expected = thor2.describe(clouds, NETWORK, CLOSED).tops2
     np.testing.assert_allclose(tops2, expected, atol=1e-4, strict=True)
