@@ -212,15 +212,10 @@ def test_accelerators_compare_all_rows_at_once(
     np.testing.assert_allclose(evidence(surfaces, clouds, OWN), expected, atol=1e-3)
 
 
-@pytest.fixture(scope="module")
-def samples(views: list[Cloud]) -> Sample:
-    """Eight views and an empty cloud."""
-    return sample_points(with_background([*views[:8], *random_clouds(0, [0])], [3.0] * 9, views))
-
-
 @pytest.mark.parametrize("n_classes", [6, 1])
-def test_probabilities_follow_the_evidence(surfaces: Surfaces, samples: Sample, n_classes: int) -> None:
-    """Compare with the two formulas in float64."""
+def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
+    """Compare with the two formulas in float64, also if surfaces are those of separate objects; one cloud is empty."""
+    samples = sample_points(with_background([*views[:8], *random_clouds(0, [0])], [3.0] * 9, views))
     twice = jax.tree.map(lambda field: jnp.concatenate([field, field])[:n_classes], surfaces)
     before = np.random.default_rng(0).dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
     after = np.asarray(with_evidence(jnp.asarray(before), twice, samples), np.float64)
@@ -239,6 +234,10 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, samples: Sample, 
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     nothing = np.zeros((9, n_classes), np.float32)
     assert np.array_equal(with_evidence(jnp.asarray(nothing), twice, samples), nothing)
+    each = [jax.tree.map(lambda field, k=k: field[k : k + 1], twice) for k in range(n_classes)]
+    for p, expected in ((before, after), (nothing, nothing)):
+        np.testing.assert_allclose(with_evidence_on_host(p, each, samples), expected, atol=1e-5)
+    assert with_evidence_on_host(p[:0], each, jax.tree.map(lambda a: a[:0], samples)).shape == (0, n_classes)
 
 
 def toy_search(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
@@ -271,25 +270,13 @@ def test_names_are_compared_while_they_may_come_first(
     np.testing.assert_allclose(on_host, on_device, atol=1e-6)
 
 
-def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, samples: Sample) -> None:
-    twice = jax.tree.map(lambda field: jnp.concatenate([field, field]), surfaces)
-    for n in (6, 1):
-        each = [jax.tree.map(lambda field, k=k: field[k : k + 1], twice) for k in range(n)]
-        p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 9)[:, :n].astype(np.float32)
-        p[2] = 0
-        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], twice), samples)
-        np.testing.assert_allclose(with_evidence_on_host(p, each, samples), expected, atol=1e-5)
-    assert with_evidence_on_host(p[:0], each, jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
-
-
 def test_threads_compare_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("thor2_jax.surfaces.evidence.search_poses", toy_search)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    rng = np.random.default_rng(0)
-    samples = Sample(*[rng.random(8, np.float32)] * 5, is_skipped=np.zeros(8, bool))
-    p, values = rng.dirichlet(np.full(4, 0.4), 8)[:, :3].astype(np.float32), rng.random((3, 4), np.float32)
+    samples = Sample(*[np.linspace(0, 1, 8, dtype=np.float32)] * 5, is_skipped=np.zeros(8, bool))
+    p = np.random.default_rng(0).dirichlet(np.full(4, 0.4), 8)[:, :3].astype(np.float32)
     for n in (0, 1, 8):
-        rows = jnp.asarray(p[:n]), values, jax.tree.map(lambda a, n=n: a[:n], samples)
+        rows = jnp.asarray(p[:n]), np.eye(3, 4, dtype=np.float32), jax.tree.map(lambda a, n=n: a[:n], samples)
         assert np.array_equal(in_threads(*rows), with_evidence(*rows))
     for k in range(3):
         traced = jax.jit(lambda a, k=k: in_threads(*rows[:k], a, *rows[k + 1 :]))
