@@ -95,6 +95,12 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_sessionfinish() -> None:
+    """Collect garbage once; pytest would collect all objects five times, and the interpreter again."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collectreport() -> None:
     """Restore the default settings of Hypothesis for other directories."""
     settings.load_profile("default")

@@ -31,7 +31,7 @@ CLASSES = ("a", "b", "c", "d")
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    return untrained_run(CLASSES, config=thor2.DescriptorConfig(homology="closed_form"))
+    return untrained_run(CLASSES)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,8 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
 
 
 def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
-    absurd = dataclasses.replace(tilted(patches()), intrinsics=thor2.Intrinsics(1e-9, 600.0, 159.5, 119.5))
+    few_points = tilted(patches() * (np.arange(320) % 12 == 0))
+    absurd = dataclasses.replace(few_points, intrinsics=thor2.Intrinsics(1e-9, 600.0, 159.5, 119.5))
     assert [answer.name for answer in recognizer.recognize(absurd)] == [None] * 4
 
 
@@ -142,7 +143,7 @@ def test_clouds_are_embedded_by_the_descriptor_of_the_embedding(field: str, chan
     run, embedding = untrained_run(CLASSES, ("tops",)), small_embedding()
     other: Any = {field: dataclasses.replace(getattr(run, field), **changes)}
     model = Recognizer(dataclasses.replace(run, embedding=embedding, **other)).model
-    clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]))
+    clouds = thor2.PointClouds.pack(random_clouds(0, [200, 300]), rim=[None, None])
     inference = infer(model, describe_looks(clouds, model.run.network, model.run.config, 2), clouds, embeds=True)
     expected = embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, 2), clouds)
     np.testing.assert_allclose(inference.embeddings, expected, atol=1e-5)
@@ -158,11 +159,10 @@ def test_instances_are_compared_with_surfaces() -> None:
     _, after = compared.infer(instances)
     usable = [each for each in instances if each.reason is None]
     clouds = pack_instances(usable, len(after.overflow))
-    expected = with_evidence(before.probabilities["embedding"], compared.run.surfaces, sample_points(clouds))[
-        : len(usable)
-    ]
-    np.testing.assert_allclose(after.probabilities["embedding"][: len(usable)], expected, rtol=1e-4)
-    assert len(usable) > 1 and np.abs(before.probabilities["embedding"][: len(usable)] - expected).max() > 0.01
+    first, second = (each.probabilities["embedding"] for each in (before, after))
+    expected = with_evidence(first, compared.run.surfaces, sample_points(clouds))
+    np.testing.assert_allclose(second[: len(usable)], expected[: len(usable)], rtol=1e-4)
+    assert len(usable) > 1 and np.abs(first - expected)[: len(usable)].max() > 0.01
 
 
 @pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])

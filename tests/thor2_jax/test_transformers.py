@@ -40,13 +40,12 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
 @pytest.mark.parametrize("config", [SMALL_CONFIG, None])
 def test_values_are_those_of_describe(config: thor2.DescriptorConfig | None) -> None:
     """The default is the configuration of the paper."""
-    clouds = random_clouds(0, SIZES)
-    chosen = config or CLOSED
-    expected = thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, chosen)
+    clouds = random_clouds(0, [*SIZES, 0, 0, 0])
+    expected = thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, config or CLOSED)
     for transformer, values in zip(TRANSFORMERS, (expected.tops, expected.tops2), strict=True):
-        rows = transformer(config=config).fit_transform(clouds)
+        rows = transformer(config=config).fit_transform(clouds[:5])
         assert isinstance(rows, np.ndarray) and rows.dtype == np.float32
-        np.testing.assert_allclose(rows, values, atol=1e-6)
+        np.testing.assert_allclose(rows, values[:5], atol=1e-6)
 
 
 def test_more_clouds_than_the_largest_batch_with_another_network(monkeypatch: pytest.MonkeyPatch) -> None:

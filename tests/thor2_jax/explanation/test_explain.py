@@ -21,7 +21,7 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks, side_len
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips
 from thor2_jax.explanation import attributions, pictures
 from thor2_jax.explanation.changes import CHANGES, Change, changed_instance, smallest_change
-from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
+from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores, packed
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions, surface_fits
 from thor2_jax.figures import png_bytes
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
@@ -314,8 +314,8 @@ def test_an_instance_is_compared_with_the_surfaces_of_objects(explanation: Expla
         first, *others = fits = list(surface_fits(recognizer.model, instance, names))
         assert [fit.name for fit in fits] == names[1:]
         assert np.quantile(first.of_points, 0.95) < 0.004 and first.distance < min(fit.distance for fit in others)
-        samples = sample_points(pack_instances([instance], 1))
-        of_own = search_poses(surfaces, samples, jnp.array([CLASSES.index(own)]))[0][0]
+        samples = sample_points(next(packed([instance])))
+        of_own = search_poses(surfaces, samples, np.full(len(samples.points), CLASSES.index(own)))[0][0]
         values = np.log(first.distance), first.chroma, first.lightness, first.free_space
         np.testing.assert_allclose(values, of_own, atol=1e-5)
     recognizer.enroll(own, [(FRAME, 3)], extend=True)  # only its views answer

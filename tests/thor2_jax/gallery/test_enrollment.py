@@ -24,7 +24,7 @@ from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ObjectGallery, views_to_embed
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.model.fusion import Calibration
-from thor2_jax.model.inference import answers
+from thor2_jax.model.inference import Inference, answers
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
 from thor2_jax.surfaces.surfaces import Surfaces
@@ -131,9 +131,8 @@ NAMED = {0.67: [None, None], 0.68: [None, "book"], 0.79: [None, "book"], 0.8: ["
 @pytest.mark.parametrize("unknown_below", [None, 0.0])
 def test_a_gallery_alone_rejects_unknown_objects(unknown_below: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Values as given: the brick has two views and is named from .791, the book has one and is named from .675."""
-    instance = instance_view(CLUTTER, 1, 2.5)
+    instance, inference = instance_view(CLUTTER, 1, 2.5), Inference(np.zeros(1), {}, scores=np.zeros((1, 2)))
     recognizer = taught(untrained_run((), ()), unknown_below=unknown_below)
-    _, inference = recognizer.infer([instance])
     for score, names in NAMED.items():
         for column, name in enumerate(["brick", "book"] if unknown_below == 0 else names):
             values = np.eye(2, dtype=np.float32)[[column]] * score

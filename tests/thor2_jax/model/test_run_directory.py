@@ -151,7 +151,7 @@ def test_a_damaged_run_directory_is_refused_in_one_line(name: str, saved: Path, 
     damage(shutil.copytree(saved, tmp_path / "run"))
     with pytest.raises(thor2.InputError) as caught:
         load_run(tmp_path / "run")
-    gc.collect()
+    gc.collect(0)
     message = str(caught.value)
     assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from small_clouds import random_clouds
 
 from thor2_jax.model.inference import _with_evidence_in_threads as in_threads
@@ -45,8 +46,10 @@ OWN = np.repeat(np.arange(3), 3)
 """Class of each view."""
 
 
-def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: jax.Array) -> jax.Array:
-    return search_poses(surfaces, sample_points(clouds), class_index)[0]
+def evidence(surfaces: Surfaces, clouds: PointClouds, class_index: ArrayLike) -> jax.Array:
+    """Return the evidence of nine rows at most; they are repeated, since other numbers of rows compile again."""
+    clouds, index = jax.tree.map(lambda a: np.resize(a, (9, *a.shape[1:])), (clouds, np.asarray(class_index)))
+    return search_poses(surfaces, sample_points(clouds), index)[0][: np.size(class_index)]
 
 
 def test_views_fit_the_surface_of_their_own_class(surfaces: Surfaces, views: list[Cloud]) -> None:
@@ -195,7 +198,7 @@ def test_one_colour_has_no_correlation() -> None:
     nearly = 200 + np.random.default_rng(0).integers(0, 4, (len(plate.faces), 3, 3), dtype=np.uint8)
     plain = TexturedMesh(plate.vertices, plate.faces, corner_colors=nearly)
     clouds = PointClouds.pack([view_cloud(plain, camera_pose(*angles, plain.centre)) for angles in POSES])
-    assert np.abs(evidence(surfaces_of([plain]), clouds, np.zeros(3, int))[:, 1:]).max() < 0.05
+    assert np.abs(evidence(surfaces_of([plain] * 3), clouds, np.zeros(3, int))[:, 1:]).max() < 0.05
 
 
 def test_accelerators_compare_all_rows_at_once(
@@ -211,12 +214,12 @@ def test_accelerators_compare_all_rows_at_once(
 
 @pytest.mark.parametrize("n_classes", [6, 1])
 def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud], n_classes: int) -> None:
-    """Compare with the two formulas in float64."""
-    surfaces = jax.tree.map(lambda field: jnp.concatenate([field, field])[:n_classes], surfaces)
-    clouds, rng = with_background(views, [3.0] * 9), np.random.default_rng(0)
-    before = rng.dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
-    after = np.asarray(with_evidence(jnp.asarray(before), surfaces, sample_points(clouds)), np.float64)
-    values = [np.asarray(evidence(surfaces, clouds, np.full(9, k)), np.float64) for k in range(n_classes)]
+    """Compare with the two formulas in float64, also if surfaces are those of separate objects; one cloud is empty."""
+    samples = sample_points(with_background([*views[:8], *random_clouds(0, [0])], [3.0] * 9, views))
+    twice = jax.tree.map(lambda field: jnp.concatenate([field, field])[:n_classes], surfaces)
+    before = np.random.default_rng(0).dirichlet(np.full(n_classes + 1, 0.3), 9)[:, :n_classes].astype(np.float32)
+    after = np.asarray(with_evidence(jnp.asarray(before), twice, samples), np.float64)
+    values = [np.asarray(search_poses(surfaces, samples, np.full(9, k % 3))[0], float) for k in range(n_classes)]
     for row, probabilities in enumerate(before.astype(np.float64)):
         best, largest = list[int](), 0.0
         for k in np.argsort(-probabilities)[:5]:
@@ -230,7 +233,16 @@ def test_probabilities_follow_the_evidence(surfaces: Surfaces, views: list[Cloud
         odds = probabilities.max() / known * (known / (1 - known)) ** 0.5 * np.exp(fits + 2.1)
         np.testing.assert_allclose(after[row], probabilities * odds / (1 + odds) / known, rtol=2e-3, atol=1e-6)
     nothing = np.zeros((9, n_classes), np.float32)
-    assert np.array_equal(with_evidence(jnp.asarray(nothing), surfaces, sample_points(clouds)), nothing)
+    assert np.array_equal(with_evidence(jnp.asarray(nothing), twice, samples), nothing)
+    each = [jax.tree.map(lambda field, k=k: field[k : k + 1], twice) for k in range(n_classes)]
+    for p, expected in ((before, after), (nothing, nothing)):
+        np.testing.assert_allclose(with_evidence_on_host(p, each, samples), expected, atol=1e-5)
+    assert with_evidence_on_host(p[:0], each, jax.tree.map(lambda a: a[:0], samples)).shape == (0, n_classes)
+
+
+def toy_search(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
+    """Return the products of a value of the row and values of the name, in place of the evidence."""
+    return jnp.where(samples.is_skipped[:, None], 0, samples.rough[:, None] * values[index]), None
 
 
 @pytest.mark.parametrize(
@@ -246,40 +258,25 @@ def test_names_are_compared_while_they_may_come_first(
     logits: tuple[float, ...], fits: tuple[float, ...], first: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last name fits best, but comes first only if it is compared."""
-
-    def search_poses(values: jax.Array, samples: Sample, index: jax.Array) -> tuple[jax.Array, None]:
-        return jnp.where(samples.is_skipped[:, None], 0, values[index]), None
-
-    monkeypatch.setattr("thor2_jax.surfaces.evidence.search_poses", search_poses)
-    probabilities = np.exp(2 * np.array([logits], np.float32))
+    monkeypatch.setattr("thor2_jax.surfaces.evidence.search_poses", toy_search)
+    probabilities = np.exp(2 * np.pad([np.float32(logits)], ((0, 0), (0, 6 - len(logits))), constant_values=-np.inf))
     probabilities /= 2 * probabilities.sum()
-    values = np.zeros((len(fits), 4), np.float32)
-    values[:, 2] = np.array(fits) / 1.5  # the weight of the lightness
-    samples = Sample(*[jnp.zeros(1)] * 5, is_skipped=jnp.zeros(1, bool))
+    values = np.zeros((6, 4), np.float32)
+    values[: len(fits), 2] = np.array(fits) / 1.5  # the weight of the lightness
+    samples = Sample(*[jnp.ones(1)] * 5, is_skipped=jnp.zeros(1, bool))
     on_device = with_evidence(jnp.asarray(probabilities), jnp.asarray(values), samples)
     on_host = with_evidence_on_host(probabilities, list(jnp.asarray(values)[:, None]), samples)
     assert on_device.argmax() == on_host.argmax() == first
     np.testing.assert_allclose(on_host, on_device, atol=1e-6)
 
 
-def test_surfaces_of_separate_objects_change_probabilities_alike(surfaces: Surfaces, views: list[Cloud]) -> None:
-    clouds = with_background([*views, *random_clouds(0, [0])], [3.0] * 10, [*views, views[0]])
-    samples = sample_points(clouds)
-    each = [jax.tree.map(lambda field, k=k: field[k : k + 1], surfaces) for k in range(3)]
-    for n in (3, 1):
-        p = np.random.default_rng(1).dirichlet(np.full(n + 1, 0.4), 10)[:, :n].astype(np.float32)
-        p[2] = 0
-        expected = with_evidence(jnp.asarray(p), jax.tree.map(lambda field, n=n: field[:n], surfaces), samples)
-        np.testing.assert_allclose(with_evidence_on_host(p, each[:n], samples), expected, atol=1e-5)
-    assert with_evidence_on_host(p[:0], each[:1], jax.tree.map(lambda a: a[:0], samples)).shape == (0, 1)
-
-
-def test_threads_compare_the_same_rows(surfaces: Surfaces, views: list[Cloud], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_compare_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("thor2_jax.surfaces.evidence.search_poses", toy_search)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    samples = sample_points(with_background(views[:8], [3.0] * 8))
+    samples = Sample(*[np.linspace(0, 1, 8, dtype=np.float32)] * 5, is_skipped=np.zeros(8, bool))
     p = np.random.default_rng(0).dirichlet(np.full(4, 0.4), 8)[:, :3].astype(np.float32)
-    for n in (0, 1, 6, 8):
-        rows = jnp.asarray(p[:n]), surfaces, jax.tree.map(lambda a, n=n: a[:n], samples)
+    for n in (0, 1, 8):
+        rows = jnp.asarray(p[:n]), np.eye(3, 4, dtype=np.float32), jax.tree.map(lambda a, n=n: a[:n], samples)
         assert np.array_equal(in_threads(*rows), with_evidence(*rows))
     for k in range(3):
         traced = jax.jit(lambda a, k=k: in_threads(*rows[:k], a, *rows[k + 1 :]))
@@ -305,5 +302,5 @@ def test_only_points_well_in_front_of_what_is_seen_are_in_free_space(surfaces: S
 @pytest.mark.usefixtures("x64")
 def test_evidence_is_float32_in_float64_mode(surfaces: Surfaces, views: list[Cloud]) -> None:
     clouds = PointClouds.pack(views)
-    assert evidence(surfaces, clouds, jnp.asarray(OWN)).dtype == np.float32
-    assert fit_poses(surfaces, clouds, OWN).dtype == np.float32
+    results = jax.eval_shape(lambda: (evidence(surfaces, clouds, OWN), fit_poses(surfaces, clouds, OWN)))
+    assert [result.dtype for result in results] == [np.float32] * 2
