@@ -1,6 +1,8 @@
 """Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
 import asyncio
+import dataclasses
+import functools
 import gc
 import json
 import os
@@ -216,6 +218,18 @@ def small_classifiers(module_patch: pytest.MonkeyPatch) -> Iterator[None]:
     small_runs._drawn.cache_clear()
     yield
     small_runs._drawn.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def small_transformers(module_patch: pytest.MonkeyPatch) -> None:
+    """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
+    from training.baselines import architectures
+    from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
+
+    network = functools.partial(RGBDViT, vit=dataclasses.replace(VIT_TINY, width=96, depth=1), size=32)
+    small = dataclasses.replace(architectures.ARCHITECTURES["rgbd-vit-small"], create=network, size=32)
+    module_patch.setitem(architectures.ARCHITECTURES, "rgbd-vit-small", small)
+    module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
 
 @pytest.fixture(scope="module")
