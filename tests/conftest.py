@@ -222,13 +222,14 @@ def small_classifiers(module_patch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def small_transformers(module_patch: pytest.MonkeyPatch) -> None:
-    """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
+    """Give the vision transformers one block and, but DINOv2, narrow tokens and images of 32 pixels."""
     from training.baselines import architectures
-    from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
+    from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY
 
-    network = functools.partial(RGBDViT, vit=dataclasses.replace(VIT_TINY, width=96, depth=1), size=32)
-    small = dataclasses.replace(architectures.ARCHITECTURES["rgbd-vit-small"], create=network, size=32)
-    module_patch.setitem(architectures.ARCHITECTURES, "rgbd-vit-small", small)
+    for name in ("rgbd-vit-small", "vit-cnn-small"):
+        network, vit = architectures.ARCHITECTURES[name], dataclasses.replace(VIT_TINY, width=96, depth=1)
+        small = dataclasses.replace(network, create=functools.partial(network.create, vit=vit, size=32), size=32)
+        module_patch.setitem(architectures.ARCHITECTURES, name, small)
     module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
 
