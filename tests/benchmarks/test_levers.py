@@ -1,6 +1,7 @@
 """The table of levers: its rows, its groups, and a tiny table of built-in objects that is interrupted and resumes."""
 
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -51,6 +52,7 @@ def test_a_small_table_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     rows = "default", 'fusion rule "max"'
     small = Lever(rows[0]), Lever(rows[1], rule="max"), Lever("gallery", fusion="gallery")
     monkeypatch.setattr(levers, "LEVERS", small)
+    monkeypatch.setattr(levers, "mesh_views", partial(levers.mesh_views, cameras=4))
     monkeypatch.setattr("subprocess.run", lambda command, **_: SimpleNamespace(returncode=run_thor2(*command[3:])))
     run_command(monkeypatch, *given, "--out", out, "--seeds", 1, "--levers", *rows)
     first = {path: path.stat().st_mtime_ns for path in out.rglob("seed-0.json")}
