@@ -38,7 +38,6 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("small_classifiers")
 def test_a_small_table_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its commands run in this process."""
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"

@@ -83,11 +83,10 @@ def test_rendering_resumes(whole: Path, tmp_path: Path, monkeypatch: pytest.Monk
 
     def stopping(source: Path, target: Path) -> None:
         nonlocal left
-        left -= 1
-        if left == 0:
+        left -= 2
+        if left == -1:
             raise Interrupted
         replace(source, target)
-        left -= 1
         if left == 0:
             raise Interrupted
 
