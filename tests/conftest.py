@@ -1,6 +1,8 @@
 """Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
 import asyncio
+import dataclasses
+import functools
 import gc
 import json
 import os
@@ -222,6 +224,19 @@ def small_classifiers(module_patch: pytest.MonkeyPatch) -> Iterator[None]:
     small_runs._drawn.cache_clear()
     yield
     small_runs._drawn.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def small_transformers(module_patch: pytest.MonkeyPatch) -> None:
+    """Give the vision transformers one block and, but DINOv2, narrow tokens and images of 32 pixels."""
+    from training.baselines import architectures
+    from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY
+
+    for name in ("rgbd-vit-small", "vit-cnn-small"):
+        network, vit = architectures.ARCHITECTURES[name], dataclasses.replace(VIT_TINY, width=96, depth=1)
+        small = dataclasses.replace(network, create=functools.partial(network.create, vit=vit, size=32), size=32)
+        module_patch.setitem(architectures.ARCHITECTURES, name, small)
+    module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
 
 @pytest.fixture(scope="module")

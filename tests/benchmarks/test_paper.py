@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run_thor2
 from rendered_objects import write_meshes, write_scene
 
 from benchmarks import paper
@@ -110,17 +111,27 @@ def test_documented_figures_are_those_of_the_results() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("small_classifiers", "small_transformers")
 def test_a_small_comparison_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
+    """A model that is lost is trained again, and nothing else; THOR cannot use real views.
+
+    Only the views are rendered in a process of their own.
+    """
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
-    for seed in range(2):
-        write_scene(frames / f"{seed}", NAMES, seed)
+    write_scene(frames / "0", NAMES, 0)
     given = [
         *(f"--meshes={meshes}", f"--frames={frames}", f"--real={frames}", "--folds=1", "--workers=1"),
         *("--baselines=thor,forest,rgbd-vit-small,templates", "--render=--azimuth-step 90 --polar-step 90"),
         "--train=--epochs 1 --batch-size 8",
     ]
-    out = tmp_path / "out"
+    out, commands, popen = tmp_path / "out", [], paper.subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> Any:
+        commands.append(command)
+        assert "render" in command or run_thor2(*command[3:]) == 0
+        return popen(command if "render" in command else "true", **options)
+
+    monkeypatch.setattr(paper.subprocess, "Popen", start)
     paper.main([*given, f"--out={out}"])
     report: dict[str, Any] = json.loads((out / "paper.json").read_text())
     results = report["datasets"]["frames"]
@@ -137,9 +148,7 @@ def test_a_small_comparison_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "joined the views: frames" in (out / "paper.md").read_text()
     assert (out / "paper.png").stat().st_size > 1000
 
-    commands: list[Any] = []
-    popen = paper.subprocess.Popen
-    monkeypatch.setattr(paper.subprocess, "Popen", lambda c, **k: commands.append(c) or popen(c, **k))
+    commands.clear()
     paper.main([*given, f"--out={out}"])
     assert commands == []
     (out / "frames" / "run" / "baselines" / "forest.safetensors").unlink()

@@ -59,7 +59,7 @@ def test_backbones_match_timm(tmp_path: Path, name: str, create: Any, size: int)
     )
     load_backbone(model, tmp_path / "weights.safetensors")
     model.eval()
-    assert_golden(name, jax.tree.leaves(nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))))
+    assert_golden(name, jax.tree.leaves(nnx.jit(type(model).__call__)(model, random_images(name, 2, size))))
 
 
 def test_gru_matches_torch() -> None:

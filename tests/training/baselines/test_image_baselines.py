@@ -1,7 +1,5 @@
 """Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
 
-import dataclasses
-from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -23,13 +21,12 @@ from training.baselines.architectures import ARCHITECTURES, crop_size, pretraine
 from training.baselines.baseline import BaselineInputs, StoredBaseline, baseline_file
 from training.baselines.image_baselines import check_backbone, compare
 from training.baselines.job import load_baselines, train_baselines
-from training.baselines.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
 from training.views.normalized_views import MemoryViews
 
-pytestmark = pytest.mark.usefixtures("small_classifiers")
+pytestmark = pytest.mark.usefixtures("small_classifiers", "small_transformers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")
@@ -58,15 +55,6 @@ SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 def write_run(folder: Path, folds: int = 4, epochs: int = 3) -> Path:
     return save_trained_run(folder, SOURCE, CONFIG, epochs=epochs, folds=folds, fold=0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_network(module_patch: pytest.MonkeyPatch) -> None:
-    """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
-    vit = dataclasses.replace(VIT_TINY, width=96, depth=1)
-    architecture = architectures.Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
-    module_patch.setitem(ARCHITECTURES, SMALL, architecture)
-    module_patch.setattr(architectures, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
 
 
 @pytest.fixture(scope="module")

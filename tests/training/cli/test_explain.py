@@ -24,7 +24,7 @@ from training.reports import explanation_page
 
 @pytest.fixture
 def frame(tmp_path: Path) -> Path:
-    return write_frame(tmp_path / "table", {1: "brick", 4: "book"})
+    return write_frame(tmp_path / "table", {1: "leaf", 4: "book"})
 
 
 @pytest.mark.slow

@@ -87,11 +87,11 @@ def test_small_demo_is_interrupted_and_resumes_by_its_command(
     everything = builtin_objects()
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
     monkeypatch.setattr(demo, "N_SCENES", 6)
-    fit = FitOptions(epochs=4, batch_size=128)
-    small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": fit, "config": SMALL_CONFIG}
+    fit = FitOptions(epochs=4, batch_size=32)
+    small = {"azimuth_step": 90.0, "polar_step": 45.0, "fit": fit, "config": SMALL_CONFIG}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
-    for stage, step in (("stage 4 of 5: fit tops", 13), ("recognize scenes", 1)):
+    for stage, step in (("stage 4 of 5: fit tops", 18), ("recognize scenes", 1)):
         with pytest.raises(Interrupted):
             demo.run_demo(tmp_path, 1, stop_when(stage, step))
     assert not (tmp_path / "report.html").exists()
