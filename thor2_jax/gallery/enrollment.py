@@ -50,12 +50,11 @@ MANY_ROWS = 16
 
 def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
     """Return the embeddings [V, K, D] of the looks at views."""
-    many = len(views) > 4 * MANY_ROWS
-    rows = MANY_ROWS if many else ROWS
+    rows = MANY_ROWS if len(views) > 4 * MANY_ROWS else ROWS
     batches = []
     for start in range(0, len(views), rows):
         chunk = views[start : start + rows]
-        clouds = pack_instances(chunk, rows, batch_points(len(view.points) for view in chunk) if many else None)
+        clouds = pack_instances(chunk, rows, batch_points(len(view.points) for view in chunk))
         looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
         batches.append(embedding.embed_oriented(looks, clouds))
     return np.concatenate(batches)[: len(views)]
