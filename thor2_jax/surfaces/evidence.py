@@ -191,9 +191,9 @@ def search_poses(surfaces: Surfaces, samples: Sample, class_index: jax.Array) ->
     def of_row(row: tuple[Sample, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return jax.lax.cond(row[0].is_skipped, lambda *_: nothing, fit, *row)
 
-    # One by one on CPUs, where padding can be skipped, else at once.
-    map_rows = functools.partial(jax.lax.map, of_row)
-    return jax.lax.platform_dependent((samples, class_index), cpu=map_rows, default=jax.vmap(of_row))
+    if jax.default_backend() != "cpu":
+        return jax.vmap(of_row)((samples, class_index))
+    return jax.lax.map(of_row, (samples, class_index))  # one by one, so that padding can be skipped
 
 
 def with_evidence_on_host(
@@ -309,7 +309,8 @@ def _fit(surface: Surfaces, sample: Sample) -> tuple[jax.Array, jax.Array]:
     pose, done = _candidates(surface.boxes, sample.points), 0
     for n, kept, steps in STAGES:
         pose = pose[jax.lax.top_k(-energy(pose, n), kept)[1]]
-        pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
+        if steps:
+            pose = jax.lax.fori_loop(done, done + steps, functools.partial(refine, n=n), pose)
         done += steps
     free = in_free_space(pose)
     best = (energy(pose, SAMPLED) + FREE_COST * free).argmin()
