@@ -141,10 +141,10 @@ class FrameOptions:
 
     @property
     def arguments(self) -> list[str]:
-        """The arguments that pass the same frames to another command."""
+        """The arguments that pass the same frames to another command; FRAME stands for more than three of them."""
         given = given_values(self)
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
-        return [*frames, *option_arguments(**given)]
+        return [*(frames if len(frames) < 4 else ["FRAME"]), *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""
