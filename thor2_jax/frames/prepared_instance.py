@@ -194,7 +194,7 @@ def find_occlusion(frame: RGBDFrame, cloud: PreparedInstance) -> tuple[bool, NDA
     boundary = np.zeros(len(cloud.points), bool)
     occluded = bool(on_boundary.sum() >= MIN_BOUNDARY_SHARE * on_contour.sum())
     seen = on_boundary & (own_depth > 0)
-    if occluded and seen.any() and len(cloud.points):
+    if occluded:
         edge = pixel_rays(pixels[seen], frame.depth.shape[1], frame.intrinsics) * own_depth[seen, None]
         distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
         boundary[nearest[distance <= BOUNDARY_REACH]] = True

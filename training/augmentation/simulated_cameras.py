@@ -161,7 +161,7 @@ def _ellipses(shape: tuple[int, ...], camera: SimulatedCamera, rng: np.random.Ge
 def _labels(
     frame: RGBDFrame, labels: NDArray[np.integer], camera: SimulatedCamera, rng: np.random.Generator
 ) -> NDArray[np.integer]:
-    changed = labels.copy()
+    changed = labels
     size = 2 * abs(camera.mask) + 1
     if camera.mask > 0:
         changed = np.where(labels == 0, maximum_filter(labels, size), labels)

@@ -3,8 +3,10 @@
 import importlib
 import os
 
-# XLA reports the features it expects of cached programs as errors. The variable is read when JAX is imported.
+# XLA reports the features it expects of cached programs as errors. The variables are read when JAX is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# Without fusion emitters, programs for CPUs compile in three fifths of the time, and are not slower.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 __all__ = ["app", "main"]
 

@@ -46,10 +46,12 @@ def test_a_worker_refuses_a_run_that_was_trained_again(run_dir: Path) -> None:
         server._create_worker(Settings(run_dir), 2, "the digest of the record that the other workers have read")
 
 
-def test_xla_log_is_silenced_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_xla_is_set_up_before_jax_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
-    code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
-    assert finish_programs(start_program(code, "TF_CPP_MIN_LOG_LEVEL")) == ["False\n3\n"]
+    code = "import os, sys, training; print('jax' in sys.modules); del os.environ['XLA_FLAGS']; import training.cli; "
+    code += "print(*map(os.getenv, sys.argv[1:]))"
+    expected = "False\n3 --xla_cpu_use_fusion_emitters=false\n"
+    assert finish_programs(start_program(code, "TF_CPP_MIN_LOG_LEVEL", "XLA_FLAGS")) == [expected]
 
 
 SETTINGS = ("max-batch", "7"), ("unknown-below", "2.0")
