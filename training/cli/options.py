@@ -141,10 +141,14 @@ class FrameOptions:
 
     @property
     def arguments(self) -> list[str]:
-        """The arguments that pass the same frames to another command; FRAME stands for more than three of them."""
+        """The arguments that pass the same frames to another command; FRAME stands for more than three folders."""
         given = given_values(self)
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
         return [*(frames if len(frames) < 4 else ["FRAME"]), *option_arguments(**given)]
+
+    def arguments_for(self, n_frames: int) -> list[str]:
+        """Return `arguments` for a command that is slow; FRAME stands for folders with more than three frames."""
+        return (self if n_frames < 4 else dataclasses.replace(self, frames=[Path("FRAME")])).arguments
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""

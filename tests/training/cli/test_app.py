@@ -83,7 +83,7 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
     assert line.startswith("done; see why with: thor2 explain ") and line.count("\n") == 1
     same = ["a b", "./-c", "--depth-scale", "100.0", "--max-gap", "0.5"]
     assert shlex.split(line)[-9:] == [*same, "--unknown-below", "0.0", "--extend"]
-    assert FrameOptions(frames=[Path("a")] * 4).arguments == ["FRAME"]
+    assert FrameOptions(frames=[Path("a")] * 4).arguments == ["FRAME"] and given.arguments_for(4)[0] == "FRAME"
 
 
 def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
