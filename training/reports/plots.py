@@ -1,5 +1,6 @@
 """Plots of objects and their descriptors, trainings and evaluations (matplotlib, PNG)."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,8 @@ def draw_accuracy(
 def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], name: str, path: str | Path) -> None:
     """Draw a confusion matrix with counts; the shade is the fraction of the row.
 
+    A class without instances that is not predicted either is left out: it may be one of a hundred enrolled objects.
+
     Args:
         counts: [C, C + 1]; rows are true classes, columns are predicted classes, and the last column counts instances
             without an answer.
@@ -138,6 +141,8 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
+    occurs = counts.any(axis=1) | counts[:, :-1].any(axis=0)
+    counts, classes = counts[occurs][:, np.append(occurs, True)], [*itertools.compress(classes, occurs.tolist())]
     columns = len(classes) + bool(counts[:, -1].any())
     figure = Figure(figsize=(0.36 * columns, 0.36 * len(classes)))
     axes = figure.add_axes((0, 0, 1, 1))
