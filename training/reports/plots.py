@@ -1,6 +1,5 @@
 """Plots of objects and their descriptors, trainings and evaluations (matplotlib, PNG)."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -142,7 +141,7 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
         OSError: the file cannot be written.
     """
     occurs = counts.any(axis=1) | counts[:, :-1].any(axis=0)
-    counts, classes = counts[occurs][:, np.append(occurs, True)], [*itertools.compress(classes, occurs.tolist())]
+    counts, classes = counts[occurs][:, np.append(occurs, True)], [classes[k] for k in np.flatnonzero(occurs)]
     columns = len(classes) + bool(counts[:, -1].any())
     figure = Figure(figsize=(0.36 * columns, 0.36 * len(classes)))
     axes = figure.add_axes((0, 0, 1, 1))
