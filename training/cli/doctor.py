@@ -60,7 +60,7 @@ def doctor(
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     result = f"frames checked: {len(sources)}"
     if is_sound and not as_json:
-        finish(result, "recognize", "recognize", *given.arguments, model=model or "RUN")
+        finish(result, "recognize", "recognize", *given.arguments(), model=model or "RUN")
     elif not as_json:
         finish(result, "after a change, check again", *sys.argv[1:])
     if not is_sound:
@@ -75,8 +75,7 @@ def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None, printed: d
     lines = [f"{finding.code}: {finding.message} {finding.advice}" for finding in diagnosis.findings]
     lines += [f"note: {note}" for note in diagnosis.notes]
     lines += [] if diagnosis.findings else ["nothing found"]
-    if (first := printed.setdefault("\n".join(lines), frame)) != frame:
-        lines = [f"{frame}: as {first}"]
-    elif frame is not None:
-        lines.insert(0, f"{frame}:")
+    first = printed.setdefault("\n".join(lines), frame)
+    if frame is not None:
+        lines = [f"{frame}:", *lines] if first == frame else [f"{frame}: as {first}"]
     print("\n".join(map(escape_characters, lines)), flush=True)

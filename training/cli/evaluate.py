@@ -135,9 +135,9 @@ def _evaluate(
     if example and given and given.frames:
         files = frames.files(frames.identifiers.index(example["frame"]))
         given = dataclasses.replace(given, frames=[files[0].parent])
-    explained = given.arguments_for(1 if example else len(frames)) if given else ["FRAME"]
-    purpose, label = f"explain {'a wrong answer' if example else 'answers'}", example.get("label")
-    finish(result, purpose, "explain", *explained, instance=label, model=run, out="why")
+    explained = given.arguments(0 if example else len(frames)) if given else ["FRAME"]
+    purpose = "explain a wrong answer" if example else "explain answers"
+    finish(result, purpose, "explain", *explained, instance=example.get("label"), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

@@ -70,5 +70,5 @@ def explain(
     else:
         purpose = "if a name is wrong, add this view of the object"
         # In several frames, the same label number is of different objects.
-        command = "enroll", "NAME", *(given.arguments if len(sources) == 1 else ["FRAME"])
+        command = "enroll", "NAME", *(given.arguments() if len(sources) == 1 else ["FRAME"])
         finish(pages, purpose, *command, segment=segment, instance=last, model=model, gallery=gallery, extend=True)

@@ -229,7 +229,7 @@ def recognize(
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
     known, same = f"{model} recognizes {recognizer.gallery.summary}", {"segment": segment, **vars(arguments)}
-    results.summarize(known, "explain", *given.arguments_for(len(sources)), **same, out="why")
+    results.summarize(known, "explain", *given.arguments(len(sources)), **same, out="why")
     if (segment or recording) and results.failures and all(results.failures):
         raise InputError(results.failures[0])
 

@@ -29,7 +29,7 @@ def draw_pictures(
     runs: Sequence[Run],
     confusions: Sequence[tuple[str, str]],
     out: Path,
-) -> tuple[list[str], list[tuple[str, int]]]:
+) -> tuple[list[str], list[dict[str, Any]]]:
     """Draw some frames with the answers of the first run, and the most confident instance of each confusion.
 
     The pictures are `frames/<k>.jpg` and `confusions/<k>.jpg`, with k counted from 0.
@@ -42,7 +42,7 @@ def draw_pictures(
         out: directory of the report.
 
     Returns:
-        The identifiers of the drawn frames, and the identifier of the frame and the label of each drawn instance.
+        The identifiers of the drawn frames, and "frame", the identifier, and "label" of each drawn instance.
 
     Raises:
         InputError: a frame cannot be read.
@@ -55,7 +55,7 @@ def draw_pictures(
     for k, confusion in enumerate(confusions):
         _, instance, _ = max((each for each in named if each[-1] == confusion), key=lambda each: each[0])
         number = frame_of[id(instance)]
-        drawn.append((frames.identifiers[number], instance.label))
+        drawn.append({"frame": frames.identifiers[number], "label": instance.label})
         frame = frames[number].frame
         draw_crop(frame.color, frame.label_image == instance.label, out / "confusions" / f"{k}.jpg")
     numbers = sorted({int(n) for n in np.linspace(0, len(frames) - 1, FRAMES)})

@@ -108,8 +108,7 @@ def evaluate_dataset(
         ]
         confusions = [(pair["truth"], pair["answer"]) for pair in report["worst"]]
         report["shown"], drawn = draw_pictures(frames, file.frames, runs, confusions, out)
-        for pair, (frame, label) in zip(report["worst"], drawn, strict=True):
-            pair |= {"frame": frame, "label": label}
+        report["worst"] = [pair | where for pair, where in zip(report["worst"], drawn, strict=True)]
         write_report_page(report, out)
         write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
         return report

@@ -140,8 +140,8 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
-    occurs = counts.any(axis=1) | counts[:, :-1].any(axis=0)
-    counts, classes = counts[occurs][:, np.append(occurs, True)], [classes[k] for k in np.flatnonzero(occurs)]
+    occur: list[int] = np.flatnonzero(counts.any(axis=1) | counts[:, :-1].any(axis=0)).tolist()
+    counts, classes = counts[np.ix_(occur, [*occur, -1])], [classes[k] for k in occur]
     columns = len(classes) + bool(counts[:, -1].any())
     figure = Figure(figsize=(0.36 * columns, 0.36 * len(classes)))
     axes = figure.add_axes((0, 0, 1, 1))
