@@ -38,7 +38,9 @@ def explain(
 
     load = functools.cache(RecognizerArguments(model, unknown_below, answer_by, gallery).load)
     sources = given.sources(segment, lambda frame: load().segment(frame))
-    check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
+    names = [source.name for source in sources]
+    names += [str(page.relative_to(out)) for depth in ("*/*", "*/*/*") for page in out.glob(f"{depth}/{PAGE}")]
+    check_output_directory(out, resumable={name.split("/")[0] for name in names})
     recognizer = load()
     explained, last = 0, 0
     with show_progress(quiet, prints=True) as progress:

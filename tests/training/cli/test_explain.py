@@ -73,6 +73,8 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
         names = sorted(path.name for path in (frame / "1").iterdir())
         assert names == ["explanation.html", "explanation.json", "scan.ply"]
     assert "photo.png" in refused(*command, 4)
+    other = write_frame(frame.parent / "other", {1: "book"})  # beside the pages of an earlier call
+    assert run_thor2("explain", "--model", model, other, "--out", frame.parent) == 0
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 
 
