@@ -99,8 +99,7 @@ def run_demo(
     # Pictures without a run were not written by a demo.
     check_output_directory(out, resumable=("run", "pictures", "demo.json") if is_finished(out / "run") else ("run",))
     objects = builtin_objects()
-    job = TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers)
-    run_train_job(job, progress)
+    run_train_job(TrainJob(out / "run", PROTOCOL.replace(seed=seed), objects, workers=workers), progress)
     pictures.mkdir(exist_ok=True)
     (run,) = load_runs([out / "run"])
     trained = run.model.run
@@ -141,8 +140,7 @@ def _answer_scenes(
             instances = [i for i in answers.instances if scene.occlusion(i.label) == degree]
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))
         if number < N_SHOWN:
-            recognitions = run.recognizer.recognize(frame)
-            draw_overlay(frame, recognitions, pictures / f"scene-{number}.png")
+            draw_overlay(frame, run.recognizer.recognize(frame), pictures / f"scene-{number}.png")
         progress("recognize scenes", number + 1, N_SCENES, "")
     return grouped
 

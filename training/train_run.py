@@ -195,8 +195,7 @@ def train_run(
         parts = settings.folds
         if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
             each = (samples.view[samples.label == index] for index in range(len(source.classes)))
-            fewest = min(len(np.unique(view)) for view in each)
-            parts = max(2, min(HELD_OUT, fewest))
+            parts = max(2, min([HELD_OUT, *(len(np.unique(view)) for view in each)]))
         fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:

@@ -152,8 +152,7 @@ class RGBDFrame:
         """
         flat = self.label_image.ravel()
         pixels = np.flatnonzero(flat != 0)  # much faster for booleans than for integers
-        order = np.argsort(flat[pixels], kind="stable")
-        pixels = pixels[order]
+        pixels = pixels[np.argsort(flat[pixels], kind="stable")]
         labels, first = np.unique(flat[pixels], return_index=True)
         if len(labels) > MAX_INSTANCES:
             raise InputError(

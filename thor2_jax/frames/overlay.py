@@ -80,7 +80,8 @@ class _Lettering(NamedTuple):
 def draw_overlay(frame: RGBDFrame, answers: Sequence[Recognition], path: str | Path) -> None:
     """Draw the answers for a frame on its colour image, and write a PNG atomically.
 
-    A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
+    A label shows the number of the instance in the label image, the name or "unrecognized", the confidence, the
+    classifier and whether the instance is occluded.
 
     Args:
         frame: a frame with labels.
@@ -157,10 +158,10 @@ def answer_paints(answers: Sequence[Recognition]) -> list[Paint]:
 def _text(answer: Recognition) -> str:
     occluded = ["occluded"] if answer.occluded else []
     if answer.name is None:
-        return "\n".join(["unrecognized", *occluded])
+        return "\n".join([f"{answer.label}: unrecognized", *occluded])
     sure = "" if answer.confidence is None else f" {answer.confidence:.2f}"
     surest = [] if answer.classifier is None else [answer.classifier.upper()]
-    return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
+    return f"{answer.label}: {answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
 
 
 def _draw_outline(pixels: NDArray[np.uint8], mask: NDArray[np.bool_], paint: Paint, thickness: int) -> None:

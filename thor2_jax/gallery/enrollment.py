@@ -27,6 +27,7 @@ from thor2_jax.gallery import store
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from thor2_jax.networks.embedding import Embedding, load_default
+from thor2_jax.printable import first_names
 
 __all__ = [
     "LOOKS",
@@ -235,8 +236,9 @@ class ObjectGallery:
     def weak_rejection(self) -> str:
         """Message that explains why few unknown objects are rejected, and what helps; empty if there is no cause."""
         objects, references = self.gallery.objects.values(), self.gallery.references
-        if few := sum(len(enrolled.clouds) < FEW for enrolled in objects):
-            return f"enrolled objects with fewer than {FEW} views: {few} of {len(objects)}; add views from other sides"
+        if few := [name for name, enrolled in self.gallery.objects.items() if len(enrolled.clouds) < FEW]:
+            count = f"{len(few)} of {len(objects)} ({first_names(few)})"
+            return f"enrolled objects with fewer than {FEW} views: {count}; add views from other sides"
         has_surfaces = all(enrolled.surface is not None for enrolled in objects)
         if objects and not has_surfaces and references is None and not self.gallery.trained and len(objects) < FEW:
             return f"objects enrolled in a run without reference views: {len(objects)}; enroll more of them"

@@ -13,6 +13,7 @@ forgotten. `Gallery.combine` combines the scores with the confidences of the cla
 """
 
 import dataclasses
+import difflib
 import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -193,7 +194,8 @@ class Gallery:
         name = find_name(name, (*self.objects, *self.trained)) or name
         is_class = self._is_answered_class(name)
         if name not in self.objects and not is_class:
-            raise InputError(f"name: {name!r} is unknown; expected a name that this model recognizes: {self.summary}")
+            close = first_names(difflib.get_close_matches(name, self.answered_names)) or self.summary
+            raise InputError(f"name: {name!r} is unknown; expected a name that this model recognizes: {close}")
         objects = {other: enrolled for other, enrolled in self.objects.items() if other != name}
         return dataclasses.replace(self, objects=objects, hidden=(*self.hidden, name) if is_class else self.hidden)
 

@@ -91,7 +91,7 @@ def explained_frame(
     instances: list[schemas.ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
         result = next(remaining) if instance.reason is None else None
-        is_shown = len(instances) < schemas.MAX_EXPLAINED
+        is_shown = sum(each.details is not None for each in instances) < schemas.MAX_EXPLAINED
         details = _details(model, instance, result, recognition) if result and is_shown else None
         instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     known: dict[str, Any] = {"knows": model.gallery.summary, "classes": list(model.names)}

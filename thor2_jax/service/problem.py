@@ -25,7 +25,7 @@ _DESCRIPTIONS = {
     500: "Internal error of the service, or a damaged gallery.",
     503: "The service is starting or stopping, explanations are being compiled, or another process is writing to the "
     "gallery.",
-    504: "The deadline of the request was exceeded.",
+    504: "The deadline of the request was exceeded (--deadline of thor2 serve); many objects need more time.",
     507: "The gallery cannot be written, for example on a full disk; it is as before.",
 }
 

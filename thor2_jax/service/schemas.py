@@ -117,7 +117,7 @@ class ExplainedInstance(InstanceAnswer):
     """Recognition of an instance, with its cloud and its descriptor."""
 
     details: Details | None = Field(
-        description=f"null if the cloud cannot be used, and after the first {MAX_EXPLAINED} instances."
+        description=f"null if the cloud cannot be used, and after {MAX_EXPLAINED} instances with details."
     )
 
 

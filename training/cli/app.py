@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager
 from typing import Annotated, Any, NoReturn, TextIO
 
@@ -59,11 +59,14 @@ def enable_compilation_cache() -> None:
 SECONDS_PER_LINE = 5.0
 
 
-def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
-    """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing."""
+def show_progress(quiet: bool = False, *, prints: bool = False) -> AbstractContextManager[Progress]:
+    """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing.
+
+    A command that prints results meanwhile (`prints`) has no bars, since both would be on one line of the terminal.
+    """
     if quiet:
         return contextlib.nullcontext(lambda stage, done, total, note: None)
-    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_lines())
+    return contextlib.nullcontext(_lines()) if prints or not sys.stderr.isatty() else _bars()
 
 
 @contextlib.contextmanager
@@ -137,20 +140,12 @@ console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column; by default, rich cuts them.
+    """A table that folds words that are longer than a column; by default, rich cuts them."""
 
-    Names are folded only if they are longer than a third of a line.
-    """
-
-    def __init__(self, *titles: str, title: str | None = None) -> None:
-        columns = (table.Column(each, overflow="fold", no_wrap=each == "name") for each in titles)
-        super().__init__(*columns, title=title)
-
-    def add_row(self, *cells: Any, **options: Any) -> None:
-        """Add a row; a long name would leave no room for the other columns, and would be cut."""
-        for column, cell in zip(self.columns, cells, strict=False):
-            column.no_wrap &= len(cell) <= WIDTH // 3
-        super().add_row(*cells, **options)
+    def __init__(self, *titles: str, title: str | None = None, folded: Collection[str] | None = None) -> None:
+        """Create the table; the columns that are not in `folded` keep their width. By default, all may be folded."""
+        fixed = () if folded is None else {*titles} - {*folded}
+        super().__init__(*(table.Column(each, overflow="fold", no_wrap=each in fixed) for each in titles), title=title)
 
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")

@@ -44,7 +44,7 @@ def doctor(
     paths = {} if meshes is None else {meshes.stem: meshes} if meshes.is_file() else find_meshes(meshes)
     recognizer = None if model is None else RecognizerArguments(model).load()
     known: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
-    is_sound, failed = True, []
+    is_sound, failed, printed = True, [], dict[str, str | None]()
     for source in sources:
         try:
             diagnosis = diagnose(source.files or source.read(), depth_scale=given.depth_scale, **known)
@@ -54,26 +54,28 @@ def doctor(
             failed.append(source.name)
             print_note(f"failed: {source.name}: {reason_of(error)}")
         else:
-            _report(diagnosis, as_json, None if given.color else source.name)
+            _report(diagnosis, as_json, None if given.color else source.name, printed)
             is_sound &= not diagnosis.findings
     if failed:
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     result = f"frames checked: {len(sources)}"
     if is_sound and not as_json:
-        finish(result, "recognize", "recognize", *given.arguments, model=model or "RUN")
+        finish(result, "recognize", "recognize", *given.arguments(), model=model or "RUN")
     elif not as_json:
         finish(result, "after a change, check again", *sys.argv[1:])
     if not is_sound:
         raise typer.Exit(1)
 
 
-def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None) -> None:
-    """Print a diagnosis."""
+def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None, printed: dict[str, str | None]) -> None:
+    """Print a diagnosis, or the frame with the same one; `printed` is diagnosis -> first frame, and is extended."""
     if as_json:
         print(json.dumps(({} if frame is None else {"frame": frame}) | dataclasses.asdict(diagnosis)), flush=True)
         return
-    lines = [] if frame is None else [f"{frame}:"]
-    lines += [f"{finding.code}: {finding.message} {finding.advice}" for finding in diagnosis.findings]
+    lines = [f"{finding.code}: {finding.message} {finding.advice}" for finding in diagnosis.findings]
     lines += [f"note: {note}" for note in diagnosis.notes]
     lines += [] if diagnosis.findings else ["nothing found"]
+    first = printed.setdefault("\n".join(lines), frame)
+    if frame is not None:
+        lines = [f"{frame}:", *lines] if first == frame else [f"{frame}: as {first}"]
     print("\n".join(map(escape_characters, lines)), flush=True)

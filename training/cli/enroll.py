@@ -55,7 +55,7 @@ def enroll(
     """
     name = None if name is None else check_name(name)
     given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
-    has_frames = bool(given.arguments)
+    has_frames = bool(given.arguments())
     if bool(mesh) == has_frames:
         raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
     if name is None and (target.label_name is not None or target.instance is not None):

@@ -131,8 +131,13 @@ def _evaluate(
     # A model may be a directory of folds or sequences; the command is for the first run in it.
     files = models[0].rglob(RUN_FILE)
     run = min(files, key=lambda path: (len(path.parts), path), default=models[0] / RUN_FILE).parent
-    purpose = "explain wrong answers" if report["worst"] else "explain answers"
-    finish(result, purpose, "explain", *(given.arguments if given else ["FRAME"]), model=run, out="why")
+    example: dict[str, Any] = next(iter(report["worst"]), {})
+    if example and given and given.frames:
+        files = frames.files(frames.identifiers.index(example["frame"]))
+        given = dataclasses.replace(given, frames=[files[0].parent])
+    explained = given.arguments(0 if example else len(frames)) if given else ["FRAME"]
+    purpose = "explain a wrong answer" if example else "explain answers"
+    finish(result, purpose, "explain", *explained, instance=example.get("label"), model=run, out="why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:

@@ -139,12 +139,14 @@ class FrameOptions:
     max_gap: Annotated[float, recording_option(help="Largest time from colour to depth, seconds.")] = DEFAULT_MAX_GAP
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
-    @property
-    def arguments(self) -> list[str]:
-        """The arguments that pass the same frames to another command; FRAME stands for more than three of them."""
+    def arguments(self, n_frames: int = 0) -> list[str]:
+        """Return the arguments that pass the same frames to another command.
+
+        FRAME stands for more than three folders, and for folders that contain more than three frames, `n_frames`.
+        """
         given = given_values(self)
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
-        return [*(frames if len(frames) < 4 else ["FRAME"]), *option_arguments(**given)]
+        return [*(frames if max(len(frames), n_frames) < 4 else ["FRAME"]), *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""

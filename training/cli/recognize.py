@@ -229,22 +229,31 @@ def recognize(
         unpaired = f"{bag.counts.color - bag.counts.pairs} of {bag.counts.color} images of {bag.topics.color}"
         print_note(f"{unpaired} have no depth within {given.max_gap:g} s")
     known, same = f"{model} recognizes {recognizer.gallery.summary}", {"segment": segment, **vars(arguments)}
-    results.summarize(known, "explain", *given.arguments, **same, out="why")
+    results.summarize(known, "explain", *given.arguments(len(sources)), **same, out="why")
     if (segment or recording) and results.failures and all(results.failures):
         raise InputError(results.failures[0])
 
 
+NOTE_WIDTH = 120
+"""Columns of a terminal from which on notes are a column of the table; in narrower ones, they are below it."""
+
+
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:
     tracked = any(hasattr(r, "track") for r in recognitions)
-    titles = "label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note"
-    table = Table(*["track"] * tracked, *titles)
+    beside = console.width >= NOTE_WIDTH
+    titles = "label", "name", "confidence", "classifier", "occluded", "points"
+    table = Table(*["track"] * tracked, *titles, *["note"] * beside, folded=("name", "note"))
+    below = []
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
-        note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
+        overflow = [f"overflow: {r.overflow}"] * bool(r.overflow)
+        note = r.reason or ", ".join(["outlier filter relaxed"] * r.kept_by_fallback + overflow)
         name = escape_characters(r.name or "unrecognized")
-        occluded = "yes" if r.occluded else "no"
-        row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
-        table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
+        row = str(r.label), name, confidence, r.classifier or "", "yes" if r.occluded else "no", str(r.points_used)
+        table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row, *[note] * beside)
+        below += [f"{r.label}: {note}"] * (bool(note) and not beside)
     if frame is not None:
         console.print(f"{frame}:")
     console.print(table if recognitions else "no instances: all pixels are background")
+    for note in below:
+        console.print(note)

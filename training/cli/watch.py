@@ -92,7 +92,7 @@ def watch(
         first_error = f" (first error: {view.first_error})" if view.first_error else ""
         recognized = f"{view.n_frames} of {n_shown} were recognized{first_error}"
         shown = f"no more frames, {recognized}; Ctrl-C ends"
-        command = "recognize", *(given_frames.arguments or ["FRAME"])
+        command = "recognize", *(given_frames.arguments() or ["FRAME"])
         same = {"segment": segment, **vars(arguments), "track": track or None}
         finish(shown, "store the answers", *command, file=sys.stderr, **same, out="answers")
         view.publish_state("ended", f"There are no more frames; {recognized}.")

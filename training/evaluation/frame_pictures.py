@@ -29,7 +29,7 @@ def draw_pictures(
     runs: Sequence[Run],
     confusions: Sequence[tuple[str, str]],
     out: Path,
-) -> list[str]:
+) -> tuple[list[str], list[dict[str, Any]]]:
     """Draw some frames with the answers of the first run, and the most confident instance of each confusion.
 
     The pictures are `frames/<k>.jpg` and `confusions/<k>.jpg`, with k counted from 0.
@@ -42,7 +42,7 @@ def draw_pictures(
         out: directory of the report.
 
     Returns:
-        The identifiers of the drawn frames.
+        The identifiers of the drawn frames, and "frame", the identifier, and "label" of each drawn instance.
 
     Raises:
         InputError: a frame cannot be read.
@@ -51,15 +51,18 @@ def draw_pictures(
     instances = [instance for each in answers for instance in each.instances]
     frame_of = {id(instance): number for number, each in enumerate(answers) for instance in each.instances}
     named = [(confidence, i, (i.truth, name)) for _, i, name, confidence in named_answers(instances, runs)]
+    drawn = []
     for k, confusion in enumerate(confusions):
         _, instance, _ = max((each for each in named if each[-1] == confusion), key=lambda each: each[0])
-        frame = frames[frame_of[id(instance)]].frame
+        number = frame_of[id(instance)]
+        drawn.append({"frame": frames.identifiers[number], "label": instance.label})
+        frame = frames[number].frame
         draw_crop(frame.color, frame.label_image == instance.label, out / "confusions" / f"{k}.jpg")
     numbers = sorted({int(n) for n in np.linspace(0, len(frames) - 1, FRAMES)})
     for k, number in enumerate(numbers):
         frame = frames[number].frame
         draw_judged(frame.color, frame.label_image, _judge(answers[number], runs), out / "frames" / f"{k}.jpg")
-    return [frames.identifiers[number] for number in numbers]
+    return [frames.identifiers[number] for number in numbers], drawn
 
 
 def _judge(answers: FrameAnswers, runs: Sequence[Run]) -> list[Annotation]:

@@ -107,7 +107,8 @@ def evaluate_dataset(
             if instance.reason == NO_PIXELS
         ]
         confusions = [(pair["truth"], pair["answer"]) for pair in report["worst"]]
-        report["shown"] = draw_pictures(frames, file.frames, runs, confusions, out)
+        report["shown"], drawn = draw_pictures(frames, file.frames, runs, confusions, out)
+        report["worst"] = [pair | where for pair, where in zip(report["worst"], drawn, strict=True)]
         write_report_page(report, out)
         write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
         return report

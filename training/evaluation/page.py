@@ -141,11 +141,12 @@ def _answer_section(report: Mapping[str, Any], out: Path) -> Section:
     for k, pair in enumerate(report["worst"]):
         truth, name = f"{pair['truth']}{'' if pair['known'] else ' (unknown object)'}", pair["answer"]
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
-        shown.append(Picture(f"confusions/{k}.jpg", f"{truth}, recognized as {name}", "small"))
+        caption = f"{truth}, recognized as {name}: frame {pair['frame']}, label {pair['label']}"
+        shown.append(Picture(f"confusions/{k}.jpg", caption, "small"))
     text = " ".join(answer_texts(report)[:2])
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
     draw_confusion(np.array(report["confusion"]), report["classes"], report["main"], out / "confusion.png")
-    caption = f"Confusion matrix of {report['main']} without rejection, summed over all models."
+    caption = f"Confusion matrix of {report['main']} without rejection, of objects that occur, summed over models."
     matrix = Section("Confusion matrix of the known objects", pictures=[Picture("confusion.png", caption)])
     header = ["object", "recognized as", "count", "fraction of the object's instances"]
     return Section("Answers", text, (header, rows) if rows else None, shown, matrix)

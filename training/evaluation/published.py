@@ -44,8 +44,7 @@ def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, 
     if kind == "uwis" and "light" in values:
         values["light"] = _LIGHTS.get(values["light"], values["light"])
     if kind == "ocid" and "sequence" in values:
-        name = values["sequence"].rpartition("/")[2]
-        values["sequence"] = f"S-{name.removeprefix('seq')}"
+        values["sequence"] = "S-" + values["sequence"].rpartition("/")[2].removeprefix("seq")
     return values
 
 

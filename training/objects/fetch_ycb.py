@@ -7,6 +7,7 @@ object are written to `<directory>/<object>`, where `find_meshes` finds `texture
 import gzip
 import re
 import shutil
+import sys
 import tarfile
 import zlib
 from collections.abc import Sequence
@@ -118,7 +119,7 @@ def _download(address: str, archive: Path, name: str, progress: Progress) -> Non
 
 
 def _extract(archive: Path, directory: Path, name: str) -> None:
-    """Move the files of the archive to `directory / name` and remove the archive, even after an error.
+    """Move the files of the archive to `directory / name` and remove the archive, except after an interrupt.
 
     Only regular files in `google_16k` are moved, without their folders. The archive is read to its end, so that the
     checksum of gzip is verified.
@@ -147,4 +148,5 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
         reason = reason_of(error).replace(f"{folder.parent}/", "")
         raise InputError(f"objects: archive of {name} has no usable mesh ({reason}); report this to its host") from None
     finally:
-        archive.unlink()
+        if sys.exc_info()[0] is not KeyboardInterrupt:
+            archive.unlink()

@@ -128,6 +128,8 @@ def draw_accuracy(
 def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], name: str, path: str | Path) -> None:
     """Draw a confusion matrix with counts; the shade is the fraction of the row.
 
+    A class without instances that is not predicted either is left out: it may be one of a hundred enrolled objects.
+
     Args:
         counts: [C, C + 1]; rows are true classes, columns are predicted classes, and the last column counts instances
             without an answer.
@@ -138,6 +140,8 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
+    occur: list[int] = np.flatnonzero(counts.any(axis=1) | counts[:, :-1].any(axis=0)).tolist()
+    counts, classes = counts[np.ix_(occur, [*occur, -1])], [classes[k] for k in occur]
     columns = len(classes) + bool(counts[:, -1].any())
     figure = Figure(figsize=(0.36 * columns, 0.36 * len(classes)))
     axes = figure.add_axes((0, 0, 1, 1))

@@ -95,13 +95,13 @@ def test_outlines_lie_on_the_inner_edge_of_touching_masks(tmp_path: Path, boxes:
 def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> None:
     labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (244, 320), (248, 320)], 40)
     answers = {
-        "mug 0.76\nTOPS2": named(1, "mug"),
-        "bowl 0.76\nTOPS2, occluded": named(2, "bowl", occluded=True),
-        "unrecognized": Recognition(label=3, reason="too few points"),
-        "unrecognized\noccluded": Recognition(label=4, occluded=True, reason="too few points"),
-        "plate 1.00\nTOPS": Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
-        "pitcher 0.76\nTOPS2": named(6, "pitcher"),
-        "spoon": Recognition(label=7, name="spoon"),
+        "1: mug 0.76\nTOPS2": named(1, "mug"),
+        "2: bowl 0.76\nTOPS2, occluded": named(2, "bowl", occluded=True),
+        "3: unrecognized": Recognition(label=3, reason="too few points"),
+        "4: unrecognized\noccluded": Recognition(label=4, occluded=True, reason="too few points"),
+        "5: plate 1.00\nTOPS": Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
+        "6: pitcher 0.76\nTOPS2": named(6, "pitcher"),
+        "7: spoon": Recognition(label=7, name="spoon"),
     }
     drawn(photo(), labels, list(answers.values()), tmp_path / "a.png")
     assert [text for _, text in boxes] == list(answers)
@@ -135,7 +135,7 @@ def test_long_names_shrink_to_fit(tmp_path: Path, boxes: list) -> None:
     labels = discs([(60, 80)], 20, (120, 160))
     drawn(photo(120, 160), labels, [named(1, "an_object_of_long_name")], tmp_path / "a.png")
     (((left, _, right, _), text),) = boxes
-    assert text.startswith("an_object_of_long_name 0.76") and 0 <= left < right < 160
+    assert text.startswith("1: an_object_of_long_name 0.76") and 0 <= left < right < 160
 
 
 def test_sizes_scale_with_the_image(tmp_path: Path, boxes: list) -> None:
@@ -172,4 +172,4 @@ def test_answers_for_other_labels_are_refused(tmp_path: Path) -> None:
 )
 def test_missing_characters_are_escaped(name: str, text: str, tmp_path: Path, boxes: list) -> None:
     drawn(photo(), discs([(100, 40)], 20), [Recognition(label=1, name=name)], tmp_path / "a.png")
-    assert boxes[0][1] == text
+    assert boxes[0][1] == f"1: {text}"

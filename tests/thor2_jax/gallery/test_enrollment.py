@@ -64,9 +64,9 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
     assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ())).objects
-    assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2")
+    assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2 (")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
-    assert ": 1 of 2;" in alone.weak_rejection
+    assert ": 1 of 2 (" in alone.weak_rejection
     alone.forget("book")
     assert "without reference views: 1;" in alone.weak_rejection
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)

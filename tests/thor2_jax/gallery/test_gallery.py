@@ -166,6 +166,7 @@ def test_forgetting_an_unknown_name_is_refused(gallery: Gallery) -> None:
     hidden = dataclasses.replace(gallery, trained=("b", "cup")).without("cup")
     assert hidden.hidden == ("cup",) and hidden.names == gallery.names
     assert_refused("'cup'.*: b, ", hidden.without, "cup")
+    assert_refused("'cups'.* recognizes: cup$", dataclasses.replace(gallery, trained=("b", "cup")).without, "cups")
 
 
 def test_compact_clouds_keep_points_to_0_05_mm() -> None:

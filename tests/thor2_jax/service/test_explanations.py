@@ -1,6 +1,7 @@
 """Explanations of frames and of one object, over HTTP, compared with the library, and on the web page."""
 
 import base64
+import dataclasses
 import io
 import json
 import threading
@@ -92,22 +93,23 @@ def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
     assert prepare_frame(files, DescriptorConfig(), False, None).label_map is None
 
 
-def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray) -> Any:
-    """Return the answer for `count` identical instances."""
+def explained(count: int, config: thor2.DescriptorConfig, z: np.ndarray, reason: str | None = None) -> Any:
+    """Return the answer for `count` instances, which are identical except for the reason of the first one."""
     aligned, colors = np.column_stack([z, z, z]).astype(np.float32), np.zeros((len(z), 3), np.uint8)
     images, strip_colors = np.zeros((7, 32, 32), np.float32), np.zeros((7, 31, 22), np.float32)
     result = CloudResult(images, np.zeros((7, 22, 31), np.float32), aligned, strip_colors, Inference(0, {}))
     instances = [PreparedInstance(k, aligned, colors, np.zeros(len(z), bool)) for k in range(count)]
+    instances[0] = dataclasses.replace(instances[0], reason=reason)
     recognitions = [thor2.Recognition(label=k, name="a") for k in range(count)]
     prepared = PreparedRequest(instances, {}, LabelMap(width=1, height=1, labels=[0], lengths=[1]))
     run = untrained_run(("a",), (), config)
     return explained_frame(Model.of_run(run), prepared, [result] * count, recognitions, {})
 
 
-def test_details_are_limited_to_the_first_instances() -> None:
-    many = explained(MAX_EXPLAINED + 2, thor2.DescriptorConfig(), np.zeros(2000))
-    assert [one.details is None for one in many.instances] == [False] * MAX_EXPLAINED + [True] * 2
-    details = many.instances[0].details
+def test_details_are_limited_to_the_first_usable_instances() -> None:
+    many = explained(MAX_EXPLAINED + 3, thor2.DescriptorConfig(), np.zeros(2000), "too few points")
+    assert [one.details is None for one in many.instances] == [True] + [False] * MAX_EXPLAINED + [True] * 2
+    details = many.instances[1].details
     assert details.image_peak == 0 and not np.any([piece.image for piece in details.slices])
     assert all(piece.strips == [] for piece in details.slices)
     assert len(json.dumps(many.model_dump())) < 4e6

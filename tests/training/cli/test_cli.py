@@ -71,6 +71,8 @@ def test_evaluate_frames(model: Path, images: Path, tmp_path: Path, printed: Com
     out = printed(*command)
     assert "THOR2" in out and "a second" in out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["worst"][0]["frame"] == images.name
+    assert f"thor2 explain {images} --instance {report['worst'][0]['label']} --model {model} " in out
     printed("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", "--unknown-below", 0)
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     truth = frame_files(images).read_names()

@@ -73,6 +73,8 @@ def test_folders_of_the_user_stay(model: Path, frame: Path, refused: Command, mo
         names = sorted(path.name for path in (frame / "1").iterdir())
         assert names == ["explanation.html", "explanation.json", "scan.ply"]
     assert "photo.png" in refused(*command, 4)
+    other = write_frame(frame.parent / "other", {1: "book"})  # beside the pages of an earlier call
+    assert run_thor2("explain", "--model", model, other, "--out", frame.parent) == 0
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 
 
@@ -105,7 +107,7 @@ def test_texts_of_a_page() -> None:
 
 
 def test_options_of_recognition_hold_and_the_next_command_is_shown(
-    model: Path, frame: Path, tmp_path: Path, printed: Command, monkeypatch: pytest.MonkeyPatch
+    model: Path, frame: Path, tmp_path: Path, texts: Texts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The next command has an instance that was explained."""
     seen = []
@@ -121,12 +123,13 @@ def test_options_of_recognition_hold_and_the_next_command_is_shown(
     gallery = tmp_path / "gallery"
     Recognizer.load(model, gallery=gallery).objects.add({})
     given = option_arguments(**vars(RecognizerArguments(model, 0.9, "classifiers", gallery)))
-    text = printed("explain", *given, frame, "--out", tmp_path / "out")
+    text, progress = texts("explain", *given, frame, "--out", tmp_path / "out")
+    assert "explain frame 1 of 1: 0 of 2, instance 1\n" in progress
     assert f" NAME {frame} --instance 1 " in text and f"pages in {tmp_path / 'out'}: 1; " in text
     assert f"mug : {tmp_path / 'out' / 'table' / '1' / 'explanation.html'}\n" in text
     assert seen == [(0.9, "classifiers", gallery)] * 2
     write_frame(tmp_path / "other", {1: "book"})
-    assert " NAME FRAME --instance 1 " in printed("explain", *given, tmp_path, "--out", tmp_path / "more")
+    assert " NAME FRAME --instance 1 " in texts("explain", *given, tmp_path, "--out", tmp_path / "more")[0]
 
 
 def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, texts: Texts) -> None:
@@ -134,7 +137,7 @@ def test_bad_input(model: Path, frame: Path, tmp_path: Path, refused: Command, t
     _, err = texts("explain", "--model", model, empty, "--out", tmp_path / "out", status=2)
     assert err.startswith("skipped: nothing: ")
     out = tmp_path / "out"
-    command = ("explain", "--model", model, frame, "--out", out)
+    command = ("explain", "--model", model, frame, "--out", out, "--quiet")
     assert "table: --instance is 9; expected one of 1, 4" in refused(*command, "--instance", 9)
     assert "--answer-by is gallery" in refused(*command, "--answer-by", "gallery")
     assert "none has no index.json" in refused(*command, "--gallery", tmp_path / "none")

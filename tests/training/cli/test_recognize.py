@@ -112,7 +112,8 @@ def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monke
     out = capfd.readouterr().out
     assert all(text in out for text in (*names[:3], r"茶碗\u202e\x1b[2J", "unrecognized", "0.954")) and "…" not in out
     assert "\x1b" not in out and "\u202e" not in out
-    assert max(map(len, out.splitlines())) == 80
+    assert "┃ confidence ┃ classifier ┃ occluded ┃ points ┃" in out and max(map(len, out.splitlines())) == 77
+    assert "\n2: unknown: a confidence of 0.448, below 0.573\n" in out
 
 
 def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:

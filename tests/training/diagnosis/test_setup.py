@@ -267,7 +267,8 @@ def test_folders_of_frames_and_scenes_of_bop(tmp_path: Path, texts: Texts, print
     camera.write_text(json.dumps(values | {"fx": values["fx"] / 2, "fy": values["fy"] / 2}))
     reports = json_lines(texts(*command, status=1)[0])
     assert [[finding["code"] for finding in report["findings"]] for report in reports] == [[], ["intrinsics-focal"]]
-    assert printed("doctor", tmp_path / "frames" / "tools").startswith("tools:\n")
+    out = printed("doctor", tmp_path / "frames")
+    assert out.startswith("breakfast:\n") and "\ntools: as breakfast\n" in out
     out, _ = texts("doctor", write_bop(tmp_path / "000001"), "--json", status=1)  # its images have few pixels
     assert [line["frame"] for line in json_lines(out)] == ["000001/000001"]
     frame_files(tmp_path / "frames" / "breakfast").color.unlink()

@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -96,6 +97,13 @@ def test_broken_download_resumes(server: Any, tmp_path: Path, ranges: bool) -> N
     fetch_ycb([NAME], tmp_path, url=server.url)
     assert server.requests == [None, "bytes=5000-"]
     assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
+
+
+def test_an_interrupted_extraction_keeps_the_archive(server: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("training.objects.fetch_ycb.load_mesh", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        fetch_ycb([NAME], tmp_path, url=server.url)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".{NAME}.tgz", ".lock"]
 
 
 DAMAGED = {

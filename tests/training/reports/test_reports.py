@@ -52,6 +52,9 @@ def test_a_confusion_matrix_shows_all_of_its_label(tmp_path: Path, n_classes: in
     for name in ("gallery", "embedding + classifiers"):
         plots.draw_confusion(np.eye(n_classes, n_classes + 1, dtype=int), classes, name, tmp_path / "confusion.png")
         pixels = np.asarray(Image.open(tmp_path / "confusion.png").convert("L"))
+        padded = np.pad(np.eye(n_classes, n_classes + 1, dtype=int), ((0, 2), (0, 2)))  # two classes do not occur
+        plots.draw_confusion(padded, [*classes, "a", "b"], name, tmp_path / "padded.png")
+        assert np.array_equal(pixels, np.asarray(Image.open(tmp_path / "padded.png").convert("L")))
         assert all((side == 255).all() for side in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]))
 
 

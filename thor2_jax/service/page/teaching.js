@@ -15,9 +15,15 @@ function markName(message) {
 }
 
 let shown = {}; // The frame and the object of the form.
+let saved = null; // The name that was saved, until the frame is recognized again.
 
 /** Show the form for an object of a frame if the service can enroll; text typed for the same object is kept. */
 export function showNaming(instance, { teaches, classes }, files) {
+  if (saved !== null && shown.label === instance.label && instance.name !== saved) {
+    const now = instance.name === null ? "unknown" : `“${instance.name}”`;
+    byId("notice-text").textContent += ` This object is still ${now}. Add views from other sides, or forget a name that is wrong (thor2 forget).`;
+    saved = null;
+  }
   byId("naming").hidden = !teaches || !canBeNamed(instance);
   byId("name-label").textContent = instance.name === null ? "Name this object" : "Correct the name";
   byId("known-names").replaceChildren(...classes.map((value) => element("option", { value })));
@@ -71,7 +77,9 @@ export function connectNaming(changed, failed) {
       const { name: enrolled, views, generation } = answer;
       showNotice(views === 1 ? `“${enrolled}” is enrolled.` : `“${enrolled}” has ${views} views now.`, generation);
       byId("notice").dataset.name = enrolled;
+      saved = enrolled;
       await changed();
+      saved = null;
     });
   });
 
