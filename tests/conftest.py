@@ -227,6 +227,12 @@ def small_classifiers(module_patch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
+def small_buckets(module_patch: pytest.MonkeyPatch) -> None:
+    """Let batches have the padded size of small clouds."""
+    module_patch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
+
+
+@pytest.fixture(scope="module")
 def small_transformers(module_patch: pytest.MonkeyPatch) -> None:
     """Give the vision transformers one block and, but DINOv2, narrow tokens and images of 32 pixels."""
     from training.baselines import architectures
@@ -245,8 +251,8 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from rendered_objects import write_box
 
     folder = tmp_path_factory.mktemp("meshes")
-    write_box(folder / "brick.ply", (0.1, 0.06, 0.2), (200, 40, 40))
-    write_box(folder / "box.ply", (0.1, 0.1, 0.1), (40, 200, 90))
+    write_box(folder / "brick.ply", (0.05, 0.03, 0.1), (200, 40, 40))
+    write_box(folder / "box.ply", (0.05, 0.05, 0.05), (40, 200, 90))
     return folder
 
 

@@ -65,7 +65,7 @@ def small_frame(seed: int = 0) -> thor2.RGBDFrame:
     """Return a frame of 120 x 90 pixels with the instances 1 and 4, in random colours."""
     rng = np.random.default_rng(seed)
     labels = np.zeros((90, 120), np.uint8)
-    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
+    labels[10:50, 10:50], labels[30:75, 60:105] = 1, 4
     depth = np.full(labels.shape, 900, np.uint16)
     depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
     color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.adaptation.estimate import Adaptation, Report, adaptation_criterion, estimate_transform
-from thor2_jax.capacity import POINT_BUCKETS, point_bucket
+from thor2_jax.capacity import POINT_BUCKETS, batch_points, point_bucket
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import as_path
@@ -35,7 +35,7 @@ from thor2_jax.gallery.enrollment import ObjectGallery
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
-from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows
+from thor2_jax.model.inference import MIN_PART, Inference, answers, compute_by_chunks, infer_clouds, padded_rows
 from thor2_jax.model.model import ColorTransform, Model
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -81,7 +81,7 @@ class DescribedFrame:
     @property
     def packed(self) -> PointClouds:
         """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, self.oriented.shape[0])
+        return pack_instances(self.usable, self.oriented.shape[0], batch_points(len(one.points) for one in self.usable))
 
 
 def _check_frames(frames: object) -> None:
@@ -285,9 +285,9 @@ class Recognizer:
         Raises:
             InputError: `max_points` exceeds the largest bucket.
         """
-        points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
-        rows = sorted({padded_rows(n, self.chunk) for n in range(1, min(max_instances, self.chunk) + 1)})
-        shapes = [(b, n) for n in points for b in rows]
+        rows = {padded_rows(n, self.chunk) for n in range(1, min(max_instances, self.chunk) + 1)}
+        least = batch_points([]) if self.chunk > MIN_PART else 0
+        shapes = {(b, max(n, least)) for n in POINT_BUCKETS if n <= point_bucket(max_points) for b in rows}
         for b, n in shapes:
             samples = infer_clouds(self.model, pack_instances([], b, n)).samples
             if samples is not None:

@@ -64,7 +64,7 @@ def test_equal_methods_and_single_placements_are_undecided() -> None:
     assert one.placements == 1 and one.verdict == "undecided"
 
 
-NAMES = ("soup_can_red", "cereal_box_blue")
+NAMES = ("soup_can_red", "yellow_box")
 
 
 def test_claims_name_columns() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import pickle
 import re
 from typing import Any
+from unittest import mock
 
 import jax
 import numpy as np
@@ -25,6 +26,8 @@ from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.surfaces.evidence import fit_poses, sample_points, with_evidence
 from training.objects.builtin_objects import builtin_objects
 from training.objects.surfaces import surfaces_of
+
+pytestmark = pytest.mark.usefixtures("small_buckets")
 
 CLASSES = ("a", "b", "c", "d")
 
@@ -165,31 +168,40 @@ def test_instances_are_compared_with_surfaces() -> None:
     assert len(usable) > 1 and np.abs(first - expected)[: len(usable)].max() > 0.01
 
 
-@pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])
-def test_nothing_compiles_after_warm_up(max_points: int, sizes: int, request: pytest.FixtureRequest) -> None:
-    """JAX's monitoring counts the compilations of a recognizer that no other test uses."""
-    run = with_surfaces(untrained_embedding_run(CLASSES, THOR2))
-    compiled: list[str] = []
-
-    def listen(event: str, duration: float, **_: object) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(event)
-
-    fresh = Recognizer(run)
-    one = frame_of_squares({1: (10, 10, (200, 30, 30))})
-    two = frame_of_squares({1: (10, 10, (200, 30, 30)), 2: (60, 100, (30, 30, 200))})
-    if sizes == 1:  # one of the enrolled objects has a surface
-        fresh.enroll("toy", [one])
-        surface = surfaces_of([builtin_objects()["banana"]]).arrays
-        fresh.objects.enroll("mesh", list(fresh.prepare(one)), "mesh", surface)
+def test_nothing_compiles_after_warm_up(request: pytest.FixtureRequest) -> None:
+    """JAX's monitoring reports what a recognizer compiles that no other test uses; one object has a surface."""
+    fresh = Recognizer(with_surfaces(untrained_embedding_run(CLASSES, THOR2)))
+    frame = frame_of_squares({1: (10, 10, (200, 30, 30))})
+    fresh.enroll("toy", [frame])
+    surface = surfaces_of([builtin_objects()["banana"]]).arrays
+    fresh.objects.enroll("mesh", list(fresh.prepare(frame)), "mesh", surface)
+    listen = mock.Mock()
     jax.monitoring.register_event_duration_secs_listener(listen)
     request.addfinalizer(lambda: jax.monitoring.unregister_event_duration_listener(listen))
-    assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
-    assert compiled
-    compiled.clear()
-    for count, frame in enumerate((one, two), 1):
-        assert [answer.classifier is not None for answer in fresh.recognize(frame)] == [True] * count
-    assert compiled == []
+    assert fresh.warm_up(max_points=500, max_instances=1) == 1
+    assert listen.called
+    listen.reset_mock()
+    assert [answer.classifier is not None for answer in fresh.recognize(frame)] == [True]
+    assert listen.mock_calls == []
+
+
+@pytest.mark.parametrize(("chunk", "count"), [(2, 4), (64, 1)])
+def test_every_size_is_warmed_up(run: TrainedRun, chunk: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[tuple[int, ...]] = []
+
+    def record(_: object, clouds: thor2.PointClouds, **__: object) -> Inference:
+        sizes.append(clouds.mask.shape)
+        return Inference(np.zeros(len(clouds.mask)), {})
+
+    monkeypatch.setattr("thor2_jax.recognizer.infer_clouds", record)
+    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 1024)
+    recognizer = Recognizer(run, chunk=chunk)
+    assert recognizer.warm_up(max_points=1000, max_instances=2) == len(sizes) == count
+    for n, n_instances in ((100, 1), (100, 2), (600, 1), (600, 2)):
+        points = np.zeros((n, 3), np.float32)
+        instance = PreparedInstance(1, points, points.astype(np.uint8), np.zeros(n, bool))
+        recognizer.infer([instance] * n_instances)
+    assert {*sizes[count:]} == {*sizes[:count]}
 
 
 def test_known_instances_are_located(monkeypatch: pytest.MonkeyPatch) -> None:

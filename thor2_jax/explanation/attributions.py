@@ -10,7 +10,6 @@ first look. The points are removed from all looks, whose frames remain those of 
 """
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -21,7 +20,7 @@ from scipy.stats import spearmanr
 
 from thor2_jax.config import Relaxation
 from thor2_jax.descriptor.slicing import region_sets, relaxed_strips, slices_and_strips
-from thor2_jax.explanation.class_scores import COMPILER_OPTIONS, ClassScores
+from thor2_jax.explanation.class_scores import ClassScores, jit_gradient
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
@@ -82,7 +81,7 @@ def select_points(instance: PreparedInstance, kept: NDArray[np.bool_ | np.intp])
     return dataclasses.replace(instance, points=points, colors=colors, boundary=instance.boundary[kept], rim=rim)
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@jit_gradient
 @jax.grad
 def _gradients(weights: jax.Array, scores: ClassScores, looks: PointClouds, index: int) -> Any:
     """Return the gradients [T, N] of the margins of T versions of a cloud, of K looks each, by the weights [T, N]."""

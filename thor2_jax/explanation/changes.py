@@ -6,7 +6,6 @@ the smallest change with another answer is searched for: each changed cloud is r
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -18,7 +17,7 @@ from thor2_jax.capacity import batch_points
 from thor2_jax.config import Relaxation
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, before_turn
-from thor2_jax.explanation.class_scores import COMPILER_OPTIONS, ClassScores
+from thor2_jax.explanation.class_scores import ClassScores, jit_gradient
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds, matmul
 
@@ -106,7 +105,7 @@ def changed_instance(
     return dataclasses.replace(instance, points=points.astype(np.float32))
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@jit_gradient
 @jax.value_and_grad
 def _lead(parameters: jax.Array, scores: ClassScores, clouds: PointClouds, axes: Any, index: int) -> jax.Array:
     """Return how far the score of a name exceeds those of all others after changes of a cloud, and the gradient.

@@ -6,8 +6,9 @@ the embedding determines only the confidence and is not explained.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal
 
 import jax
@@ -30,13 +31,14 @@ from thor2_jax.model.model import Model
 from thor2_jax.networks.networks import EMBEDDING, Classifier
 from thor2_jax.types import PointClouds, Strips, matmul
 
-__all__ = ["ClassScores", "classifier_scores", "gallery_scores"]
+__all__ = ["ClassScores", "classifier_scores", "gallery_scores", "jit_gradient"]
 
 ROWS = 8
 """Number of versions of a cloud that are described in one call."""
 
-COMPILER_OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""XLA options for gradients, which are then compiled in half of the time and take little longer."""
+LEVEL = {} if "optimization_level" in os.environ.get("XLA_FLAGS", "") else {"xla_backend_optimization_level": 1}
+jit_gradient = partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False, **LEVEL})
+"""Compiles gradients in half of the time of `jax.jit`; they take little longer. A level of XLA_FLAGS is kept."""
 
 MIN_VIEWS = 256
 """Smallest number of enrolled views after padding, which is a power of two."""

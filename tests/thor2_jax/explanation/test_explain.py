@@ -34,6 +34,8 @@ from training.objects.surfaces import surfaces_of
 from training.rendering.camera import camera_pose
 from training.views.mesh_views import view_cloud
 
+pytestmark = pytest.mark.usefixtures("small_buckets")
+
 CLASSES = ("a", "b", "c")
 FOUR = dataclasses.replace(SMALL_CONFIG, looks=4)
 
@@ -66,11 +68,6 @@ def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig 
         return jnp.stack([jnp.zeros_like(value), value], axis=1)
 
     return ClassScores("log-odds", config, NETWORK, config.looks, jax.tree_util.Partial(scores), ("plain", "special"))
-
-
-@pytest.fixture(autouse=True)
-def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
 
 
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])

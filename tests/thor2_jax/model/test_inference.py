@@ -7,7 +7,7 @@ import pytest
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.inference import compute_by_chunks, padded_rows
+from thor2_jax.model.inference import compute_by_chunks
 from thor2_jax.types import PointClouds
 
 
@@ -34,12 +34,6 @@ def test_chunks_give_the_rows_of_all_usable_instances(n: int, size: int) -> None
     np.testing.assert_array_equal(counts[: len(usable)], usable)
     assert not counts[len(usable) :].any() and len(counts) in BATCH_BUCKETS
     assert len(sizes) == max(1, -(-len(usable) // size)) and set(sizes) <= set(BATCH_BUCKETS)
-
-
-def test_large_chunks_have_one_size_for_small_frames() -> None:
-    """So a command compiles nothing more for frames of other numbers of instances."""
-    assert {padded_rows(n, BATCH_BUCKETS[-1]) for n in range(9)} == {8}
-    assert [padded_rows(n, 4) for n in range(1, 6)] == [1, 2, 4, 4, 8]
 
 
 def test_instances_are_prepared_between_chunks() -> None:

@@ -86,19 +86,12 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path, refused: C
     assert report["instances"]["no_class"] == {"leaf": 1}
     page = (tmp_path / "report" / "report.html").read_text()
     options = frame_options(frames / "a")
-    assert run_thor2("evaluate", "frames", *options, "--model", model) == 0
+    assert run_thor2("evaluate", "frames", *options, "--model", model, "--out", tmp_path / "one") == 0
+    report = json.loads((tmp_path / "one" / "report.json").read_text())
+    assert report["dataset"]["path"] == ", ".join(map(str, options[1::2]))
     for given in (options[:2], [*options[:4], *options[6:]]):
         assert "--segment" not in refused("evaluate", "frames", *given, "--model", model)
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
-
-
-def test_runs_and_files_of_a_frame_are_told_apart(model: Path, frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[Any] = []
-    monkeypatch.setattr("training.cli.evaluate._evaluate", lambda *arguments, **_: calls.append(arguments))
-    one = frame_options(frames / "000")
-    for given, files in (([frames], [frames]), (one, one[1::2])):
-        assert run_thor2("evaluate", "frames", "--model", model, model, *given) == 0
-        assert calls[-1][2] == ", ".join(map(str, files)) and calls[-1][4] == [model]
 
 
 def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, printed: Callable[..., str]) -> None:
@@ -276,7 +269,7 @@ def test_progress_begins_before_views_are_rendered(model: Path, tmp_path: Path) 
     def pool(function: Any, tasks: Any) -> Any:
         yield from (steps.append("render") or function(task) for task in tasks)
 
-    meshes = {"box": write_box(tmp_path / "box.ply", (0.1, 0.2, 0.15))}
+    meshes = {"box": write_box(tmp_path / "box.ply", BOX)}
     enroll_objects(model, meshes, pool=pool, progress=lambda stage, done, *_: steps.append(done))
     assert steps == [0, "render", 1]
 

@@ -28,12 +28,11 @@ def frame(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drawn_pictures")
+@pytest.mark.usefixtures("drawn_pictures", "small_buckets")
 def test_a_page_for_every_instance(
     model: Path, frame: Path, tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is left after an error."""
-    monkeypatch.setattr("thor2_jax.capacity.MIN_BATCH_POINTS", 512)
     out, compared = tmp_path / "out", tmp_path / "compared"
     save_run(with_surfaces(load_run(model)), compared)
     *pages, last = printed("explain", "--model", compared, frame, "--out", out).splitlines()

@@ -22,7 +22,7 @@ from thor2_jax.types import PointClouds
 from training.baselines.baseline import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
 
-pytestmark = pytest.mark.usefixtures("small_classifiers")
+pytestmark = pytest.mark.usefixtures("small_classifiers", "small_buckets")
 
 CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
 
@@ -79,7 +79,7 @@ def test_each_sequence_is_answered_by_its_run(tmp_path: Path) -> None:
 
 def test_confidences_are_those_of_recognition(tmp_path: Path) -> None:
     """Instances are compared with surfaces, too, and with an object that is enrolled."""
-    record: dict[str, object] = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))}
+    record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))}
     save_run(with_surfaces(untrained_embedding_run(("a", "b"), record=record)), tmp_path / "run")
     recognizer, frame = Recognizer.load(tmp_path / "run"), tilted(patches())
     for column in ("embedding", "both"):
