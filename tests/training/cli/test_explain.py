@@ -51,7 +51,8 @@ def test_a_page_for_every_instance(
         assert "Does it fit the surfaces?" in page.text and len(record["surfaces"]) == 3
         assert not list(directory.glob(".*"))
     monkeypatch.setattr(explanation_page, "write_page", full_disk)
-    error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
+    command = ("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
+    error = refused(*command, at_once=False)
     assert "No space left" in error and not (tmp_path / "deep").exists()
 
 
