@@ -36,7 +36,6 @@ from thor2_jax.files import (
 )
 from thor2_jax.gallery.compact_clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.model.run_record import RUN_FILE
 
 __all__ = [
     "GALLERY_DIRECTORY",
@@ -123,9 +122,7 @@ KEEP_OTHERS = f"delete {INDEX_FILE} and keep the other objects"
 
 def _unusable(directory: Path, problem: str, repair: str = KEEP_OTHERS) -> GalleryError:
     """Return the error of a gallery whose index can be rebuilt from the object files that are intact."""
-    is_of_run = directory.name == GALLERY_DIRECTORY and (directory.parent / RUN_FILE).is_file()
-    place = [str(directory.parent)] if is_of_run else ["RUN", "--gallery", str(directory)]
-    command = shlex.join(["thor2", "objects", "--reembed", "--model", *place])
+    command = f"thor2 objects --reembed --model RUN --gallery {shlex.quote(str(directory))}"
     return GalleryError(f"gallery: {problem}; restore it from a copy, or {repair}: {command}")
 
 

@@ -197,7 +197,7 @@ def test_a_lost_index_is_rebuilt_by_the_command(model: Path, texts: Texts, refus
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
     for command in (("objects",), ("forget", "brick")):
-        assert f"thor2 objects --reembed --model {model}" in refused(*command, "--model", model)
+        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in refused(*command, "--model", model)
     table, progress = texts("objects", "--reembed", "--model", model, "--gallery", gallery)
     assert progress.startswith("embed: 0 of 2\n") and "embed: 2 of 2" in progress
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table) for name in ("brick", "book"))
