@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # JAX reads these variables when it is imported. The process that distributes the tests does not import it.
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 # Most of the time of the tests is compilation, which takes a third of it without optimization. CI also compares the
-# golden files with XLA_FLAGS set to nothing: with the programs of users.
+# golden files with the programs that users compile.
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
 # Tracing allocates many objects that stay, so that older generations are practically never collected.
 gc.set_threshold(100_000, 1000, 1000)

@@ -195,7 +195,8 @@ def train_run(
         parts = settings.folds
         if parts == 1 and settings.distractors is not None:  # fewer parts than `HELD_OUT` if a class has few views
             each = (samples.view[samples.label == index] for index in range(len(source.classes)))
-            parts = max(2, min([HELD_OUT, *(len(np.unique(view)) for view in each)]))
+            fewest = min(len(np.unique(view)) for view in each)
+            parts = max(2, min(HELD_OUT, fewest))
         fold_of = fold_of_views(samples.label, samples.view, source.classes, parts, settings.fit.seed)
         wait_for_all("checked")
         if first:

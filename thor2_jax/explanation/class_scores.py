@@ -38,7 +38,7 @@ ROWS = 8
 
 LEVEL = {} if "optimization_level" in os.environ.get("XLA_FLAGS", "") else {"xla_backend_optimization_level": 1}
 jit_gradient = partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False, **LEVEL})
-"""Compiles gradients in half of the time of `jax.jit`; they take little longer. A level of XLA_FLAGS is kept."""
+"""Compiles gradients in half of the time of `jax.jit`; they take little longer. XLA_FLAGS may set another level."""
 
 MIN_VIEWS = 256
 """Smallest number of enrolled views after padding, which is a power of two."""

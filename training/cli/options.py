@@ -140,9 +140,10 @@ class FrameOptions:
     every: Annotated[int, recording_option(min=1, max=2**31 - 1, help="Take every N-th frame.")] = 1
 
     def arguments(self, n_frames: int = 0) -> list[str]:
-        """Return the arguments that pass the same frames to another command.
+        """Return the arguments that pass the same frames to another command; FRAME stands for more than three frames.
 
-        FRAME stands for more than three folders, and for folders that contain more than three frames, `n_frames`.
+        Args:
+            n_frames: number of frames in the given folders, if it is known.
         """
         given = given_values(self)
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]

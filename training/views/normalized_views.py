@@ -176,8 +176,8 @@ def normalize_views(
         InputError: a cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
     xyz, camera = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-    # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory. If the
-    # CPU is the default, to select it would compile what other computations have compiled.
+    # This runs on the CPU, since accelerators round differently and rendering should not occupy their memory. Where it
+    # is the default device, it is not selected, since programs would then be compiled a second time.
     with jax.default_device(None if jax.default_backend() == "cpu" else jax.local_devices(backend="cpu")[0]):
         for count, batch in padded_batches(clouds, boundary):
             normal = view_normalize(batch, config)
