@@ -1,7 +1,7 @@
 // Main module of the page: choose a frame, recognize it, show its objects.
 
 import { showDetails } from "./details.js";
-import { breakable, confidenceOf, element, isNarrow, percent, rgb } from "./drawing.js";
+import { breakable, byId, confidenceOf, element, isNarrow, markField, pause, percent, rgb } from "./drawing.js";
 import { decoded, labelImage } from "./label_image.js";
 import { MaskTools } from "./masks.js";
 import { instanceColors, Overlay, textColor } from "./overlay.js";
@@ -12,8 +12,6 @@ import { connectWhy, showWhy } from "./why.js";
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
 const RETRY_MS = 1000;
 const WATCH_MS = 10000; // While the service is ready.
-const byId = (id) => document.getElementById(id);
-const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 const overlay = new Overlay(byId("overlay"), (click) => choose(click));
 const maskTools = new MaskTools(overlay, changeMasks, undoMasks);
@@ -25,12 +23,6 @@ function setStatus(text, busy = false) {
   byId("status").textContent = text;
   byId("status").toggleAttribute("data-busy", busy);
   byId("status").removeAttribute("data-empty");
-}
-
-function markField(id, message) {
-  byId(`${id}-error`).textContent = message;
-  if (message) byId(id).setAttribute("aria-invalid", "true");
-  else byId(id).removeAttribute("aria-invalid");
 }
 
 function clearProblems() {

@@ -1,8 +1,7 @@
 // Details of one object: its cloud, its slices, and the probabilities of each classifier.
 
-import { breakable, element, keepDrawn, percent, rgb, themed } from "./drawing.js";
+import { breakable, byId, element, keepDrawn, percent, rgb, themed } from "./drawing.js";
 
-const byId = (id) => document.getElementById(id);
 const TITLES = {
   tops: "TOPS: shape",
   tops2: "TOPS2: shape and colour",

@@ -1,4 +1,4 @@
-// Drawing helpers: canvases at the resolution of the screen, redrawn when their size or the colour scheme changes.
+// Helpers that the modules share: elements, texts, colours, and canvases at the resolution of the screen.
 
 const drawn = new WeakMap();
 const watch = new ResizeObserver((entries) => {
@@ -50,6 +50,17 @@ export const confidenceOf = ({ confidence, details }) => details?.calibrated_con
 
 /** Split a name at its underscores, so that a line can break there; Arabic names do not move the text beside them. */
 export const breakable = (name) => element("bdi", {}, ...name.split(/(?<=_)/).flatMap((piece) => [piece, element("wbr")]));
+
+export const byId = (id) => document.getElementById(id);
+
+/** Show an error beside a field; an empty message removes it. */
+export function markField(id, message) {
+  byId(`${id}-error`).textContent = message;
+  if (message) byId(id).setAttribute("aria-invalid", "true");
+  else byId(id).removeAttribute("aria-invalid");
+}
+
+export const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** Create an element with properties and children. */
 export function element(tag, properties = {}, ...children) {

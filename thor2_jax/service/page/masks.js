@@ -1,6 +1,7 @@
 // Correction of the service's masks by clicks: pieces are dropped, merged, and split along a straight cut.
 
-const byId = (id) => document.getElementById(id);
+import { byId } from "./drawing.js";
+
 const HINTS = {
   none: "Select a piece to correct its mask.",
   merge: "Choose the piece that belongs to the same object.",

@@ -1,18 +1,10 @@
 // Naming of objects: the form in the details, and the notice with a button to undo.
 
-import { element } from "./drawing.js";
+import { byId, element, markField } from "./drawing.js";
 import * as service from "./service.js";
-
-const byId = (id) => document.getElementById(id);
 
 /** Return whether an object can be named: known or not, its cloud must have been described. */
 export const canBeNamed = ({ name, unrecognized }) => name !== null || unrecognized.startsWith("unknown");
-
-function markName(message) {
-  byId("name-error").textContent = message;
-  if (message) byId("name").setAttribute("aria-invalid", "true");
-  else byId("name").removeAttribute("aria-invalid");
-}
 
 let shown = {}; // The frame and the object of the form.
 let saved = null; // The name that was saved, until the frame is recognized again.
@@ -30,7 +22,7 @@ export function showNaming(instance, { teaches, classes }, files) {
   if (shown.files === files && shown.label === instance.label) return;
   shown = { files, label: instance.label };
   byId("name").value = "";
-  markName("");
+  markField("name", "");
 }
 
 function showNotice(text, generation = null) {
@@ -62,7 +54,7 @@ export function connectNaming(changed, failed) {
   byId("naming").addEventListener("submit", (event) => {
     event.preventDefault();
     const name = byId("name").value.trim();
-    markName(name ? "" : "Enter a name.");
+    markField("name", name ? "" : "Enter a name.");
     if (!name) return byId("name").focus();
     whileBusy(async () => {
       let answer;
@@ -70,7 +62,7 @@ export function connectNaming(changed, failed) {
         answer = await service.enroll(shown.files, shown.label, name);
       } catch (problem) {
         if (problem.status === 401 || !(problem instanceof service.Problem)) throw problem;
-        markName(problem.message);
+        markField("name", problem.message);
         return byId("name").focus();
       }
       byId("name").value = "";

@@ -1,9 +1,8 @@
 // Explanation of one object: the pictures of /v1/why.
 
-import { element, isNarrow } from "./drawing.js";
+import { byId, element, isNarrow, pause } from "./drawing.js";
 import * as service from "./service.js";
 
-const byId = (id) => document.getElementById(id);
 let request = new AbortController();
 
 /** Show the button for an object, without the explanation of another object. */
@@ -49,7 +48,7 @@ async function explanation(files, label, signal) {
     } catch (problem) {
       if (problem.status !== 503) throw problem;
       byId("why-status").textContent = `${problem.message} The answer appears here then.`;
-      await new Promise((resolve) => setTimeout(resolve, 1000 * problem.retryAfter));
+      await pause(1000 * problem.retryAfter);
       signal.throwIfAborted();
     }
   }
