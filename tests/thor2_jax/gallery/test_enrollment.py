@@ -76,15 +76,6 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
 
 
-def test_forgetting_restores_every_answer() -> None:
-    recognizer = taught(run())
-    before = recognizer.recognize(CLUTTER)
-    recognizer.enroll("pen", [(CLUTTER, 3)])
-    assert [answer.name for answer in recognizer.recognize(CLUTTER, answer_by="gallery")] == ["brick", "book", "pen"]
-    recognizer.forget("pen")
-    assert recognizer.recognize(CLUTTER) == before
-
-
 def test_both_answers_by_the_union_of_classes() -> None:
     recognizer = taught(run())
     assert recognizer.model.answers_by() == "both" and recognizer.classes == ("a", "b", "c", "brick", "book")
