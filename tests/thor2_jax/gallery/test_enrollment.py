@@ -62,7 +62,10 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert objects.gallery.summary.startswith("17 toy objects")
     objects = taught(run()).objects
     assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
-    assert not ObjectGallery(()).weak_rejection
+    packaged = ObjectGallery(())
+    assert packaged.gallery.summary == "no object yet" and not packaged.weak_rejection
+    packaged.add({"brick": objects.gallery.objects["brick"]})
+    assert packaged.gallery.references is packaged.embedding.references is not None
     alone = taught(untrained_run((), ())).objects
     assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2 (")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
@@ -72,7 +75,6 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
     assert_refused("on disk", alone.undo, 0)
-    assert ObjectGallery(()).gallery.summary == "no object yet"
     assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
 
 
