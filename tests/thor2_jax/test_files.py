@@ -31,18 +31,6 @@ def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_failure_leaves_the_old_file_and_nothing_else(error: type[BaseException], tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-    with pytest.raises(error), files.atomic_write(path) as temporary:
-        assert temporary.parent.parent == tmp_path and temporary.suffix == ".txt"
-        temporary.write_text("half")
-        assert path.read_text() == "old"
-        raise error
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
-
-
 def test_a_new_or_empty_directory_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "empty")
     (tmp_path / "empty").mkdir()

@@ -126,9 +126,8 @@ class InferenceEngine:
         """
         if settings.cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(settings.cache))
-            # By default JAX caches only large programs that take more than a second to compile.
+            # By default JAX caches only programs that take more than a second to compile.
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-            jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         directory = settings.gallery or settings.model / GALLERY_DIRECTORY
         if not settings.teach:
             check_exists(settings.gallery)

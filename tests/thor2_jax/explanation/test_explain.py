@@ -60,14 +60,15 @@ def explanation(recognizer: Recognizer) -> Explanation:
     return explain(recognizer, FRAME, 3)
 
 
-def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> ClassScores:
+def toy(score: Callable[[LookDescriptors], Any]) -> ClassScores:
     """Return scores of two names: 0, and a function of the descriptors."""
 
     def scores(oriented: LookDescriptors) -> jax.Array:
         value = score(oriented)
         return jnp.stack([jnp.zeros_like(value), value], axis=1)
 
-    return ClassScores("log-odds", config, NETWORK, config.looks, jax.tree_util.Partial(scores), ("plain", "special"))
+    of_descriptors, names = jax.tree_util.Partial(scores), ("plain", "special")
+    return ClassScores("log-odds", SMALL_CONFIG, NETWORK, SMALL_CONFIG.looks, of_descriptors, names)
 
 
 @pytest.mark.parametrize("rule", ["log-mean", *slow("max", "mean")])
@@ -119,19 +120,6 @@ def test_forgotten_classes_have_no_score() -> None:
     scores = classifier_scores(recognizer.model)
     assert scores.names == ("a", "c")
     np.testing.assert_allclose(scores.of_instances([INSTANCE]), whole[:, [0, 2]], rtol=1e-5)
-
-
-def test_parts_keep_the_mask_of_each_look() -> None:
-    """Without the points of the rim, the second look, which has none of them, is unchanged; without others, empty."""
-    rim = INSTANCE.rim
-    assert rim is not None and 0 < rim.sum() < len(rim) / 2
-    for number in range(4):
-        scores = toy(lambda oriented, k=number: oriented.each.images[:, k].sum(axis=(1, 2, 3)), FOUR)
-        masks = np.array([rim | True, ~rim, rim])
-        whole, inner, outer = scores.of_masks(scores.orient(INSTANCE), masks)[:, 1]
-        assert whole > 1e-3
-        assert (inner == pytest.approx(whole, rel=1e-6)) == (number == 1)
-        assert (outer == 0) == (number == 1)
 
 
 def test_selected_points_keep_their_flags() -> None:

@@ -62,7 +62,10 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert objects.gallery.summary.startswith("17 toy objects")
     objects = taught(run()).objects
     assert objects.gallery.summary == "5 objects: a, b, c, brick, book"
-    assert not ObjectGallery(()).weak_rejection
+    packaged = ObjectGallery(())
+    assert packaged.gallery.summary == "no object yet" and not packaged.weak_rejection
+    packaged.add({"brick": objects.gallery.objects["brick"]})
+    assert packaged.gallery.references is packaged.embedding.references is not None
     alone = taught(untrained_run((), ())).objects
     assert alone.weak_rejection.startswith("enrolled objects with fewer than 10 views: 2 of 2 (")
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 2)
@@ -72,17 +75,7 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("thor2_jax.gallery.enrollment.FEW", 1)
     assert not alone.weak_rejection
     assert_refused("on disk", alone.undo, 0)
-    assert ObjectGallery(()).gallery.summary == "no object yet"
     assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
-
-
-def test_forgetting_restores_every_answer() -> None:
-    recognizer = taught(run())
-    before = recognizer.recognize(CLUTTER)
-    recognizer.enroll("pen", [(CLUTTER, 3)])
-    assert [answer.name for answer in recognizer.recognize(CLUTTER, answer_by="gallery")] == ["brick", "book", "pen"]
-    recognizer.forget("pen")
-    assert recognizer.recognize(CLUTTER) == before
 
 
 def test_both_answers_by_the_union_of_classes() -> None:

@@ -118,7 +118,7 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     for folder in (directory, directory / "objects"):
         killed(folder)
     update_gallery(directory, lambda gallery: gallery.without("new"), FINGERPRINT)
-    update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
+    assert update_gallery(directory, lambda gallery: gallery, FINGERPRINT).hidden == ()
     after = files_of(directory)
     assert after.keys() == before.keys()
     assert all(after[name] == before[name] for name in before if not name.endswith(".json"))
