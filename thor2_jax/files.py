@@ -63,7 +63,7 @@ __all__ = [
 def as_path(path: object, name: str) -> Path:
     """Return the path of a file as a Path; a value of another type, or with a null character, raises InputError."""
     if not isinstance(path, str | os.PathLike):
-        raise InputError(f"{name} is a {type(path).__name__}; expected a path")
+        raise InputError(f"{name} is of type {type(path).__name__}; expected a path")
     if "\0" in str(path):
         raise InputError(f"{name} is {str(path)!r}; expected a path without null characters")
     return Path(path)

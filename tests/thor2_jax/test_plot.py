@@ -146,7 +146,7 @@ def test_input_that_cannot_be_drawn_is_refused(ax) -> None:
     assert_refused("points is .*masked", plot.cloud, ax, np.ma.masked_less(POINTS, 0.1), COLORS)
     assert_refused("values is .*numbers", plot.cloud, ax, POINTS, COLORS, ["red"] * len(POINTS))
     assert_refused("values is .*numbers", plot.attribution_colors, ["red"])
-    assert_refused("config is a NoneType", plot.slices, ax, POINTS, COLORS, None)
+    assert_refused("config is of type NoneType", plot.slices, ax, POINTS, COLORS, None)
     assert_refused("diagrams is a ndarray", plot.persistence_diagram, ax, np.zeros((7, 2)), CLOSED)
     assert_refused("config is a ColorNetwork", plot.persistence_image, ax, np.zeros((32, 32)), NETWORK)
     assert_refused("network is a ndarray", plot.color_matrix, ax, NETWORK, np.zeros((31, 22)))

@@ -141,7 +141,7 @@ class Intrinsics:
         if hasattr(values, "distortion_model"):  # a CameraInfo message
             values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
         if not isinstance(values, Mapping):
-            raise InputError(f"intrinsics is a {type(values).__name__}; expected fx, fy, cx, cy, or a 3 x 3 matrix")
+            raise InputError(f"intrinsics is of type {type(values).__name__}; expected fx, fy, cx, cy, or a matrix")
         camera = values["intrinsic"] if isinstance(values.get("intrinsic"), Mapping) else values  # of Open3D
         matrix, scale = _parts(camera)
         scale = DEFAULT_DEPTH_SCALE if scale is None else scale

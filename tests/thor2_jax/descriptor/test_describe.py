@@ -56,13 +56,13 @@ def test_arguments_of_other_types_are_named() -> None:
         assert_refused(r"points \[512, 3\]", function, one, NETWORK, CLOSED)
         assert_refused(r"points \[1, 1, 512, 3\]", function, batches, NETWORK, CLOSED)
         assert_refused(exchanged, function, packed, CLOSED, NETWORK)
-        assert_refused("config is a NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
+        assert_refused("config is of type NoneType; expected a DescriptorConfig", function, packed, NETWORK, None)
     for without_network in (thor2.align, thor2.view_normalize, thor2.turn, thor2.diagrams):
         assert_refused("clouds is list", without_network, [], CLOSED)
         assert_refused("config is a ColorNetwork", without_network, packed, NETWORK)
     assert_refused("clouds is list", thor2.mirror, [], "x")
     assert_refused("strips is a PointClouds; expected a Strips", thor2.describe_strips, packed, NETWORK, CLOSED)
-    assert_refused("parameters is a dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
+    assert_refused("parameters is of type dict; expected a Parameters", thor2.describe, packed, NETWORK, CLOSED, {})
     assert_refused(exchanged, thor2.Parameters.of, CLOSED, NETWORK)
 
 

@@ -73,7 +73,7 @@ def test_a_model_says_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not alone.weak_rejection
     assert_refused("on disk", alone.undo, 0)
     assert ObjectGallery(()).gallery.summary == "no object yet"
-    assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("f, ...")
+    assert ObjectGallery(tuple("abcdefg")).gallery.summary.endswith("e, ..., g")
 
 
 def test_forgetting_restores_every_answer() -> None:
