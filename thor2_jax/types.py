@@ -104,7 +104,7 @@ class PointClouds:
                 message gives the index of the cloud.
         """
         if not isinstance(clouds, Sized) or len(clouds) == 0:
-            actual = "empty" if isinstance(clouds, Sized) else f"a {type(clouds).__name__}"
+            actual = "empty" if isinstance(clouds, Sized) else f"of type {type(clouds).__name__}"
             raise InputError(f"clouds is {actual}; expected a list of at least one pair (xyz, rgb)")
         arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]

@@ -101,11 +101,14 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, pri
     for other, count in ((), 2), ((write_frame(frames / "002", {1: "brick"}, 2),), 3):
         generation = Recognizer.load(model).gallery.generation
         line = "skipped: views of brick that are repeated or enrolled already: 1\n"
-        assert line in printed("enroll", "brick", *more, *other, "--extend")
+        text = printed("enroll", "brick", *more, *other, "--extend")
+        assert line in text and "new, since" not in text
         assert view_counts(model) == {"brick": count, "book": 2, "red thing": 1}
         assert (Recognizer.load(model).gallery.generation > generation) == bool(other)
     assert run_thor2("enroll", "brick", *more, "--replace") == 0
     assert view_counts(model)["brick"] == 1
+    text = printed("enroll", "brik", *more, "--label-name", "brick", "--extend")
+    assert "new, since no object with this name can be extended: brik\n" in text
 
 
 def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
@@ -174,6 +177,7 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "instance by --mesh-scale 1"),
         (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "--extend and --replace are given"),
         (("--frames", frames, "--instance", 1), "name is missing"),
+        (("--bag", frames), "name is missing"),
         (("mug", "--frames", frames, "--engine", "ray"), "engine is ray; it belongs to --mesh"),
         (("mug", "--mesh", tmp_path / "one.ply", "--segment", "table"), "segment is table; it belongs to frames"),
         (("mug", "--frames", tmp_path / "absent"), "absent"),
