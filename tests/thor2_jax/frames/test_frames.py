@@ -142,7 +142,8 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
 def test_missing_files_and_values_that_are_no_path(files: dict[str, Path], name: str) -> None:
     for value in (10**6, [files[name]], "a\0b"):
-        assert_refused(rf"^{name} is (of type (int|list)|'a\\x00b'); expected a path", read_frame, **files | {name: value})
+        refused = rf"^{name} is (of type (int|list)|'a\\x00b'); expected a path"
+        assert_refused(refused, read_frame, **files | {name: value})
     assert_refused("^depth_scale is '1'", read_frame, **files, depth_scale="1")
     files[name].unlink()
     with pytest.raises(FileNotFoundError, match=str(files[name])):
