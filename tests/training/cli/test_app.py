@@ -57,6 +57,7 @@ def test_a_usage_error_is_one_line(refused: Command) -> None:
         ("objects --model=~/m=", f"{Path.home()}/m= is not a run directory"),
         ("train --dataset m --out o --frames", "'--frames' requires an argument"),
         ("render --meshes m --out o --sensor --copies 100000000000000000000", "copies is 100000000000000000000;"),
+        ("render --meshes m --out o --copies 3", "copies is 3; it belongs to an augmentation"),
         ("render --meshes m --out o --sensor --crops 99999999", "(given: 99999999)"),
     ):
         assert expected in refused(*shlex.split(command))
