@@ -9,7 +9,6 @@ import typer
 from training.cli import options
 from training.cli.app import app, finish, show_progress
 
-
 COPIES = 5
 
 
