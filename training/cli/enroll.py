@@ -78,6 +78,8 @@ def enroll(
         counts, known, notes = enroll_objects(model, source, name=name, pool=pool, progress=progress, **vars(target))
     for note in notes:
         console.print(note)
+    if target.instance is not None and len(frames) > 1 and (given.bag or segment):
+        console.print(f"warning: {target.instance} may be another object in each frame, since they are segmented apart")
     for each, count in counts.items():
         console.print(f"views of {each}: {count}")
     if known.weak_rejection:

@@ -111,7 +111,7 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path, pri
     assert "new, since no object with this name can be extended: brik\n" in text
 
 
-def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
+def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command, printed: Command) -> None:
     """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
@@ -121,7 +121,8 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
     assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
-    assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
+    text = printed("enroll", "box", "--bag", bag, "--instance", 1, "--model", model)
+    assert "warning: 1 may be another object in each frame" in text
     assert view_counts(model) == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
 
 
