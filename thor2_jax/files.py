@@ -28,6 +28,7 @@ from colornet.files import (
     temporary_directory,
 )
 from thor2_jax.errors import InputError, reason_of, refusing_os_errors
+from thor2_jax.printable import first_names
 
 __all__ = [
     "LOCK",
@@ -91,7 +92,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
             names = [name for name in names if name not in resumable and not name.startswith(".")]
         if names and not (marker and (directory / marker).is_file()):
             raise InputError(
-                f"out: {directory} already contains {', '.join(names[:3])}; expected a new or empty directory"
+                f"out: {directory} already contains {first_names(names, 3)}; expected a new or empty directory"
                 f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
             )
         check_writable(directory)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, as_array, decoding, with_context
 from thor2_jax.files import as_path, parse_json, parse_yaml, read_file, read_npy
+from thor2_jax.printable import first_names
 
 __all__ = [
     "DEFAULT_DEPTH_SCALE",
@@ -298,7 +299,7 @@ def _parts(values: Mapping[Any, Any]) -> tuple[Any, Any]:
         if has_size and _is_number(scale) and BOP_CAMERA_SCALES[0] <= scale <= BOP_CAMERA_SCALES[1]:
             scale = 1000 / scale  # BOP's camera.json
         return _pinhole_matrix(values, "cx", "cy"), scale
-    shown, expected = ", ".join(map(str, list(values)[:8])) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
+    shown, expected = first_names(list(map(str, values)), 8) or "no entry", "fx, fy, cx, cy, or a ROS camera_info, K"
     raise InputError(f"intrinsics has {shown}; expected {expected}, cam_K, ppx and ppy, or intrinsic_matrix")
 
 
