@@ -151,7 +151,7 @@ class FrameOptions:
         if self.bag is not None and n_frames > 3:
             given["every"] = n_frames * self.every
         frames = [f"./{path}" if str(path).startswith("-") else str(path) for path in given.pop("frames", ())]
-        return [*(frames if max(len(frames), n_frames) < 4 else ["FRAME"]), *option_arguments(**given)]
+        return [*(frames if self.bag or max(len(frames), n_frames) < 4 else ["FRAME"]), *option_arguments(**given)]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with options that fit it."""

@@ -87,7 +87,8 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
     assert shlex.split(line)[-9:] == [*same, "--unknown-below", "0.0", "--extend"]
     assert FrameOptions(frames=[Path("a")] * 4).arguments() == ["FRAME"] and given.arguments(4)[0] == "FRAME"
     recording = FrameOptions(bag=Path("a.mcap"), every=2)
-    assert [recording.arguments(n)[-1] for n in (3, 300)] == ["2", "600"]
+    for n_frames, every in ((3, "2"), (300, "600")):
+        assert recording.arguments(n_frames) == ["--bag", "a.mcap", "--every", every]
 
 
 def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:

@@ -114,6 +114,8 @@ def test_a_narrow_terminal_cuts_no_name(capfd: pytest.CaptureFixture[str], monke
     assert "\x1b" not in out and "\u202e" not in out
     assert "┃ confidence ┃ classifier ┃ occluded ┃ points ┃" in out and max(map(len, out.splitlines())) == 77
     assert "\n2, 5: unknown: a confidence of 0.448, below 0.573\n" in out
+    recognize_command._print_table("f", [Recognition(1, "070-b_colored_wood_blocks", 0.954, "embedding")])
+    assert "│070-b_colored_wood_blocks│" in capfd.readouterr().out
 
 
 @pytest.mark.usefixtures("small_embedding")
