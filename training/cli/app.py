@@ -144,7 +144,7 @@ console = _Console(width=WIDTH, markup=False, emoji=False)
 
 
 class Table(table.Table):
-    """A table that folds words that are longer than a column, which rich cuts; it has no padding if it only fits without."""
+    """A table that folds words where rich cuts them, and has no padding if it fits only without."""
 
     def __init__(self, *titles: str, title: str | None = None, folded: Collection[str] | None = None) -> None:
         """Create the table; the columns that are not in `folded` keep their width. By default, all may be folded."""
