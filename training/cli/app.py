@@ -129,12 +129,13 @@ sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.std
 class _Console(Console):
     """A console that shows control characters in texts escaped, for instance those in names of folders.
 
-    The terminal breaks lines of text, so that a copied command or path has no line breaks.
+    Text is broken into lines for terminals only, since programs read other output line by line.
     """
 
     def print(self, *objects: Any, **options: Any) -> None:
         shown = [escape_characters(each) if isinstance(each, str) else each for each in objects]
-        super().print(*shown, **{"soft_wrap": all(isinstance(each, str) for each in objects)} | options)
+        is_read = not self.is_terminal and all(isinstance(each, str) for each in objects)
+        super().print(*shown, **{"soft_wrap": is_read} | options)
 
 
 # Without a terminal, rich would truncate tables at 80 columns. Below 72, it would leave out columns of tables, so

@@ -63,7 +63,7 @@ def explain(
                     continue
                 write_explanation(explanation, frame, source.name, directory)
                 explained, last = explained + 1, label
-                console.print(f"{explanation.title}: {directory / PAGE}")
+                console.print(f"{explanation.title}: {directory / PAGE}", soft_wrap=True)
     if not explained:
         raise InputError("no instance could be explained; see above")
     pages = f"pages in {out}: {explained}"

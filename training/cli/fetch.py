@@ -28,7 +28,7 @@ def ycb(
     """
     from training.objects.fetch_ycb import LICENCE, YCB_URL, fetch_ycb
 
-    console.print(LICENCE)
+    console.print(LICENCE, soft_wrap=True)
     with show_progress(quiet) as progress:
         meshes = fetch_ycb(options.split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
